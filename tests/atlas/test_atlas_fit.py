@@ -137,6 +137,28 @@ def test_a_triangle_below_a_texel():
     np.testing.assert_allclose(decoded[mesh.mask], 0.25)
 
 
+@pytest.mark.parametrize("name", ["half", "cascade"])
+def test_charts_that_overlap_have_no_area_or_one_texel(name: str):
+    """Beside a square that has none of this: it is decoded as well as alone, and they to finite light."""
+    from wlm.atlas.data import from_arrays
+
+    square = np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.6], [0.1, 0.6]])
+    speck = 0.8 + 0.5 / 40 * np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
+    line = np.array([[0.9, 0.1], [0.9, 0.5], [0.9, 0.5], [0.9, 0.1]])
+    uv = np.concatenate([square, square + 0.1, speck, line])
+    position = np.concatenate([np.insert(square, 2, height, 1) for height in range(4)])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    row, column = np.mgrid[:40, :40] / 40
+    image = np.stack([1 + np.sin(4 * column), 1 + np.cos(3 * row), 1 + column * row], 2).astype(np.float32)
+    mesh = from_arrays(position, np.concatenate([faces + 4 * i for i in range(4)]), uv, image)
+    text = " ".join(mesh.warnings)
+    assert "their UVs overlap" in text and "without area" in text and mesh.mask[32, 32]
+    extra = {"steps": 20, "resolution": 64} if name == "cascade" else {"budget": 0.5}
+    decoded = Decoder(compress(mesh, name, views=2, **extra)).lightmap(mesh)
+    error = np.abs(decoded - image)[mesh.mask]
+    assert error.max() < 0.5 and np.sqrt(np.square(error).mean()) < 0.05
+
+
 @pytest.mark.parametrize("texels", [(1, 1), (1, 40), (40, 1), (4, 4)])
 def test_small_lightmaps(texels: tuple[int, int]):
     """Of one tile, or of tiles a texel high; less than a tile is better as it is."""

@@ -9,14 +9,17 @@ import pytest
 import torch
 from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import MIXED, random_model
+from builders.resigned import GONE, rewrite
 
 import wlm
+from wlm.atlas.colour import encode
 from wlm.atlas.fit import compress
-from wlm.atlas.mips import Tail, make_tail
-from wlm.atlas.model import Profile, tail_bits, tail_shapes
+from wlm.atlas.mips import Tail, make_tail, tail_light
+from wlm.atlas.model import tail_bits, tail_shapes
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.dds_reader import read_dds
+from wlm.formats.ktx2_reader import read_ktx2
 
 HALF = {"views": 2, "mips": True, "fallback": False}
 
@@ -35,7 +38,8 @@ def means(image: np.ndarray, side: int) -> np.ndarray:
 
 def test_sizes_of_levels():
     assert tail_shapes(64, 96) == [(16, 24), (8, 12), (4, 6), (2, 3), (1, 1)]
-    assert tail_shapes(1, 1) == [(1, 1)] and tail_shapes(5, 33) == [(2, 9), (1, 4), (1, 2), (1, 1)]
+    # Whole blocks: Direct3D and browsers take no others.
+    assert tail_shapes(1, 1) == [(4, 4), (2, 2), (1, 1)] and tail_shapes(17, 33)[:2] == [(8, 12), (4, 6)]
     assert tail_bits(64, 96) == 8 * 16 * (24 + 6 + 2 + 1 + 1)
 
 
@@ -68,7 +72,7 @@ def test_gaps_do_not_count(device):
     """A texel at a chart's border is the mean of those in the chart; black gaps would halve it."""
     mesh = charts(lambda place: np.full((*place.shape[:-1], 3), 0.5), height=96, width=128)
     assert not mesh.mask.all()
-    tail = Tail(make_tail(mesh, device), 96, 128, device)
+    tail = Tail(make_tail(mesh, "bc6h", device), 96, 128, "bc6h", device)
     uv = torch.rand((500, 2), generator=torch.Generator().manual_seed(0)).to(device)
     light = tail.read(uv, torch.linspace(2, 7, 500, device=device))
     torch.testing.assert_close(light, torch.full_like(light, 0.5), rtol=1e-3, atol=0)
@@ -93,18 +97,71 @@ def test_the_bits_are_counted_and_the_file_keeps_them(pair, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
-@pytest.mark.parametrize("kind", ["tiles", MIXED, "plain"])
+@pytest.mark.parametrize("kind", ["tiles", MIXED, "plain", "cascade"])
 def test_the_shader_compiles(kind, tmp_path):
     model = dataclasses.replace(random_model(sheet(), kind), tail=np.zeros((1, 16), np.uint8))
-    main = "in vec2 uv;\nout vec4 light;\nvoid main() { light = vec4(wlm_atlas_grad(uv, dFdx(uv), dFdy(uv)), 1.0); }\n"
+    places = "uv, uv" if len(model.uv) else "uv"
+    call = f"wlm_atlas_grad({places}, dFdx(uv), dFdy(uv))"
+    main = f"in vec2 uv;\nout vec4 light;\nvoid main() {{ light = vec4({call}, 1.0); }}\n"
     (tmp_path / "shader.frag").write_text(f"#version 330\n{atlas_glsl(model)}{main}")
     done = subprocess.run(["glslangValidator", "shader.frag"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
-def test_where_there_are_none():
-    for profile, words in (("cascade", "tiles"), ("astc", "found astc")):
-        with pytest.raises(WlmError, match=f"--mips: .*{words}"):
-            Profile.load(profile).override({"mips": True}, "--")
+def test_a_margin_is_not_read(device):
+    """Of a lightmap whose quarter isn't of whole blocks, the tail reads what it does of one that is."""
+    mesh = sheet(height=50, width=70)
+    levels = tail_light(mesh.lightmap, mesh.mask)
+    blocks = np.concatenate([encode(light, "bc6h", weight)[0] for light, weight in levels])
+    np.testing.assert_allclose(levels[0][0][:12, :17], means(mesh.lightmap[:48, :68], 4), rtol=1e-5)
+    tail = Tail(blocks, 50, 70, "bc6h", device)
+    row, column = np.mgrid[:12, :17].reshape(2, -1)
+    uv = np.stack([(4 * column + 2) / 70, (4 * row + 2) / 50], 1).astype(np.float32)
+    light = tail.read(torch.from_numpy(uv).to(device), torch.full((len(uv),), 2.0, device=device)).cpu().numpy()
+    want = means(mesh.lightmap[:48, :68], 4).reshape(-1, 3)
+    assert np.sqrt(np.square(light - want).mean()) < 0.02 * np.ptp(want)
+
+
+def test_the_first_files_with_mips(tmp_path):
+    """Their levels had any sides: those of whole blocks are read, others refused in a line."""
+    for width, good in ((96, True), (70, False)):
+        mesh = sheet(height=64, width=width)
+        model = dataclasses.replace(random_model(mesh, "tiles"), tail=make_tail(mesh, "bc6h"))
+        model.save(tmp_path / "a.wlm")
+        rewrite(tmp_path / "a.wlm", {"tail": GONE})
+        if good:
+            np.testing.assert_array_equal(wlm.load(tmp_path / "a.wlm").tail, model.tail)
+        else:
+            with pytest.raises(WlmError, match="expected mips of whole blocks; compress again"):
+                wlm.load(tmp_path / "a.wlm")
+
+
+@pytest.mark.parametrize("kind", ["astc", "cascade", "plain with uv"])
+def test_mips_of_other_methods(kind, tmp_path, device):
+    """Under the lightmap's own UVs, and as blocks that the colours' GPU has."""
+    mesh = charts(lambda place: np.full((*place.shape[:-1], 3), 0.5), height=60, width=84)
+    if kind == "astc":
+        pytest.importorskip("astc_encoder")
+        model = compress(mesh, "astc", views=1, mips=True, budget=0.5, fallback=False)
+    else:
+        model = random_model(mesh, kind)
+        model = dataclasses.replace(model, tail=make_tail(mesh, "bc6h", device))
+    own = torch.rand((100, 2), generator=torch.Generator().manual_seed(1)).to(device)
+    new = 1.0 - own if len(model.uv) else None
+    decoder, lod = model.decoder(device), torch.linspace(2.0, 6.0, 100, device=device)
+    light = decoder.read(*((own, lod) if new is None else (new, lod, own)))
+    torch.testing.assert_close(light, torch.full_like(light, 0.5), rtol=0.01, atol=0)
+    near = decoder.read(*((own, 0 * lod) if new is None else (new, 0 * lod, own)))
+    assert torch.equal(near, decoder.read(own if new is None else new))
+    if new is not None:
+        with pytest.raises(ValueError, match="own: expected the lightmap's UVs"):
+            decoder.read(new, lod)
+    wlm.atlas.export(model, tmp_path / "out", mesh)
+    name = "tail.ktx2" if kind == "astc" else "tail.dds"
+    first, _ = (read_ktx2 if kind == "astc" else read_dds)(tmp_path / "out" / name)
+    assert first.shape[:2] == (16, 24) and sorted(path.name for path in tmp_path.glob("out/tail.*")) == [name]
+
+
+def test_a_budget_that_mips_exceed():
     with pytest.raises(WlmError, match="budget: 0.01 is less than mips take"):
         compress(sheet(), "half", mips=True, budget=0.01)

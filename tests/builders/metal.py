@@ -34,6 +34,7 @@ template <class T, int N> struct vec {
     T& x() { return v[0]; } T& y() { return v[1]; } T& z() { return v[2]; } T& w() { return v[3]; }
     T& r() { return v[0]; } T& g() { return v[1]; } T& b() { return v[2]; } T& a() { return v[3]; }
     vec<T, 2> xy() { return vec<T, 2>(v[0], v[1]); }
+    vec<T, 2> zw() { return vec<T, 2>(v[2], v[3]); }
     vec<T, 3> xyz() { return vec<T, 3>(v[0], v[1], v[2]); }
     vec<T, 3> rgb() { return xyz(); }
 };

@@ -124,6 +124,7 @@ _WGPU_FORMS = {
     ("uint8", 2): "rg8unorm",
     ("uint8", 4): "rgba8unorm",
     ("uint16", 2): "rg16uint",
+    ("uint16", 4): "rgba16uint",
     ("uint32", 1): "r32uint",
     ("float16", 4): "rgba16float",
     ("float32", 2): "rg32float",

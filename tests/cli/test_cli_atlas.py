@@ -299,7 +299,13 @@ def test_a_scene_is_one_command(tmp_path):
     text = call("atlas", "evaluate", out, "--views", "2", "--resolution", "32", "--json", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["inside_views"] == 2 and report["psnr"] > 35.0 and "PSNR dB, from inside" in text
-    words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--flip")
+    assert "CR of all textures" in call("atlas", "info", out)
+    for place in (out, out / "scene.wlm"):
+        facts = json.loads(call("atlas", "info", place, "--json"))
+        assert facts["states"] == ["0", "1"] and facts["cr"] >= 0.7 and not facts["levels"]
+    words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out)
+    assert "--colour: expected 'rgb9e5' or 'mixed', got 'half'" in fails(*words, "--colour", "half")
+    words += ("--flip",)
     assert "--flip: expected with one lightmap alone" in fails(*words)
 
 

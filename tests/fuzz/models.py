@@ -322,7 +322,7 @@ READERS = (
         vary_artifact,
         _atlas,
     ),
-    Reader("atlas-scene", "a.wlm", stored("atlas-scene.wlm"), vary_artifact, _atlas_scene),
+    Reader("atlas-scene", "a.wlm", stored("atlas-scene.wlm", "atlas-scene-mixed.wlm"), vary_artifact, _atlas_scene),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, r
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
+from wlm.atlas.colour import quantise
 from wlm.atlas.exact import decode64
-from wlm.atlas.model import pack_entries
 from wlm.atlas.scene.decode import Decoder as SceneDecoder
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
+from wlm.atlas.scene.exporter import factor_texels, sheet_texels
+from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
@@ -106,18 +108,28 @@ def atlas(kind, _) -> Subject:
     return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
 
 
-def mips(_) -> Subject:
-    """The light of the tiles where a pixel is small, of the tail where it is large, in between of both."""
-    near = atlas(MIXED, None)
-    model = replace(random_atlas(charts(), MIXED), tail=np.zeros((1, 16), np.uint8))
-    size = np.array([[model.width // 4, model.height // 4]]) * 4
+def mips(kind, _) -> Subject:
+    """The light of the model where a pixel is small, of the tail where it is large, in between of both.
+
+    The tail has a margin, and rises along u where the lightmap is.
+    """
+    near = atlas(kind, None)
+    model = replace(random_atlas(charts(), kind), tail=np.zeros((1, 16), np.uint8))
     texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
-    near.bound["u_change"] = points_of(np.stack([texels / size[0, 0], 0 * texels], 1))
-    near.bound["wlm_atlas_tail"] = np.full((model.height // 4, model.width // 4, 4), 0.5, np.float16)
+    near.bound["u_change"] = points_of(np.stack([texels / model.width, 0 * texels], 1))
+    rows, columns = -(-model.height // 16) * 4 + 4, -(-model.width // 16) * 4 + 4
+    tail = np.zeros((rows, columns, 4), np.float16)
+    tail[:] = (np.arange(columns) / columns)[None, :, None]
+    near.bound["wlm_atlas_tail"] = tail
+    points = near.bound["u_points"][0, :, :2]
+    place = points[:, 0].astype(np.float64) * model.width / 4 - 0.5
+    far = (np.clip(place, 0, columns - 1) / columns)[:, None]
     place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
+    if len(model.uv):
+        place = f"vec2(texelFetch(u_points, pixel, 0).xy), {place}"
     main = f"vec4 shown(ivec2 pixel) {{ return vec4(wlm_atlas_grad({place}), 1.0); }}\n"
     share = np.clip(np.log2(np.maximum(texels, 1.0)) - 1.0, 0.0, 1.0)[:, None]
-    expected = (1.0 - share) * near.expected + share * 0.5
+    expected = (1.0 - share) * near.expected + share * far
     return replace(near, text=atlas_glsl(model), main=f"{POINTS}uniform sampler2D u_change;\n{main}", expected=expected)
 
 
@@ -125,38 +137,63 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def scene(_) -> Subject:
+def random_scene(short: bool, mixed: bool) -> SceneModel:
+    """Two sheets, the first with two smaller levels.
+
+    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks.
+    """
     random = np.random.default_rng(1)
-    texels = pack_rgb9e5(random.random((4 * 20, 24, 3)).astype(np.float32)).reshape(4, 20, 24)
-    size = random.integers(1, 8, (9, 11, 2))
-    first = random.integers(0, np.array([24, 20]) - size + 1)
-    lut = pack_entries(first, size)
-    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 0), SheetPlace("b", 22, 29, 5, 4, 4, 5, 1))
-    factor = random.random((3, 2, 3)).astype(np.float32)
-    model = SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), sheets, factor, texels, lut)
-    decoder, number = SceneDecoder(model), random.integers(0, 2, 500)
-    uv = random.uniform(-0.05, 1.05, (500, 2)).astype(np.float32)
-    expected = decoder.read(torch.from_numpy(uv), torch.from_numpy(number), 1.25).numpy()
-    calls = [
-        f"wlm_scene(at.xy, vec2({s.width}.0, {s.height}.0), ivec2({s.column}, {s.row}), ivec2({s.columns}, {s.rows}), "
-        f"{s.page})"
-        for s in sheets
-    ]
+    texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
+    size = random.integers(1, 8, (13, 11, 2))
+    count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
+    first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
+    second, blocks = {}, False
+    if mixed:
+        pages = [quantise(random.random((16, 24, 3)), "bc6h") for _ in range(2)]
+        second = {"blocks": np.stack([page["blocks"] for page in pages])}
+        second |= {"block_texels": np.stack([page["texels"] for page in pages])}
+        blocks = random.random((13, 11)) < 0.5
+        whole = random.integers(1, 3, (13, 11, 2))
+        size = np.where(blocks[..., None], 4 * whole, size)
+        most = np.array([6, 4]) - whole * np.stack([np.maximum(count, 1), np.ones_like(count)], 2)
+        first = np.where(blocks[..., None], 4 * random.integers(0, most + 1), first)
+    lut = pack_tiles(first, size, random.integers(0, 5, (13, 11)), count, random.integers(0, 2, (13, 11)), blocks)
+    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
+    levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
+    factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
+    if short:
+        factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
+    parts = (sheets, factor, texels, lut, levels)
+    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), *parts, **second)
+
+
+def scene(short, mixed, _) -> Subject:
+    model, random = random_scene(short, mixed), np.random.default_rng(2)
+    decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
+    uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
+    texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
+    lod = torch.from_numpy(np.log2(np.maximum(texels, 1.0)).astype(np.float32))
+    points = torch.from_numpy(uv), torch.from_numpy(number)
+    expected = decoder.read(*points, 1.25, lod).numpy()
     main = f"""{POINTS}vec4 shown(ivec2 pixel)
 {{
     vec4 at = texelFetch(u_points, pixel, 0);
-    if (at.z == 0.0)
-        return vec4({calls[0]}, 1.0);
-    return vec4({calls[1]}, 1.0);
+    if (at.w == 0.0)
+        return vec4(wlm_scene(at.xy, int(at.z), 1.25), 1.0);
+    return vec4(wlm_scene_grad(at.xy, vec2(0.0, at.w), vec2(0.0, 0.0), int(at.z), 1.25), 1.0);
 }}
 """
-    layers = np.stack([rgba(unpack_rgb9e5(layer)) for layer in texels])
+    heights = np.array([each.height for each in model.sheets])[number]
     bound = {
-        "u_points": points_of(np.column_stack([uv, number])),
-        "wlm_scene_lut": lut,
-        "wlm_scene_colour": layers,
-        "wlm_scene_factor": np.pad(decoder.factors(1.25), ((0, 0), (0, 1))),
+        "u_points": points_of(np.column_stack([uv, number, texels / heights])),
+        "wlm_scene_sheets": sheet_texels(model),
+        "wlm_scene_lut": model.lut,
+        "wlm_scene_factors": factor_texels(model),
+        # Of one layer wgpu would make no array.
+        "wlm_scene_colour": np.stack([rgba(unpack_rgb9e5(layer)) for layer in (*model.texels, model.texels[0])]),
     }
+    if mixed:
+        bound["wlm_scene_blocks"] = np.stack([rgba(page) for page in model.block_texels])
     return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
 
 
@@ -291,8 +328,11 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
-    "atlas mips": mips,
-    "scene": scene,
+    "atlas mips": partial(mips, MIXED),
+    "atlas cascade mips": partial(mips, "cascade"),
+    "scene": partial(scene, False, False),
+    "scene of one component": partial(scene, True, False),
+    "scene mixed": partial(scene, False, True),
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,
@@ -343,7 +383,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     found = shown(subject, language, True, tmp_path)[..., :channels]
     np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
     # WebGPU filters no 32-bit floats, and its core has no 16-bit levels: a table of coordinates is fetched there.
-    if subject.filtered is not None and (name != "atlas cascade" or language.startswith("glsl")):
+    if subject.filtered is not None and (not name.startswith("atlas cascade") or language.startswith("glsl")):
         found = shown(subject, language, False, tmp_path)[..., :channels]
         np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
 

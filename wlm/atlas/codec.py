@@ -20,6 +20,7 @@ from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
     MOST_SIZE,
+    TAIL_OCTAVES,
     AtlasModel,
     Profile,
     check_area,
@@ -59,6 +60,8 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         parts["colour"] = model.blocks
     elif model.colour != "half":
         parts["colour"] = pack_rgb9e5(model.texels)
+    if len(model.tail):
+        settings["tail"] = list(tail_shapes(model.height, model.width)[0])
     if model.colour == "mixed":
         settings["block_texels"] = list(model.block_texels.shape[:2])
         parts["blocks"] = model.blocks
@@ -121,7 +124,8 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
 class _Header(Header):
     """The settings of a file.
 
-    `size`, `texels` and `block_texels` are rows and columns of the lightmap, of T_p and of its second texture.
+    `size`, `texels`, `block_texels` and `tail` are rows and columns of the lightmap, of T_p, of its second texture and
+    of the first level of the mips.
     """
 
     name: Name
@@ -130,6 +134,7 @@ class _Header(Header):
     size: _Size
     texels: _Size
     block_texels: _Size | None = None
+    tail: _Size | None = None
     profile: Profile
     report: dict[str, JsonValue]
     parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
@@ -170,6 +175,10 @@ def _checked(
         **PARTS,
     }
     parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
+    # The first files with mips had levels of any sides.
+    first_level = header.tail or [-(-side >> TAIL_OCTAVES) for side in (height, width)]
+    if len(parts["tail"]) and tuple(first_level) != tail_shapes(height, width)[0]:
+        raise ValueError("setting tail: expected mips of whole blocks; compress again")
     lut, corners = parts["lut"], decode_corners({name: parts.pop(name) for name in PARTS})
     if len(corners):
         if len(parts["uv"]):

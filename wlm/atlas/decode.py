@@ -7,7 +7,7 @@ import warp as wp
 from wlm import interop
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.mips import Tail
-from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, TAIL_OCTAVES, AtlasModel
+from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, TAIL_OCTAVES, AtlasModel, tail_codec
 from wlm.atlas.views import corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
@@ -48,25 +48,29 @@ class Decoder:
             self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
             self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
-        self._tail = Tail(model.tail, model.height, model.width, self.device) if len(model.tail) else None
+        size = model.height, model.width
+        self._tail = Tail(model.tail, *size, tail_codec(model.colour), self.device) if len(model.tail) else None
 
-    def read(self, uv: torch.Tensor, lod: torch.Tensor | None = None) -> torch.Tensor:
+    def read(self, uv: torch.Tensor, lod: torch.Tensor | None = None, own: torch.Tensor | None = None) -> torch.Tensor:
         """Reads light at coordinates, as a shader does.
 
         Args:
             uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the lightmap's.
             lod: float32 [N], octaves of the lightmap's texels along a pixel, of a model with mips; None: up close.
+            own: With `lod`, of a model with new UVs: the lightmap's, which the mips are under.
 
         Returns:
             float32 [N, 3].
 
         Raises:
-            ValueError: The model has no mips.
+            ValueError: The model has no mips, or the lightmap's UVs are missing.
         """
         if lod is not None:
             if self._tail is None:
                 raise ValueError("lod: expected a model with mips")
-            near, far = self.read(uv), self._tail.read(uv, lod)
+            if own is None and len(self._corner):
+                raise ValueError("own: expected the lightmap's UVs beside the new ones, found none")
+            near, far = self.read(uv), self._tail.read(uv if own is None else own, lod)
             return near + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - near)
         uv = uv.contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)

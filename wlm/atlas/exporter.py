@@ -6,7 +6,7 @@ mask.png                        the texels that belong to charts, unless those a
 lut.exr, .ktx2, .dds            T_c, unless the model is "plain"
 colour.exr, .ktx2, .dds         T_p; blocks of ASTC have no DDS
 blocks.exr, .ktx2, .dds         the second texture of colour "mixed", BC6H
-tail.dds                        the mips, if the model has them, BC6H
+tail.dds, or .ktx2 of ASTC      the mips, if the model has them
 atlas.glsl                      a function that reads them
 report.json                     settings, sizes, times, warnings, and where the inputs were
 """
@@ -25,7 +25,7 @@ from wlm import system
 from wlm.atlas import codec
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh, from_arrays, load, write_mesh
-from wlm.atlas.model import BLOCKS, LUT_STEPS, TEXELS, AtlasModel, disk_ratio, tail_shapes
+from wlm.atlas.model import BLOCKS, LUT_STEPS, TEXELS, AtlasModel, disk_ratio, tail_codec, tail_shapes
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
@@ -46,10 +46,10 @@ MASK_FILE = "mask.png"
 SHADER_FILE = "atlas.glsl"
 REPORT_FILE = "report.json"
 _TEXTURES = tuple(name + suffix for name in ("lut", "colour", "blocks") for suffix in (".exr", ".ktx2", ".dds"))
-TAIL_FILE = "tail.dds"
+_TAILS = ("tail.dds", "tail.ktx2")
 READING = {"node": str, "encoding": str, "flip": bool}
 """Options of `load` that the report keeps among the inputs."""
-_FILES = (MODEL_FILE, MESH_FILE, MASK_FILE, *_TEXTURES, TAIL_FILE, SHADER_FILE, REPORT_FILE)
+_FILES = (MODEL_FILE, MESH_FILE, MASK_FILE, *_TEXTURES, *_TAILS, SHADER_FILE, REPORT_FILE)
 _MOST_SIDE = 16384  # texels of a texture on GPUs
 _LUT_FORMATS = {"tiles": "R16G16_UINT", "cascade": "R16G16_UNORM"}
 
@@ -121,8 +121,11 @@ def export(
         _write_colour(temporary, model)
         if len(model.tail):
             (rows, columns), *rest = tail_shapes(model.height, model.width)
-            blocks = model.tail.tobytes()
-            write_dds(temporary / TAIL_FILE, blocks, columns, rows, fmt="BC6H_UF16", mips=len(rest))
+            blocks, size = model.tail.tobytes(), (columns, rows)
+            if tail_codec(model.colour) == "astc":
+                write_ktx2(temporary / "tail.ktx2", blocks, *size, "ASTC_4x4_SFLOAT_BLOCK", mips=len(rest))
+            else:
+                write_dds(temporary / "tail.dds", blocks, *size, fmt="BC6H_UF16", mips=len(rest))
         atomic_write(temporary / SHADER_FILE, atlas_glsl(model).encode())
         names = sorted(path.name for path in temporary.iterdir())
         report = _report(model, mesh, new_set, model_bytes) | dict(facts or {})

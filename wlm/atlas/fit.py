@@ -18,7 +18,17 @@ from wlm.atlas.cascade import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.decode import Decoder
 from wlm.atlas.mips import make_tail
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, check_area, tail_bits
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    COLOUR_BITS,
+    SOURCE_BITS,
+    AtlasModel,
+    Profile,
+    check_area,
+    tail_bits,
+    tail_codec,
+)
 from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit_tiles
@@ -70,10 +80,11 @@ def compress(
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
     check_size(*mesh.mask.shape)
-    if profile.mips and tail_bits(*mesh.mask.shape) >= profile.budget * mesh.mask.size * SOURCE_BITS:
+    tail, tiles = tail_bits(*mesh.mask.shape), profile.method == "tiles"
+    if profile.mips and tiles and tail >= profile.budget * mesh.mask.size * SOURCE_BITS:
         raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")
     stages, grid = Stages(device, progress, checkpoint), FineGrid(mesh, device)
-    if profile.method == "cascade":
+    if not tiles:
         model = fit_cascade(mesh, group_triangles(mesh, profile, stages), profile, seed, stages)
     else:
         model = fit_tiles(grid, profile, seed, stages)
@@ -84,7 +95,7 @@ def compress(
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     if profile.mips:
         with stages("mips"):
-            model = replace(model, tail=make_tail(mesh, device))
+            model = replace(model, tail=make_tail(mesh, tail_codec(model.colour), device))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
     lost = LostLight()
     lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])

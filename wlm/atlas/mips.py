@@ -1,8 +1,9 @@
-"""Mips of an atlas of tiles: a small lightmap for what is far away.
+"""Mips of an atlas: a small lightmap for what is far away.
 
-Tiles that are neighbours in the lightmap aren't in T_p, so that its own mips would mix what doesn't belong together. In
-place of them the tail is the lightmap at a quarter of its resolution with all smaller levels, one texture of BC6H under
-the mesh's own UVs. With `lod` the octaves of the lightmap's texels along a pixel, light is
+What is beside each other in the lightmap, tiles or a cascade's triangles, isn't in T_p, so that its own mips would mix
+what doesn't belong together. In place of them the tail is the lightmap at a quarter of its resolution with all smaller
+levels, one texture under the mesh's own UVs: blocks of BC6H, or of ASTC where the colours are. With `lod` the octaves
+of the lightmap's texels along a pixel, light is
 
     mix(tiles, tail, clamp(lod - 1, 0, 1)),    the tail read at its own level lod - 2,
 
@@ -12,54 +13,80 @@ tail takes 1.4% of the lightmap's bits.
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 from wlm.atlas import colour
 from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import BLOCKS, TAIL_OCTAVES, tail_blocks, tail_shapes
+from wlm.atlas.model import TAIL_OCTAVES, tail_blocks, tail_shapes, tail_share
 from wlm.atlas.resize import box
 from wlm.ops.raster import texture
 from wlm.texels import fill_gaps
 
 
-def make_tail(mesh: LightmappedMesh, device: str = "cpu") -> np.ndarray:
+def make_tail(mesh: LightmappedMesh, codec: str, device: str = "cpu") -> np.ndarray:
     """Makes the tail of a lightmap.
+
+    Args:
+        mesh: The mesh.
+        codec: `tail_codec`.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        uint8 [B, 16], blocks, level by level.
+
+    Raises:
+        WlmError: A package for ASTC is missing.
+    """
+    levels = tail_light(mesh.lightmap, mesh.mask, device)
+    return np.concatenate([colour.encode(light, codec, weight, device)[0] for light, weight in levels])
+
+
+def tail_light(light: np.ndarray, mask: np.ndarray, device: str = "cpu") -> list[tuple[np.ndarray, np.ndarray]]:
+    """The levels of a tail before they are stored.
 
     A texel is the mean of those of the mask that it covers; one that covers none has the nearest's.
 
     Args:
-        mesh: The mesh.
+        light: [H, W, 3].
+        mask: bool [H, W].
         device: "cpu" or "cuda:N".
 
     Returns:
-        uint8 [B, 16], blocks of BC6H, level by level.
+        For each of `tail_shapes` its light [h, w, 3] and the weights of its texels [h, w], float64.
     """
-    share = torch.from_numpy(mesh.mask).double()[..., None]
-    sums = torch.cat([torch.from_numpy(mesh.lightmap).double() * share, share], 2).to(device)
-    blocks = []
-    for shape in tail_shapes(*mesh.mask.shape):
+    shapes, levels = tail_shapes(*mask.shape), []
+    share = torch.from_numpy(mask).double()[..., None]
+    sums = torch.cat([torch.from_numpy(light).double() * share, share], 2)
+    margin = [(size << TAIL_OCTAVES) - side for size, side in zip(shapes[0], mask.shape, strict=True)]
+    sums = pad(sums, (0, 0, 0, margin[1], 0, margin[0])).to(device)
+    for shape in shapes:
         sums = box(sums, *shape)
         values = sums.cpu().numpy()
         weight = values[..., 3]
-        light = fill_gaps(values[..., :3] / np.maximum(weight, 1e-9)[..., None], weight > 1e-9)
-        blocks.append(colour.encode(light, BLOCKS, weight, device)[0])
-    return np.concatenate(blocks)
+        levels.append((fill_gaps(values[..., :3] / np.maximum(weight, 1e-9)[..., None], weight > 1e-9), weight))
+    return levels
 
 
 class Tail:
     """A tail on a device."""
 
-    def __init__(self, blocks: np.ndarray, height: int, width: int, device: str) -> None:
+    def __init__(self, blocks: np.ndarray, height: int, width: int, codec: str, device: str) -> None:
         """Decodes a tail.
 
         Args:
             blocks: As of `make_tail`.
             height, width: Of the lightmap.
+            codec: `tail_codec`.
             device: "cpu" or "cuda:N".
+
+        Raises:
+            WlmError: A block isn't one of the format, or a package for ASTC is missing.
         """
         self._levels, begin = [], 0
+        self._share = torch.tensor(tail_share(height, width)[::-1], device=device)
         for shape in tail_shapes(height, width):
             end = begin + tail_blocks(*shape)
-            light = colour.decode(blocks[begin:end], *shape, BLOCKS)
+            light = colour.decode(blocks[begin:end], *shape, codec)
             self._levels.append(torch.from_numpy(light).to(device))
             begin = end
 
@@ -67,12 +94,13 @@ class Tail:
         """Reads light between two levels.
 
         Args:
-            uv: float32 [N, 2].
+            uv: float32 [N, 2], the mesh's own.
             lod: float32 [N], octaves of the lightmap; up to 2 the tail's first level.
 
         Returns:
             float32 [N, 3].
         """
+        uv = uv * self._share
         place = (lod - TAIL_OCTAVES).clamp(0, len(self._levels) - 1)
         low = place.floor().long()
         light = torch.zeros((len(uv), 3), device=uv.device)

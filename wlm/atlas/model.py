@@ -68,7 +68,7 @@ class Profile(Settings):
         unseen: Weight of what no view shows, as a fraction of the mean weight.
         border: Factor on the weight within a texel of a chart's border: an error there is a seam.
         relative: How much of the weight is of the relative error, 0 to 1; the rest is of the error in linear light.
-        mips: For "tiles": whether there is a tail of smaller levels, `wlm.atlas.mips`; its bits are part of the budget.
+        mips: Whether there is a tail of smaller levels, `wlm.atlas.mips`; for "tiles" its bits are part of the budget.
         fallback: Whether a plain smaller lightmap of as many bits replaces the result if its error is no larger.
         threshold: lambda of eq. 4; 0 shares no triangles.
         colour_threshold: lambda_h of section 3.2.1.
@@ -115,8 +115,7 @@ class Profile(Settings):
         """Replaces some settings, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: Unknown or out of range; or a budget, two textures or mips for the cascade, which has none; or
-                mips beside ASTC.
+            WlmError: Unknown or out of range; or a budget or two textures for the cascade, which has none.
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
@@ -125,10 +124,6 @@ class Profile(Settings):
                 )
             if (values.get("colour") or self.colour) == "mixed":
                 raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
-            if values.get("mips") or self.mips:
-                raise WlmError(f"{prefix}mips: expected a profile of tiles")
-        elif (values.get("mips") or self.mips) and (values.get("colour") or self.colour) == "astc":
-            raise WlmError(f"{prefix}mips: they are of BC6H: expected colour half, rgb9e5, bc6h or mixed, found astc")
         return super().override(values, prefix)
 
 
@@ -153,7 +148,7 @@ class AtlasModel(Model):
         block_texels: half [Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 3] for none.
         lut: uint16 [Hc, Wc, 2], T_c: for "tiles" `pack_entries`' [ty, tx, 2]; for "cascade" coordinates in units of
             1 / `LUT_STEPS`; [0, 0, 2] for "plain".
-        tail: uint8 [B, 16], the mips' blocks of BC6H, level by level; [0, 16] for none.
+        tail: uint8 [B, 16], the mips' blocks, level by level, of ASTC beside it and else of BC6H; [0, 16] for none.
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
         report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
             run), groups, why it is plain.
@@ -231,11 +226,26 @@ def compression_ratio(
 
 
 def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of the mips of a lightmap: a quarter, rounded up, then halves, rounded down, to one texel."""
-    scale = 1 << TAIL_OCTAVES
-    height, width = -(-height // scale), -(-width // scale)
+    """Rows and columns of the mips of a lightmap: a quarter, in whole blocks, then halves, rounded down, to one texel.
+
+    The first level is a margin larger than a quarter where that isn't of whole blocks, which Direct3D and browsers ask
+    for: `tail_share` of it is the lightmap.
+    """
+    step = BLOCK_SIDE << TAIL_OCTAVES
+    height, width = (-(-side // step) * BLOCK_SIDE for side in (height, width))
     levels = max(height, width).bit_length()
     return [(max(height >> level, 1), max(width >> level, 1)) for level in range(levels)]
+
+
+def tail_share(height: int, width: int) -> tuple[float, float]:
+    """How much of the mips is the lightmap, from the first texel on, along v and u."""
+    first = tail_shapes(height, width)[0]
+    return height / (first[0] << TAIL_OCTAVES), width / (first[1] << TAIL_OCTAVES)
+
+
+def tail_codec(colour: str) -> str:
+    """The format of the mips' blocks, by `colour` of the model: that which its GPU has."""
+    return "astc" if colour == "astc" else BLOCKS
 
 
 def tail_blocks(height: int, width: int) -> int:

@@ -19,19 +19,27 @@ _HEAD = """\
 """
 
 _GRAD = """
-// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_atlas(uv).
-vec3 wlm_atlas_grad(vec2 uv, vec2 dx, vec2 dy)
+{comment}
+vec3 wlm_atlas_grad({parameters}, vec2 dx, vec2 dy)
 {{
-    vec2 size = {scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)); // of the lightmap, in texels
+    vec2 size = vec2({width}.0, {height}.0); // of the lightmap, in texels
     float texels = max(length(dx * size), length(dy * size)); // along the pixel
     // A bilinear read still meets all texels where a pixel is two of them.
     float share = log2(max(texels, 1.0)) - {octaves}.0;
     if (share <= 0.0)
         return wlm_atlas(uv);
-    vec3 far = textureGrad(WLM_ATLAS_TAIL, uv, dx, dy).rgb;
+    // Of the tail the lightmap is the part that begins at its first texel: its sides are those of whole blocks.
+    vec2 part = size / ({scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)));
+    vec3 far = textureGrad(WLM_ATLAS_TAIL, {own} * part, dx * part, dy * part).rgb;
     return share < 1.0 ? mix(wlm_atlas(uv), far, share) : far;
 }}
 """
+
+_NEAR = """\
+// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_atlas(uv)."""
+_NEAR_OWN = """\
+// Light where a pixel is large: own is the lightmap's UVs as the mesh had them, beside the new ones, dx and dy are
+// dFdx(own) and dFdy(own). Up close it is wlm_atlas(uv)."""
 
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
@@ -154,5 +162,12 @@ def atlas_glsl(model: AtlasModel) -> str:
     elif cascade:
         body = _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
     if len(model.tail):
-        body += _GRAD.format(scale=1 << TAIL_OCTAVES, octaves=TAIL_OCTAVES - 1)
+        names = ("vec2 uv, vec2 own", "own", _NEAR_OWN) if len(model.uv) else ("vec2 uv", "uv", _NEAR)
+        body += _GRAD.format(
+            **dict(zip(("parameters", "own", "comment"), names, strict=True)),
+            width=model.width,
+            height=model.height,
+            scale=1 << TAIL_OCTAVES,
+            octaves=TAIL_OCTAVES - 1,
+        )
     return text + body

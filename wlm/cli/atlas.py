@@ -102,8 +102,6 @@ def compress(
             "node": node,
             "encoding": encoding,
             "flip": flip,
-            "colour": colour,
-            "mips": mips,
             "resume": resume,
         }
         for name, value in lone.items():
@@ -112,7 +110,7 @@ def compress(
         quiet_warp()
         from wlm.cli.atlas_scene import compress_scene
 
-        changes = {"budget": budget, "views": views}
+        changes = {"budget": budget, "colour": colour, "mips": mips or None, "views": views}
         options = {"seed": seed, "device": device, "trust": trust}
         compress_scene(mesh_path, lightmap_path, output, uv_set=uv_set, profile=profile, overrides=changes, **options)
         return
@@ -331,7 +329,13 @@ def info(
     """Say what a compressed lightmap holds, without decoding it."""
     quiet_warp()
     from wlm.atlas.exporter import describe
+    from wlm.atlas.scene.exporter import is_scene
 
+    if is_scene(path):
+        from wlm.cli.atlas_scene import show_scene
+
+        show_scene(path, as_json)
+        return
     facts = describe(path)
     if as_json:
         show_json(facts)

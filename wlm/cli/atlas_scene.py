@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from wlm.cli.console import escape, note, number, running, show, table, write_json
+from wlm.cli.console import escape, note, number, running, show, show_json, table, write_json
 from wlm.errors import WlmError
 
 
@@ -49,9 +49,39 @@ def compress_scene(
     rows.add_row("objects", f"{len(scene.objects):,}")
     rows.add_row("sheets", f"{len(scene.sheets):,}")
     rows.add_row("states", f"{len(scene.states):,}")
-    rows.add_row("components", f"{model.factor.shape[1]}")
+    counts = model.report["components"]
+    mean = sum(int(count) * tiles for count, tiles in counts.items()) / sum(counts.values())
+    rows.add_row("components of a tile", f"{mean:.1f} of {model.report['mixtures']} mixtures")
     rows.add_row("CR of all textures", f"{model.compression_ratio:.2%}")
     rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
+    show(rows)
+
+
+def show_scene(path: Path, as_json: bool) -> None:
+    """Shows what a scene's folder or model holds."""
+    from wlm.atlas.scene.exporter import describe_scene
+
+    facts = describe_scene(path)
+    if as_json:
+        show_json(facts)
+        return
+    rows = table(str(path), ["", "value"])
+    rows.add_row("name", escape(facts["name"]))
+    rows.add_row("bytes", f"{facts['bytes']:,}")
+    rows.add_row("states", escape(", ".join(facts["states"])))
+    rows.add_row("sheets", f"{len(facts['sheets']):,}")
+    rows.add_row("smaller levels", f"{facts['levels']:,}")
+    width, height, pages = facts["colour_size"]
+    rows.add_row("colour texture", f"{width}x{height}, {pages} pages")
+    rows.add_row("table", "x".join(map(str, facts["lut_size"])))
+    rows.add_row("factors of a state", f"{facts['factors']:,}")
+    rows.add_row("CR of all textures", f"{facts['cr']:.2%}")
+    rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}")
+    rows.add_row("source", escape(facts["source"]))
+    rows.add_row("profile", escape(facts["profile"]["name"]))
+    rows.add_section()
+    for part, count in facts["parts"].items():
+        rows.add_row(f"bytes of {part}", f"{count:,}")
     show(rows)
 
 

@@ -10,7 +10,9 @@ import struct
 from wlm.formats.atomic import atomic_write
 
 DXGI_FORMATS = {
+    "R32G32B32A32_FLOAT": 2,
     "R16G16B16A16_FLOAT": 10,
+    "R16G16B16A16_UINT": 12,
     "R10G10B10A2_UNORM": 24,
     "R11G11B10_FLOAT": 26,
     "R8G8B8A8_UNORM": 28,
@@ -31,6 +33,8 @@ others with a texel's channels one after another, little-endian; those of 10 bit
 _BLOCK_BYTES = 16
 # Of the formats without blocks.
 _TEXEL_BYTES = {
+    "R32G32B32A32_FLOAT": 16,
+    "R16G16B16A16_UINT": 8,
     "R16G16B16A16_FLOAT": 8,
     "R10G10B10A2_UNORM": 4,
     "R11G11B10_FLOAT": 4,

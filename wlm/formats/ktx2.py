@@ -1,4 +1,5 @@
-"""KTX2 files of the textures that we export: 2D, or 3D for grids of probes, one mip level, not supercompressed.
+"""KTX2 files of the textures that we export: 2D, the tail of an atlas with mips, or 3D for grids of probes; none is
+supercompressed.
 
 Layout: the KTX file format specification 2.0; the data format descriptor: Khronos Data Format specification 1.3, the
 basic descriptor block.
@@ -30,9 +31,9 @@ VK_FORMATS = {
 
 _IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
-# length of the descriptor and of the key/value data; of the supercompression's data; then the level's offset, length
-# and length without supercompression.
-_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
+# length of the descriptor and of the key/value data; of the supercompression's data.
+_HEADER = struct.Struct("<12s 9I 4I 2Q")
+_LEVEL = struct.Struct("<3Q")  # a level's offset, length and length without supercompression
 _BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
 _MAX_DEPTH = 2048  # slices, likewise
@@ -56,7 +57,9 @@ _SHARED = "E5B9G9R9_UFLOAT_PACK32"
 _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 
 
-def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str, depth: int = 0) -> int:
+def write_ktx2(
+    path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str, depth: int = 0, mips: int = 0
+) -> int:
     """Writes texels or blocks as a KTX2 file, whole or not at all.
 
     Args:
@@ -67,12 +70,15 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         height: Texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
+        mips: Levels after the first of a 2D texture, of half the size each, rounded down; `data` holds them one after
+            another.
 
     Returns:
         The number of bytes written.
 
     Raises:
-        ValueError: An unknown format, a size out of range, or data that doesn't fill the texture.
+        ValueError: An unknown format, a size or a number of mips out of range, mips of a 3D texture, or data that
+            doesn't fill the texture.
         WlmError: The file can't be written; what was there before stays.
     """
     if fmt not in VK_FORMATS:
@@ -81,30 +87,40 @@ def write_ktx2(path: str | os.PathLike[str], data: bytes, width: int, height: in
         raise ValueError(f"expected sides of 1 to {_MAX_SIDE} texels, got {width}x{height}")
     if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
         raise ValueError(f"depth: expected 0 to {_MAX_DEPTH} slices of texels, got {depth} of {fmt}")
-    size = _size(fmt, width, height) * max(depth, 1)
-    if len(data) != size:
-        raise ValueError(f"data: expected {size} bytes, got {len(data)}")
+    most = 0 if depth else max(width, height).bit_length() - 1
+    if not 0 <= mips <= most:
+        raise ValueError(f"mips: expected 0 to {most}, got {mips}")
+    sizes = [_size(fmt, max(width >> level, 1), max(height >> level, 1)) * max(depth, 1) for level in range(mips + 1)]
+    if len(data) != sum(sizes):
+        raise ValueError(f"data: expected {sum(sizes)} bytes, got {len(data)}")
     descriptor = _descriptor(fmt)
     # In the order of their keys; r, d and i: to the right, down and inwards.
     pairs = _pair("KTXorientation", "rdi" if depth else "rd") + _pair("KTXwriter", "wlm")
-    end = _HEADER.size + len(descriptor) + len(pairs)
-    # A level begins at a multiple of both 4 and the bytes of a texel or block.
-    start = end + -end % math.lcm(4, _texel_bytes(fmt))
+    begin = _HEADER.size + _LEVEL.size * len(sizes)
+    end = begin + len(descriptor) + len(pairs)
+    # A level begins at a multiple of both 4 and the bytes of a texel or block; the smallest comes first.
+    step = math.lcm(4, _texel_bytes(fmt))
+    index, pieces, place = [], [], end
+    for level in reversed(range(len(sizes))):
+        first = sum(sizes[:level])
+        gap = bytes(-place % step)
+        index.insert(0, _LEVEL.pack(place + len(gap), sizes[level], sizes[level]))
+        pieces += [gap, data[first : first + sizes[level]]]
+        place += len(gap) + sizes[level]
     header = _HEADER.pack(
         _IDENTIFIER,
         VK_FORMATS[fmt],
         4 if fmt == _SHARED else _channel_bytes(fmt) if fmt in _CHANNELS else 1,
         width,
         height,
-        *(depth, 0, 1, 1, 0),
-        _HEADER.size,
+        *(depth, 0, 1, 1 + mips, 0),
+        begin,
         len(descriptor),
-        _HEADER.size + len(descriptor),
+        begin + len(descriptor),
         len(pairs),
         *(0, 0),
-        *(start, len(data), len(data)),
     )
-    return atomic_write(path, [header, descriptor, pairs, bytes(start - end), data])
+    return atomic_write(path, [header, *index, descriptor, pairs, *pieces])
 
 
 def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
@@ -119,13 +135,14 @@ def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         WlmError: The file can't be read, is another kind of texture, or is cut short.
     """
-    largest = _HEADER.size + _MOST_TEXELS * 8 + _MOST_PAIRS
+    head = _HEADER.size + _LEVEL.size
+    largest = head + _MOST_TEXELS * 8 + _MOST_PAIRS
     data = read_file(path, largest, "the texture")
-    if len(data) < _HEADER.size or data[: len(_IDENTIFIER)] != _IDENTIFIER:
+    if len(data) < head or data[: len(_IDENTIFIER)] != _IDENTIFIER:
         raise WlmError(f"{path}: expected a KTX2 texture")
     fields = _HEADER.unpack_from(data)
     fmt, _, width, height, depth, layers, faces, levels, packing = fields[1:10]
-    start, length = fields[-3:-1]
+    start, length, _ = _LEVEL.unpack_from(data, _HEADER.size)
     if (fmt, layers, faces, levels, packing) != (VK_FORMATS["R16G16B16A16_SFLOAT"], 0, 1, 1, 0) or not depth:
         raise WlmError(f"{path}: expected one 3D texture of half floats in RGBA, not packed, found format {fmt}")
     if length != 8 * width * height * depth or start + length > len(data):

@@ -1,7 +1,7 @@
 """Reads light of a scene: one entry of the table that all sheets share, then a bilinear read of each component.
 
 As `wlm_kernels.atlas.decode`, but that a sheet's tiles begin at a place of their own in the table, that texels are
-packed as RGB9E5, and that light is a sum of components, each a layer of the texture, by the state's factors.
+packed as RGB9E5, and that light is a sum of components, rectangles beside each other, by the state's factors.
 
 Read `wlm/atlas/scene/exact.py` first: the same in float64 NumPy.
 """
@@ -13,13 +13,24 @@ from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
 
-_NO_BLOCKS = wp.constant(16)  # more than any size's code: no entry names blocks
+_SIDE_MASK = wp.constant(15)
+_BLOCK = wp.constant(4)
+_COUNT_BITS = wp.constant(8)
+_COUNT_MASK = wp.constant(255)
 
 
 @wp.func
-def _mixed(texels: wp.array3d[wp.uint32], layer: int, row: int, x: Axis) -> wp.vec3:
-    """The light of a row between two texels."""
-    return wp.lerp(unpack_rgb9e5(texels[layer, row, x.low]), unpack_rgb9e5(texels[layer, row, x.high]), x.share)
+def _mixed(texels: wp.array3d[wp.uint32], page: int, row: int, column: int, x: Axis) -> wp.vec3:
+    """The light of a row between two texels, of the rectangle that begins so many columns on."""
+    near = unpack_rgb9e5(texels[page, row, column + x.low])
+    return wp.lerp(near, unpack_rgb9e5(texels[page, row, column + x.high]), x.share)
+
+
+@wp.func
+def _mixed_blocks(blocks: wp.array3d[wp.vec3h], page: int, row: int, column: int, x: Axis) -> wp.vec3:
+    """`_mixed` of the second texture."""
+    near = wp.vec3(blocks[page, row, column + x.low])
+    return wp.lerp(near, wp.vec3(blocks[page, row, column + x.high]), x.share)
 
 
 @wp.kernel
@@ -29,9 +40,11 @@ def _read(
     sheet: wp.array1d[int],
     sheets: wp.array2d[int],  # [S, 7]
     size: int,
-    factor: wp.array1d[wp.vec3],  # [K]
+    factor: wp.array1d[wp.vec3],  # [C]
     lut: wp.array3d[wp.uint16],
     texels: wp.array3d[wp.uint32],
+    blocks: wp.array3d[wp.vec3h],
+    first_block_code: int,
     # out:
     out: wp.array1d[wp.vec3],
 ):
@@ -43,30 +56,57 @@ def _read(
     across = tile_place(u[0], sheets[s, 1], size, sheets[s, 5])
     row = sheets[s, 2] + int(down[0])
     column = sheets[s, 3] + int(across[0])
-    x = axis_at(lut[row, column, 0], across[1], _NO_BLOCKS)
-    y = axis_at(lut[row, column, 1], down[1], _NO_BLOCKS)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    count = factor.shape[0]
+    x = axis_at(lut[row, column, 0], across[1], first_block_code)
+    y = axis_at(lut[row, column, 1], down[1], first_block_code)
+    step = (int(lut[row, column, 0]) & _SIDE_MASK) + 1
+    of_blocks = step > first_block_code
+    if of_blocks:
+        step = _BLOCK * (step - first_block_code)
+    first = int(0)
+    last = int(1)
+    if lut.shape[2] == 4:
+        first = int(lut[row, column, 2])
+        last = int(lut[row, column, 3])
+    page = last >> _COUNT_BITS
+    # NaN where there is no place.
+    total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
+    count = last & _COUNT_MASK
+    if count > 0:
+        total += factor[first]
     for k in range(count):
-        layer = sheets[s, 6] * count + k
-        top = _mixed(texels, layer, y.low, x)
-        bottom = _mixed(texels, layer, y.high, x)
-        total += wp.cw_mul(factor[k], wp.lerp(top, bottom, y.share))
+        top = wp.vec3(0.0, 0.0, 0.0)
+        bottom = wp.vec3(0.0, 0.0, 0.0)
+        if of_blocks:
+            top = _mixed_blocks(blocks, page, y.low, k * step, x)
+            bottom = _mixed_blocks(blocks, page, y.high, k * step, x)
+        else:
+            top = _mixed(texels, page, y.low, k * step, x)
+            bottom = _mixed(texels, page, y.high, k * step, x)
+        total += wp.cw_mul(factor[first + 1 + k], wp.lerp(top, bottom, y.share))
+    # Factors have any sign.
+    for c in range(3):
+        if total[c] < 0.0:
+            total[c] = 0.0
     out[i] = total
 
 
-def read(uv, sheet, sheets, size: int, factor, lut, texels, out) -> None:
+def read(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
     """Reads light at points.
 
     Args:
         uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
-        sheet: int [N], the sheet of each point.
+        sheet: int [N], the sheet or level of each point.
         sheets: int [S, 7]: rows and columns of texels; first row and column in the table; rows and columns of tiles;
-            page.
+            one number that isn't read.
         size: B, texels along a tile.
-        factor: vec3 [K], of each component.
-        lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
-        texels: uint32 [pages K, Hp, Wp], RGB9E5; a page's components follow each other.
+        factor: vec3 [C], of each mixture a constant and then one of each component.
+        lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
+            - 1; number of its factors; page << 8 | number of components. Or of the first two alone, [ty, tx, 2]: one
+            component and one page.
+        texels: uint32 [pages, Hp, Wp], RGB9E5; the components of a tile follow each other along a row.
+        blocks: vec3h [pages, Hb, Wb], the second texture, in blocks of 4 x 4 texels.
+        first_block_code: As of `wlm_kernels.atlas.decode`; 16: no entry is of the second texture.
         out: vec3 [N], written.
     """
-    wp.launch(_read, uv.shape, inputs=[uv, sheet, sheets, size, factor, lut, texels], outputs=[out], device=uv.device)
+    inputs = [uv, sheet, sheets, size, factor, lut, texels, blocks, first_block_code]
+    wp.launch(_read, uv.shape, inputs=inputs, outputs=[out], device=uv.device)

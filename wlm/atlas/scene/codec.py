@@ -1,23 +1,28 @@
 """The artifact of a scene's model: one file.
 
-Parts: `colour` (uint32 [pages K, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2]), `factor` (float32 [M, K, 3]) and
-`sheets` (int32 [S, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
+Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]), `factor` (float32 [M, C, 3]) and
+`sheets` (int32 [S + levels, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
+Earlier files name no `entries`, the numbers of one, `wlm.atlas.scene.earlier`.
 """
 
-from typing import Annotated, Any
+import math
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, JsonValue
 
-from wlm.atlas.model import MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace
+from wlm.atlas.colour import decode as decode_blocks
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
+from wlm.atlas.scene.earlier import side_by_side
+from wlm.atlas.scene.model import SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
 from wlm.formats.parts import Part, check_parts
 from wlm.system import Header, Name
 
-_MOST_COMPONENTS = 64
+_MOST_EARLIER = 64  # components of earlier files
+_MOST_FACTOR = 1e30  # sums of so many texels times it are finite
 _MOST_NUMBERS = 1 << 31  # along an axis of a part
 
 
@@ -27,10 +32,14 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "name": model.name,
         "states": list(model.states),
         "sheets": [sheet.name for sheet in model.sheets],
+        "entries": model.lut.shape[2],
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
     parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor, "sheets": model.table()}
+    if model.colour == "mixed":
+        settings["block_texels"] = list(model.block_texels.shape[1:3])
+        parts["blocks"] = model.blocks
     streams, settings["parts"] = deflated(parts)
     return settings, streams, model.source
 
@@ -39,6 +48,8 @@ class _Header(Header):
     name: Name
     states: list[Name]
     sheets: list[Name]
+    block_texels: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    entries: Literal[2, 4] | None = None
     profile: SceneProfile
     report: dict[str, JsonValue]
     parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
@@ -54,26 +65,49 @@ def decode(artifact: Artifact) -> SceneModel:
     header = check_settings(_Header, artifact.settings, "setting ")
     table = {
         "colour": Part(np.uint32, (None, None, None)),
-        "lut": Part(np.uint16, (None, None, 2)),
-        "factor": Part(np.float32, (len(header.states), None, 3), least=0.0),
-        "sheets": Part(np.int32, (len(header.sheets), 7), least=0),
+        "lut": Part(np.uint16, (None, None, None)),
+        "factor": Part(np.float32, (len(header.states), None, 3), least=-_MOST_FACTOR, most=_MOST_FACTOR),
+        "sheets": Part(np.int32, (None, 7), least=0),
+        "blocks": Part(np.uint8, (None, None, 16), optional=True),
     }
     parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
-    texels, lut, factor, sheets = (parts[name] for name in table)
+    texels, lut, factor, sheets, blocks = (parts[name] for name in table)
+    second = tuple(header.block_texels or (0, 0))
+    most = MOST_SIZE * BLOCK_SIDE
+    if any(side % BLOCK_SIDE or not 0 <= side <= most for side in second) or bool(len(blocks)) != all(second):
+        raise ValueError(f"setting block_texels: {second}: expected multiples of 4 beside blocks alone")
+    if len(blocks) and (header.entries is None or blocks.shape[1] != math.prod(second) // BLOCK_SIDE**2):
+        raise ValueError(f"part blocks: {blocks.shape}: expected those of {second} texels")
     if not (texels.size and lut.size and factor.size and len(sheets)):
         raise ValueError("a part is empty")
-    count = factor.shape[1]
-    pages, rest = divmod(len(texels), count)
-    if count > _MOST_COMPONENTS or rest or max(texels.shape[1:]) > MOST_SIZE:
-        raise ValueError(f"part colour: expected pages of {count} layers, found {texels.shape}")
-    first, size, _ = unpack_entries(lut, TEXELS)
-    if ((first + size) > texels.shape[:0:-1]).any():
-        raise ValueError("part lut: a tile reaches beyond the colour texture")
+    if max(texels.shape[1:]) > MOST_SIZE or lut.shape[2] != (header.entries or SHORT_ENTRY):
+        raise ValueError(f"part colour, part lut: {texels.shape}, {lut.shape}: expected pages and entries")
+    names = list(header.sheets)
+    if header.entries is None:
+        texels, lut, sheets = _of_earlier(texels, lut, factor.shape[1], sheets)
+        factor = np.pad(factor, ((0, 0), (1, 0), (0, 0)))
+    colour = "mixed" if len(blocks) else TEXELS
+    first, size, component, count, page, of_blocks = unpack_tiles(lut, colour)
+    if colour == "mixed" and (unpack_entries(lut[..., :2], colour)[2][..., 1] != of_blocks).any():
+        raise ValueError("part lut: a tile is of both textures")
+    size[..., 0] *= np.maximum(count, 1)
+    beyond = ((first + size) > np.where(of_blocks[..., None], second[::-1], texels.shape[:0:-1])).any(-1)
+    beyond |= page >= np.where(of_blocks, len(blocks), len(texels))
+    if (beyond & (count > 0)).any() or (component + count >= factor.shape[1]).any():
+        raise ValueError("part lut: a tile reaches beyond the colour texture or the factors")
+    if len(sheets) < len(names):
+        raise ValueError(f"part sheets: expected {len(names)}, found {len(sheets)}")
     places = []
-    for name, row in zip(header.sheets, sheets.tolist(), strict=True):
-        place = SheetPlace(name, *row)
-        if min(place.height, place.width) < 1 or place.page >= pages:
-            raise ValueError(f"part sheets: {row}: expected a size and a page below {pages}")
+    names += [""] * (len(sheets) - len(names))
+    for number, row in enumerate(sheets.tolist()):
+        smaller = row[6]
+        if smaller and not max(number, len(header.sheets) - 1) < smaller < len(sheets):
+            raise ValueError(f"part sheets: {row}: expected a level after it")
+        if smaller:
+            names[smaller] = names[number]
+        place = SheetPlace(names[number], *row)
+        if min(place.height, place.width) < 1:
+            raise ValueError(f"part sheets: {row}: expected a size")
         if (place.rows, place.columns) != tile_counts(place.height, place.width, header.profile.tile):
             raise ValueError(f"part sheets: {row}: expected the tiles of its size")
         if place.row + place.rows > lut.shape[0] or place.column + place.columns > lut.shape[1]:
@@ -85,9 +119,40 @@ def decode(artifact: Artifact) -> SceneModel:
         artifact.source,
         header.profile,
         tuple(header.states),
-        tuple(places),
+        tuple(places[: len(header.sheets)]),
         factor,
         texels,
         lut,
+        tuple(places[len(header.sheets) :]),
         header.report,
+        blocks if len(blocks) else np.empty((0, 0, 16), np.uint8),
+        _decoded(blocks, second),
     )
+
+
+def _decoded(blocks: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """`SceneModel.block_texels`."""
+    pages = [decode_blocks(page, *size, BLOCKS).astype(np.float16) for page in blocks]
+    return np.stack(pages) if pages else np.empty((0, 0, 0, 3), np.float16)
+
+
+def _of_earlier(
+    texels: np.ndarray, lut: np.ndarray, count: int, sheets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The parts of an earlier file as they are now: a sheet had a page in place of a smaller level."""
+    pages, rest = divmod(len(texels), count)
+    if count > _MOST_EARLIER or rest:
+        raise ValueError(f"part colour: expected pages of {count} layers, found {texels.shape}")
+    first, size, _ = unpack_entries(lut, TEXELS)
+    if ((first + size) > texels.shape[:0:-1]).any():
+        raise ValueError("part lut: a tile reaches beyond the colour texture")
+    page = np.full(lut.shape[:2], -1)
+    for _, _, row, column, rows, columns, number in sheets.tolist():
+        if number >= pages:
+            raise ValueError(f"part sheets: page {number}: expected one below {pages}")
+        page[row : row + rows, column : column + columns] = number
+    if (page < 0).all():
+        raise ValueError("part sheets: no sheet is in the table")
+    sheets = sheets.copy()
+    sheets[:, 6] = 0
+    return *side_by_side(texels, lut, count, page), sheets

@@ -5,6 +5,7 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.atlas.model import FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
 from wlm.atlas.scene.model import SceneModel
 from wlm_kernels.atlas import scene as kernels
 
@@ -30,10 +31,14 @@ class Decoder:
         self.model, self.device = model, interop.check_device(device)
         self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.uint32, device=self.device)
         self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
+        mixed = model.colour == "mixed"
+        blocks = model.block_texels if mixed else np.zeros((1, 1, 1, 3), np.float16)
+        self._blocks = wp.array(np.ascontiguousarray(blocks), dtype=wp.vec3h, device=self.device)
+        self._code = FIRST_BLOCK_CODE if mixed else 1 << SIDE_BITS
         self._sheets = wp.array(model.table(), dtype=int, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """The factors of a state, float32 [K, 3]; between two states, 0.5 for example, they are mixed.
+        """The factors of a state, float32 [C, 3]; between two states, 0.5 for example, they are mixed.
 
         Raises:
             ValueError: It is below 0 or above the last.
@@ -45,25 +50,50 @@ class Decoder:
         near, far = self.model.factor[low], self.model.factor[min(low + 1, last)]
         return (near + np.float32(state - low) * (far - near)).astype(np.float32)
 
-    def read(self, uv: torch.Tensor, sheet: torch.Tensor, state: float) -> torch.Tensor:
+    def read(
+        self, uv: torch.Tensor, sheet: torch.Tensor, state: float, lod: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Reads light at points, as a shader does.
 
         Args:
             uv: float32 [N, 2] on the decoder's device, in the sheets.
             sheet: int [N], 0 to S - 1.
             state: As for `factors`.
+            lod: float32 [N], octaves of the sheet's texels along a pixel, of a model with mips; None: up close.
 
         Returns:
             float32 [N, 3].
+
+        Raises:
+            ValueError: The model has no mips.
         """
+        if lod is not None:
+            if not self.model.levels:
+                raise ValueError("lod: expected a model with mips")
+            return self._between(uv, sheet.long(), state, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
         uv, sheet = uv.contiguous(), sheet.int().contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
             factor = wp.array(self.factors(state), dtype=wp.vec3, device=self.device)
             points = interop.to_warp(uv, wp.vec2), interop.to_warp(sheet)
             tile, result = self.model.profile.tile, interop.to_warp(out, wp.vec3)
-            kernels.read(*points, self._sheets, tile, factor, self._lut, self._texels, result)
+            textures = self._texels, self._blocks, self._code
+            kernels.read(*points, self._sheets, tile, factor, self._lut, *textures, result)
         return out
+
+    def _between(self, uv: torch.Tensor, sheet: torch.Tensor, state: float, level: torch.Tensor) -> torch.Tensor:
+        """Light between two levels, 0 the sheet's own."""
+        smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
+        near, far = sheet, torch.where(smaller[sheet] > 0, smaller[sheet], sheet)
+        for number in range(1, 1 + len(self.model.levels)):
+            on = (level >= number) & (near != far)
+            if not bool(on.any()):
+                break
+            after = torch.where(smaller[far] > 0, smaller[far], far)
+            near, far = torch.where(on, far, near), torch.where(on, after, far)
+        share = (level - level.floor())[:, None]
+        below = self.read(uv, near, state)
+        return below + share * (self.read(uv, far, state) - below)
 
     def lightmap(self, sheet: int, state: float) -> np.ndarray:
         """Decodes a lightmap in its own layout, float32 [H, W, 3]; in the gaps between charts it is anything."""

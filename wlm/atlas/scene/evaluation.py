@@ -131,7 +131,6 @@ def compare_scene(
     """
     device = check_device(device)
     cameras = scene_views(scene, views) if isinstance(views, int) else list(views)
-    images = [torch.from_numpy(sheet.frames).to(device) for sheet in scene.sheets]
     states, meter = range(len(scene.states)), Meter(progress, "evaluate", len(cameras))
     seen, inside = [], []
     for camera, (_, sheet, uv) in zip(cameras, seen_points(scene, cameras, resolution, device), strict=True):
@@ -144,7 +143,8 @@ def compare_scene(
         raise WlmError(f"{scene.name}: cannot be scored: no camera around it or inside sees a lightmap")
     peaks, psnrs, texels = [], {name: [] for name in decoders}, {name: [] for name in decoders}
     for state in states:  # the light of one at a time
-        lights = [_read(images, sheet, uv, state) for sheet, uv in seen]
+        images = [torch.from_numpy(sheet.frames[state]).to(device) for sheet in scene.sheets]
+        lights = [_read(images, sheet, uv) for sheet, uv in seen]
         peak = _peak(lights)
         peaks.append(peak)
         for name, decoder in decoders.items():
@@ -173,12 +173,12 @@ def compare_scene(
     return result
 
 
-def _read(images: list[torch.Tensor], sheet: torch.Tensor, uv: torch.Tensor, state: int) -> torch.Tensor:
+def _read(images: list[torch.Tensor], sheet: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
     """The reference: each sheet's lightmap, read bilinearly."""
     light = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
     for number in torch.unique(sheet).tolist():
         at = sheet == number
-        light[at] = raster.texture(images[number][state], uv[at].contiguous())
+        light[at] = raster.texture(images[number], uv[at].contiguous())
     return light
 
 
@@ -205,7 +205,7 @@ def _texel_mse(
         uv = np.stack([(column + 0.5) / width, (row + 0.5) / height], 1).astype(np.float32)
         place = torch.from_numpy(uv).to(images[number].device)
         which = torch.full((len(uv),), number, dtype=torch.int32, device=place.device)
-        target = images[number][state][torch.from_numpy(row), torch.from_numpy(column)]
+        target = images[number][torch.from_numpy(row), torch.from_numpy(column)]
         total += _mse(decoder(place, which, state), target, scene.name, name) * len(uv)
         count += len(uv)
     return total / count

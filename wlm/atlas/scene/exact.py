@@ -2,38 +2,42 @@
 
 import numpy as np
 
-from wlm.atlas.model import TEXELS, unpack_entries
-from wlm.atlas.scene.model import SceneModel
+from wlm.atlas.scene.model import SceneModel, unpack_tiles
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
 
 def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -> np.ndarray:
-    """Reads light at points, by `wlm.atlas.scene.model`'s sum.
+    """Reads light at points, by `wlm.atlas.scene.model`'s sum, clipped at 0.
 
     Args:
         model: The model.
         uv: [N, 2], finite, in the sheets; clamped to [0, 1].
-        sheet: int [N], 0 to S - 1.
+        sheet: int [N], rows of `SceneModel.table`.
         state: Its number.
 
     Returns:
         float64 [N, 3].
     """
     table = model.table()[np.asarray(sheet)].astype(np.int64)
-    size, origin, tiles, page = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1], table[:, 6]
+    size, origin, tiles = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1]
     x = (np.asarray(uv, np.float64).clip(0.0, 1.0) * size - 0.5).clip(0, size - 1) / model.profile.tile
     tile = np.minimum(np.floor(x), tiles - 1).astype(np.int64)
-    first, count, _ = unpack_entries(model.lut[tile[:, 1] + origin[:, 1], tile[:, 0] + origin[:, 0]], TEXELS)
+    entry = model.lut[tile[:, 1] + origin[:, 1], tile[:, 0] + origin[:, 0]]
+    first, count, component, components, page, blocks = unpack_tiles(entry, model.colour)
     place = first + (x - tile) * (count - 1)
     low = np.clip(np.floor(place).astype(np.int64), first, first + count - 1)
     high = np.minimum(low + 1, first + count - 1)
     share = place - low
-    factor = model.factor[state].astype(np.float64)
-    light = np.zeros((len(x), 3))
-    for k in range(len(factor)):
-        layer = page * len(factor) + k
-        for column, a in ((low[:, 0], 1.0 - share[:, 0]), (high[:, 0], share[:, 0])):
-            for row, b in ((low[:, 1], 1.0 - share[:, 1]), (high[:, 1], share[:, 1])):
-                texel = unpack_rgb9e5(model.texels[layer, row, column]).astype(np.float64)
-                light += factor[k] * texel * (a * b)[:, None]
-    return light
+    light = model.factor[state, component].astype(np.float64) * (components > 0)[:, None]
+    for k in range(int(components.max(initial=0))):
+        at = np.flatnonzero(components > k)
+        step, factor = k * count[at, 0], model.factor[state, component[at] + 1 + k].astype(np.float64)
+        for column, a in ((low[at, 0], 1.0 - share[at, 0]), (high[at, 0], share[at, 0])):
+            for row, b in ((low[at, 1], 1.0 - share[at, 1]), (high[at, 1], share[at, 1])):
+                texel = np.empty((len(at), 3))
+                for second in (False, True):
+                    part = blocks[at] == second
+                    place = page[at][part], row[part], (column + step)[part]
+                    texel[part] = model.block_texels[place] if second else unpack_rgb9e5(model.texels[place])
+                light[at] += factor * texel * (a * b)[:, None]
+    return light.clip(min=0.0)

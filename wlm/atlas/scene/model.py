@@ -1,28 +1,41 @@
 """The model of a scene's lightmaps: one table and one texture for all sheets and all states.
 
-The lightmaps of a sheet share its tiles. Light at a point in state m is a sum over components,
+The lightmaps of a sheet share its tiles. A tile has a few components, K rectangles of one size beside each other in
+T_p, and a mixture; light at a point in state m is
 
-    C_m(u) = sum_k f[m, k] T_p[page K + k](place of u by T_c),
+    C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place of u by T_c, k rectangles to the right),
 
-with K layers of T_p for each page, and f a factor for each state, component and channel. With as many components as
-states they are the states' own light and f is 1 or 0; with fewer, which pays where light changes over hours, they are
-what the states have in common (`mixture`). Between two states light and so f is linear.
+with f a constant and a factor of each component, for each state and channel; what is negative is 0. Tiles whose light
+changes alike from state to state share a mixture (`mixture`). Between two states f is linear. With mips a sheet is
+followed by smaller ones, its levels, that are read in the same way.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from wlm.atlas.model import LUT_BITS, SOURCE_BITS
+from wlm.atlas.model import SOURCE_BITS, pack_entries, unpack_entries
 from wlm.system import Model, Settings
 
 TEXEL_BITS = 32
 """Bits of a texel of T_p: RGB9E5."""
 
-FACTOR_BITS = 96
-"""Bits of a component's factors in a state: three floats."""
+NUMBER_BITS = 16
+"""Bits of each of the numbers of an entry of T_c."""
+
+ENTRY, SHORT_ENTRY = 4, 2
+"""Numbers of an entry; and where there are one component and one page alone."""
+
+FACTOR_BITS = 128
+"""Bits of a component's factors in a state: three floats, in a texel of four."""
+
+SHEET_BITS = 128
+"""Bits of a sheet's or level's row: eight numbers of 16."""
+
+COUNT_BITS = 8
+"""Of an entry's fourth number: the lowest, for the number of components; above them is the page."""
 
 
 class SceneProfile(Settings):
@@ -30,9 +43,11 @@ class SceneProfile(Settings):
 
     Attributes:
         name: Shown in reports.
+        colour: How T_p is stored: "rgb9e5"; or "mixed": two textures, RGB9E5 and BC6H, and each tile in one of them.
         budget: Bits of T_p, T_c and the factors as a fraction of all lightmaps' at 48 bits per texel, 1 - CR of eq. 9.
         tile: Texels of a lightmap along a tile, 3 to 15.
-        components: K, of each texel; 0: the number that leaves the least error.
+        components: Most components of a tile; 0: as many as pay.
+        mips: Whether there are smaller levels of each sheet, within the budget.
         views: Random views around the scene, and as many from inside; a texel counts by the pixels that show it.
         unseen: Weight of what no view shows, as a fraction of the mean weight of the scene.
         border: Factor on the weight within a texel of a chart's border.
@@ -40,9 +55,11 @@ class SceneProfile(Settings):
 
     FILES: ClassVar[str] = "atlas-scene"
 
+    colour: Literal["rgb9e5", "mixed"] = "rgb9e5"
     budget: float = Field(0.05, gt=0.0, le=2.0)
     tile: int = Field(7, ge=3, le=15)
     components: int = Field(0, ge=0, le=64)
+    mips: bool = False
     views: int = Field(64, ge=1, le=4096)
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     border: float = Field(4.0, gt=0.0, le=100.0)
@@ -50,14 +67,14 @@ class SceneProfile(Settings):
 
 @dataclass(frozen=True)
 class SheetPlace:
-    """Where a sheet is.
+    """Where a sheet, or a level of one, is.
 
     Attributes:
         name: For people.
         height, width: Texels of its lightmaps.
         row, column: Its first entry in T_c.
         rows, columns: Its tiles.
-        page: Its page of T_p.
+        smaller: The row in `SceneModel.table` of the next smaller level; 0: there is none.
     """
 
     name: str
@@ -67,7 +84,7 @@ class SheetPlace:
     column: int
     rows: int
     columns: int
-    page: int
+    smaller: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +97,14 @@ class SceneModel(Model):
         profile: The settings of the compression.
         states: Names of the states, M.
         sheets: At least one.
-        factor: float32 [M, K, 3], finite, not negative.
-        texels: uint32 [pages K, Hp, Wp], T_p, RGB9E5; a page's components follow each other.
-        lut: uint16 [Hc, Wc, 2], T_c: `wlm.atlas.model.pack_entries`.
+        factor: float32 [M, C, 3], finite, of any sign; of each mixture a constant, then its components' factors.
+        texels: uint32 [pages, Hp, Wp], T_p, RGB9E5.
+        lut: uint16 [Hc, Wc, 4], T_c: `pack_tiles`; [Hc, Wc, 2], its first two numbers, where there are one component
+            and one page.
+        levels: With mips the smaller levels of all sheets, for each sheet a quarter, then halves.
         report: Facts about the compression, for people.
+        blocks: uint8 [pages, B, 16], the second texture of "mixed", BC6H, row by row; [0, 0, 16] for none.
+        block_texels: half [pages, Hb, Wb, 3], what they decode to, multiples of 4; [0, 0, 0, 3] for none.
     """
 
     SYSTEM: ClassVar[str] = "atlas-scene"
@@ -96,13 +117,21 @@ class SceneModel(Model):
     factor: np.ndarray
     texels: np.ndarray
     lut: np.ndarray
+    levels: tuple[SheetPlace, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
+    blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 16), np.uint8))
+    block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0, 3), np.float16))
+
+    @property
+    def colour(self) -> str:
+        """How T_p is stored, as in `SceneProfile`."""
+        return "mixed" if len(self.blocks) else "rgb9e5"
 
     @property
     def bits(self) -> int:
-        """Bits of T_p, T_c and the factors."""
-        entries = self.lut.shape[0] * self.lut.shape[1]
-        return self.texels.size * TEXEL_BITS + entries * LUT_BITS + self.factor.size // 3 * FACTOR_BITS
+        """Bits of T_p, T_c, the factors and the sheets' rows."""
+        texels = self.texels.size * TEXEL_BITS + self.blocks.size * 8 + self.lut.size * NUMBER_BITS
+        return texels + self.factor.size // 3 * FACTOR_BITS + (len(self.sheets) + len(self.levels)) * SHEET_BITS
 
     @property
     def compression_ratio(self) -> float:
@@ -111,7 +140,42 @@ class SceneModel(Model):
         return 1.0 - self.bits / source
 
     def table(self) -> np.ndarray:
-        """int32 [S, 7], the sheets as kernels and shaders read them: rows and columns of texels, first row and column
-        in T_c, rows and columns of tiles, page."""
-        rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.page) for s in self.sheets]
+        """int32 [S + levels, 7], the sheets and then the levels as kernels and shaders read them: rows and columns of
+        texels, first row and column in T_c, rows and columns of tiles, row of the next smaller level."""
+        rows = [
+            (s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in (*self.sheets, *self.levels)
+        ]
         return np.array(rows, np.int32)
+
+
+def pack_tiles(
+    first: np.ndarray,
+    size: np.ndarray,
+    component: np.ndarray,
+    count: np.ndarray,
+    page: np.ndarray,
+    blocks: np.ndarray | bool = False,
+) -> np.ndarray:
+    """Encodes entries of T_c.
+
+    Args:
+        first, size, blocks: As of `pack_entries`: the rectangle of the first component.
+        component: int [...], number of the first component's factors, below 65,536.
+        count: int [...], components, 0 to 255; 0: the tile is black.
+        page: int [...], 0 to 255.
+
+    Returns:
+        uint16 [..., 4].
+    """
+    rest = np.stack([component, (np.asarray(page) << COUNT_BITS) + count], -1).astype(np.uint16)
+    return np.concatenate([pack_entries(first, size, blocks), rest], -1)
+
+
+def unpack_tiles(lut: np.ndarray, colour: str) -> tuple[np.ndarray, ...]:
+    """Decodes `pack_tiles`, to int64, and `blocks` to bool [...]; of short entries, too."""
+    first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], colour)
+    if lut.shape[-1] == SHORT_ENTRY:
+        zeros = np.zeros(lut.shape[:-1], np.int64)
+        return first, size, zeros, zeros + 1, zeros, blocks[..., 0]
+    last = lut[..., 3].astype(np.int64)
+    return first, size, lut[..., 2].astype(np.int64), last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS, blocks[..., 0]

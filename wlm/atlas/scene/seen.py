@@ -77,7 +77,8 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
     totals = [sum(float(each.sum()) for each in counts) for counts in (around, inside)]
     scale = totals[0] / totals[1] if min(totals) > 0 else 1.0
     visible = [a + scale * b for a, b in zip(around, inside, strict=True)]
-    used = [grid.covered | (count > 0) for grid, count in zip(grids, visible, strict=True)]
+    # As `spread` has them.
+    used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
     cells = sum(int(each.sum()) for each in used)
     mean = sum(float(count[each].sum()) for count, each in zip(visible, used, strict=True)) / max(cells, 1)
     settings = Profile(name="", unseen=profile.unseen, border=profile.border)

@@ -1,0 +1,191 @@
+"""What each tile of a scene loses with one, two and more components at each size.
+
+For a tile, a mixture and a size the squared error of all states is what the mixture leaves and
+
+    sum_m || sum_k f[m, k] r_k ||² = sum_j || sum_k L[k, j] r_k ||²,    F^T F = L L^T (Cholesky),
+
+with r_k what component k is off once it is stored: clipped at 0 and rounded, as texels or as blocks.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from wlm.atlas.colour import stored
+from wlm.atlas.layout import Size, allocate
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, FIRST_BLOCK_CODE, SIDE_BITS, TEXELS
+from wlm.atlas.scene.mixture import Mixtures, find_mixtures, moments
+from wlm.atlas.scene.model import FACTOR_BITS, SceneProfile
+from wlm.atlas.stages import Stages
+from wlm.atlas.tiles import Tiles, remainder, sample_weights, solve, tile_light
+from wlm.formats.dds import MOST_SIDE
+from wlm.system import Meter
+
+_RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # components of a tile
+MOST_MIXTURES = 128
+"""Of one number of components."""
+
+_FACTOR_SHARE = 0.15  # of the budget, that the factors of all mixtures that are tried may take
+# Tiles that mixtures are found of, numbers of their moments at most, and texels of each for the bounds.
+_SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
+_PAYS = 0.99  # of the error: more components leave less, or no more are tried
+_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16)
+_ROUGH, _MEDIUM = 3, 10  # rounds of conjugate gradients of a curve, and of one of blocks
+_AT_ONCE = 1024  # tiles
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTiles:
+    """The tiles of all sheets and levels that have a weight.
+
+    Attributes:
+        texels: float32 [T, B + 1, B + 1, M, 3], their light over its peaks.
+        weight: float32 [T, P], of their points; all add up to 1.
+        plane: int [T], their sheet or level, ascending.
+        index: int64 [T], number of each within it, row by row.
+        size: B.
+        device: Where they are fitted.
+    """
+
+    texels: torch.Tensor
+    weight: torch.Tensor
+    plane: np.ndarray
+    index: np.ndarray
+    size: int
+    device: str
+
+    def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
+        """On the device the texels of some tiles, and the weights of their points."""
+        return self.texels[at].to(self.device), self.weight[at].to(self.device)
+
+    def points(self, texels: torch.Tensor) -> torch.Tensor:
+        """Light at the points of tiles [T, N, 3, P] of texels [T, B + 1, B + 1, N, 3]."""
+        return tile_light(texels.flatten(3)).unflatten(1, (-1, 3))
+
+    def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
+        """Texels [T, B + 1, B + 1, K, 3] of components, of the states' and the tiles' mixtures."""
+        parts = torch.einsum("tkmc,tyxmc->tyxkc", mixtures.take[number], texels)
+        return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """Tiles with one number of components.
+
+    Attributes:
+        mixtures: Those there are.
+        number: int [T], the one of each tile.
+        error: float64 [sizes, T], mean over the states, at each size.
+        left: The error that is left where tiles may have up to so many components, about.
+    """
+
+    mixtures: Mixtures
+    number: np.ndarray
+    error: np.ndarray
+    left: float
+
+    @property
+    def rank(self) -> int:
+        return self.mixtures.factor.shape[2]
+
+
+def sizes_of(profile: SceneProfile) -> list[Size]:
+    """What a component of a tile may become."""
+    mixed = profile.colour == "mixed"
+    most = profile.tile + 1
+    sides = [side for side in _SIDES if side <= (min(most, FIRST_BLOCK_CODE) if mixed else most)]
+    whole = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE) if mixed else ()
+    sizes = [Size(nx, ny, TEXELS) for ny in sides for nx in sides]
+    return sizes + [Size(nx, ny, BLOCKS, True) for ny in whole for nx in whole]
+
+
+def candidates(
+    tiles: SceneTiles, sizes: list[Size], profile: SceneProfile, bits: float, seed: int, stages: Stages
+) -> list[Tried]:
+    """The error of every tile with one component, two and so on, up to as many as pay."""
+    count, states = tiles.texels.shape[0], tiles.texels.shape[3]
+    most = min(profile.components or states, states, _RANKS[-1])
+    ranks = [*(rank for rank in _RANKS if rank < most), most]
+    many = int(min(_FACTOR_SHARE * bits / (states * FACTOR_BITS), MOST_SIDE) / sum(rank + 1 for rank in ranks))
+    random = np.random.default_rng(seed)
+    samples = min(count, _SAMPLES, _MOMENTS // (3 * states**2))
+    few = np.sort(random.choice(count, max(samples, 1), replace=False))
+    moment = []
+    for at in np.array_split(few, -(-len(few) // _AT_ONCE)):
+        texels, weight = tiles.light(at)
+        moment.append(moments(tiles.points(texels), weight).cpu().numpy())
+    row, column = random.integers(0, tiles.size + 1, (2, _SAMPLE_TEXELS))
+    moment, bounds = np.concatenate(moment), tiles.texels[few][:, row, column].numpy()
+    meter, tried, before, eager = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf, np.arange(count)
+    for done, rank in enumerate(ranks):
+        mixtures = find_mixtures(moment, bounds, rank, 1 if rank == states else min(max(many, 1), MOST_MIXTURES), seed)
+        # Where a tile isn't tried, nothing is gained.
+        error = np.repeat(tried[0].error.max(0)[None], len(sizes), 0) if tried else np.zeros((len(sizes), count))
+        number = np.zeros(count, int)
+        number[eager], error[:, eager] = _curves(tiles, eager, mixtures, sizes, meter, done * count)
+        tried.append(Tried(mixtures, number, error, 0.0))
+        left, chosen = _left(tried, sizes, bits)
+        tried[-1] = replace(tried[-1], left=left)
+        # A tile that has fewer components than it may have takes no more where others may.
+        eager = np.flatnonzero(chosen == done)
+        if left > _PAYS * before or not len(eager):
+            break
+        before = left
+    return tried
+
+
+def _curves(
+    tiles: SceneTiles, members: np.ndarray, mixtures: Mixtures, sizes: list[Size], meter: Meter, done: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """`number` and `error` of `Tried`, of some tiles."""
+    device, rank = tiles.device, mixtures.factor.shape[2]
+    mixtures = mixtures.to(device)
+    factor, offset = mixtures.factor, mixtures.offset
+    root = _roots(mixtures.factor)
+    number, error = np.zeros(len(members), int), np.zeros((len(sizes), len(members)))
+    step = max(1, _AT_ONCE * 8 // rank)
+    for at in range(0, len(members), step):
+        if meter.due(done + at):
+            meter.report(done + at)
+        part = slice(at, at + step)
+        texels, weight = tiles.light(members[part])
+        light = tiles.points(texels)
+        chosen = mixtures.nearest(moments(light, weight))
+        components = tiles.points(tiles.components(texels, mixtures, chosen))
+        rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
+        lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
+        whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
+        piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+        for i, size in enumerate(sizes):
+            samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
+            held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
+            rest = remainder(piece, held).unflatten(0, (-1, rank))
+            rest = torch.einsum("tkcp,tckj->tjcp", rest, root[chosen])
+            left = (rest.square().mean(2).sum(1) * weight).double().sum(1)
+            error[i, part] = (left + lost).cpu().numpy()
+        number[part] = chosen.cpu().numpy()
+    return number, error
+
+
+def _roots(factor: torch.Tensor) -> torch.Tensor:
+    """L of F^T F / M = L L^T, float32 [G, 3, K, K]."""
+    gram = torch.einsum("gmkc,gmlc->gckl", factor.double(), factor.double()) / factor.shape[1]
+    trace = gram.diagonal(dim1=2, dim2=3).sum(2).clamp(min=1e-30)
+    # What makes it definite where components are alike.
+    gram = gram + 1e-9 * trace[..., None, None] * torch.eye(gram.shape[2], device=gram.device)
+    return torch.linalg.cholesky(gram).float()
+
+
+def costs(tried: list[Tried], sizes: list[Size]) -> np.ndarray:
+    """Bits of each number of components and size."""
+    bits = np.array([float(size.bits) for size in sizes])
+    return np.concatenate([bits * each.rank for each in tried])
+
+
+def _left(tried: list[Tried], sizes: list[Size], bits: float) -> tuple[float, np.ndarray]:
+    """The error that is left, about; and the number in the list of what each tile takes, int [T]."""
+    error = np.concatenate([each.error for each in tried])
+    chosen = allocate(error, costs(tried, sizes), bits, 0.0)
+    return float(error[chosen, np.arange(len(chosen))].sum()), chosen // len(sizes)
