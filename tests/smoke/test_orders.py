@@ -19,7 +19,6 @@ from wlm.smoke.transport.learning import Lesson, fit_filter, make_lessons, psnr,
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.samples import ALBEDOS, Sample, draw_view, make_sample
-from wlm.smoke.transport.scoring import best_gain, compare
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
@@ -33,18 +32,6 @@ def unseen() -> list[Sample]:
 @pytest.fixture(scope="module")
 def lessons(unseen) -> list[Lesson]:
     return [lesson for sample in unseen for lesson in make_lessons(sample)]
-
-
-def test_every_method_is_worse_than_the_filter(unseen, lessons):
-    """By shaded pictures: single scattering, its best gain, which is fitted to these very pictures, and octaves."""
-    gains = {albedo: best_gain(lessons, albedo) for albedo in (0.9, 1.0)}
-    scores = compare(unseen, load_orders(), gains, lights=2)
-    mean = {name: np.mean(score.psnr) for name, score in scores.items()}
-    flip = {name: np.mean(score.flip) for name, score in scores.items()}
-    assert mean["filter"] > 30.0 and min(scores["filter"].psnr) > 26.0
-    for rival in ("single", "gain", "octaves"):
-        assert mean["filter"] > mean[rival] + 3.0 and flip["filter"] < flip[rival]
-    assert mean["single"] < 24.0
 
 
 def test_the_network_is_worth_its_name_and_never_worse(lessons):

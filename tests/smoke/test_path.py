@@ -193,6 +193,8 @@ def test_the_noise_of_all_lights_counts_what_they_share(device: str):
     spread = torch.stack([each.total for each in made]).var(0).mean()
     stated = torch.stack([each.total_noise.square() for each in made]).mean()
     assert 0.7 < float(stated / spread) < 1.4
+    alone = trace(volume, facing(volume, size=8), lights, samples=1)
+    assert alone.error == math.inf and torch.isfinite(alone.total).all() and alone.total.any()
     darker = made[0].with_albedo((0.1, 0.1, 0.1))
     assert darker.error == pytest.approx(float(darker.total_noise.norm() / darker.total.norm()), rel=1e-4)
 
@@ -215,7 +217,7 @@ def test_half_floats_are_traced_as_floats(device: str):
 
 def test_wrong_settings_are_named():
     volume, camera = ball(), facing(ball(), size=4)
-    wrong = {"g": 1.0, "samples": 1, "orders": -1, "highest": -1, "seed": -1, "albedo": (1.0, 1.2, 0.0)}
+    wrong = {"g": 1.0, "samples": 0, "orders": -1, "highest": -1, "seed": -1, "albedo": (1.0, 1.2, 0.0)}
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name}: expected"):
             trace(volume, camera, [Light(WAY)], **{name: value})

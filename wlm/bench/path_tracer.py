@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 import numpy as np
+import torch
 
 from wlm.errors import WlmError, one_line
 from wlm.fluid.volume import DensityVolume
@@ -216,3 +217,16 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
 
     grey = np.repeat(np.asarray(lightmaps, np.float32)[..., None], 3, axis=-1)
     return np.stack([pyoidn.denoise(image, filter_type=_FILTER)[..., 0] for image in grey])
+
+
+def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
+    """Denoises a picture [H, W, 3] of linear light, on its own device where the library can.
+
+    Raises:
+        WlmError: Open Image Denoise isn't installed.
+    """
+    if not has_denoiser():
+        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+    import pyoidn
+
+    return pyoidn.denoise(picture.float().contiguous(), filter_type="RT", hdr=True)
