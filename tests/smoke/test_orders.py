@@ -9,9 +9,11 @@ import torch
 import torch.nn.functional as F
 from builders.smoke_plumes import plume
 
+from wlm.bench.smoke_light import make_cloud
 from wlm.errors import WlmError
-from wlm.fluid.volume import from_array
+from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
+from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.features import COARSE, FEATURES, ambient, blur, make_inputs
 from wlm.smoke.transport.filtering import OrdersModel, load_orders, scatter
@@ -68,6 +70,33 @@ def test_far_from_what_it_was_trained_on_the_network_is_left_out(lessons):
     beyond = replace(inputs, depth=high + 1.0)
     assert model.trust(replace(inputs, depth=high)) == 1.0 and 0 < model.trust(replace(inputs, depth=high + 0.2)) < 1
     assert torch.equal(model.multiple(beyond), model.filtered(beyond))
+
+
+def test_a_correction_too_small_to_matter_is_left_out(lessons):
+    """What the network adds is all taken where it is large, and nothing where it is a twentieth of the light."""
+    model, inputs = load_orders(), lessons[0].inputs
+    filtered = model.filtered(inputs)
+    shares = [float(model.worth(inputs, filtered, share * filtered)[0]) for share in (0.0, 0.05, 0.08, 0.11)]
+    assert shares == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-4)
+    small = OrdersModel(model.arrays | {"last": 0.01 * model.arrays["last"]})
+    assert torch.equal(small.multiple(inputs), filtered) and not torch.equal(model.multiple(inputs), filtered)
+
+
+@pytest.mark.parametrize("cells", [32, 64])
+def test_on_no_grid_is_the_network_worse_than_its_input(cells: int):
+    """Smoke of another maker and a plume, at both ends of the thickness that was learned, in cells coarse and fine."""
+    model, gains = load_orders(), []
+    cloud = DensityVolume(make_cloud(cells, "cpu"), 8.0, 1.0 / cells)
+    for number, volume in enumerate((cloud, make_plume(cells, seed=12, hot=False, extinction=40.0))):
+        random = np.random.default_rng([cells, number])
+        camera = Camera.around(volume, toward=random.normal(size=3), pixels=20)
+        lights = [Light(tuple(map(float, random.normal(size=3)))) for _ in range(2)]
+        traced = trace(volume, camera, lights, samples=192, seed=number).planes.sum(1)[..., 0]
+        made = make_inputs(volume, light_smoke(volume, camera, lights, COARSE), ambient(volume, camera))
+        for inputs, light in zip(made, traced, strict=True):
+            both = (psnr(model.light(inputs, (1.0,) * 3, network=n)[..., 0], light) for n in (True, False))
+            gains.append(next(both) - next(both))
+    assert min(gains) > -0.1 and np.mean(gains) > 0.1
 
 
 @pytest.mark.parametrize("kind", ["directional", "point", "perspective"])
