@@ -16,9 +16,12 @@ from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.marching import medium_of
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.lights import Environment, PointLight
 from wlm.smoke.transport.tracing import Transport, trace
+from wlm_kernels.smoke import path
+from wlm_kernels.smoke.march import BRICK
 
 WAY = (1.0, 0.7, 0.8)
 
@@ -183,6 +186,19 @@ def test_hard_smoke(device: str):
     again, other = (trace(ball(device=device), within, [Light(WAY)], samples=40, seed=seed) for seed in (5, 6))
     first = trace(ball(device=device), within, [Light(WAY)], samples=40, seed=5)
     assert torch.equal(first.planes, again.planes) and not torch.equal(first.planes, other.planes)
+
+
+def test_empty_bricks_around_smoke_are_left_out(device: str):
+    """Smoke in a corner of a large box is traced as in a box of its own, and paths walk through as few bricks."""
+    small = ball(20, device=device)
+    density = torch.zeros(64, 40, 48, device=device)
+    density[41:61, 3:23, 20:40] = small.density
+    large = DensityVolume(density, small.extinction, small.voxel, tuple(-small.voxel * n for n in (41, 3, 20)))
+    made = [trace(volume, facing(small, size=8), [Light(WAY)], samples=512, orders=2) for volume in (small, large)]
+    assert float(made[1].total.mean()) == pytest.approx(float(made[0].total.mean()), rel=0.02)
+    bounds = path.bounds(medium_of(large), 2 * BRICK)
+    assert bounds.low == (40, 0, 16) and bounds.size == (24, 24, 32) and bounds.most.shape == (3, 3, 4)
+    assert path.bounds(medium_of(from_array(np.zeros((9, 9, 9)), device=device)), 1.0).most.shape == (1, 1, 1)
 
 
 def test_the_noise_of_all_lights_counts_what_they_share(device: str):
