@@ -26,7 +26,8 @@ ZERO = 127.0 / 255.0
 _TRACE = 1e-3  # weight of what is around a pixel with a motion of its own
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 _BLUR = 0.75  # pixels of motion up to which reading between pixels blurs more than a cross-fade does
-_ABOUT = 5  # pixels along the square that two frames are compared in
+_ABOUT = 9  # pixels along the square that two frames are compared in, and shares are smoothed over
+_FEW = 1e-4  # square of a difference of light that doesn't count
 _STILL = 1e-6  # the least scale
 
 
@@ -98,11 +99,16 @@ def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
     off = []
     for share in _SHARES:
         difference = (_read(after, _places(moved) + share * moved) - before).square().sum(0)
-        off.append(F.avg_pool2d(difference[None], _ABOUT, 1, _ABOUT // 2, count_include_pad=False)[0])
+        off.append(_smooth(difference) + _FEW * (1.0 - share))
     share = torch.tensor(_SHARES)[torch.stack(off).argmin(0)]
     pixels = moved * torch.tensor([before.shape[2], before.shape[1]])[:, None, None]
     share = share * ((pixels.norm(dim=0) - _BLUR) / _BLUR).clamp(0.0, 1.0)
-    return moved * F.avg_pool2d(share[None], 3, 1, 1, count_include_pad=False)[0]
+    return moved * _smooth(share)
+
+
+def _smooth(plane: torch.Tensor) -> torch.Tensor:
+    """The mean over squares, [H, W]."""
+    return F.avg_pool2d(plane[None], _ABOUT, 1, _ABOUT // 2, count_include_pad=False)[0]
 
 
 def scale_of(motions: torch.Tensor) -> float:

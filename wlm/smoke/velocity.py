@@ -14,7 +14,7 @@ from wlm.formats.atomic import atomic_path
 from wlm.formats.npz import read_npz
 
 _NAME = "velocity"
-_LARGEST = 3 * 512**3  # numbers
+_LARGEST = 3 * 320**3  # numbers
 
 
 def velocity_file(folder: Path, number: int) -> Path:
@@ -31,8 +31,10 @@ def write_velocity(path: Path, velocity: wp.array, reach: float) -> None:
         reach: Lengths of the world a frame that a velocity of 1 is.
 
     Raises:
-        WlmError: It can't be written.
+        WlmError: It can't be written, or has more cells than `read_velocity` takes.
     """
+    if 3 * velocity.size > _LARGEST:
+        raise WlmError(f"{path}: expected at most {_LARGEST // 3} cells of air, found {velocity.size}")
     values = (reach * velocity.numpy()).astype(np.float16)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **{_NAME: values})
