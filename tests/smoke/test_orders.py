@@ -214,6 +214,22 @@ def test_hard_smoke(device: str):
         scatter(plume(), camera, [Light((1, 1, 1))], (1.0, 2.0, 0.0))
 
 
+@pytest.mark.parametrize("within", ["light", "camera", "both"])
+def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
+    """No less than light scattered once, and no more than there is; of a light from outside it is all there is."""
+    volume = make_plume(20, hot=False, extinction=12.0, device=device)
+    inside = Camera.look_at((0.5, 0.6, 0.5), (0.5, 0.6, 0.0), extent=1.0, height=12, width=12, perspective=True)
+    camera = Camera.around(volume, toward=(0.2, 0.1, 1.0), pixels=12) if within == "light" else inside
+    lamp = PointLight((0.48, 0.55, 0.42), (4 * math.pi,) * 3, radius=0.1)
+    light = Light((1.0, 0.7, 0.3)) if within == "camera" else lamp
+    made = scatter(volume, camera, [light], (1.0, 1.0, 0.0))
+    wanted = trace(volume, camera, [light], albedo=(1.0, 1.0, 0.0), samples=256).total
+    once, picture = made.lit.shade(albedo=(1.0, 1.0, 0.0)), made.shade()
+    assert torch.isfinite(picture).all() and (picture >= 0.999 * once).all() and not picture[..., 2].any()
+    share = float(picture[..., 0].mean() / wanted[..., 0].mean())
+    assert share == pytest.approx(1.0, abs=0.2) if within == "camera" else 0.15 < share < 1.2
+
+
 def test_files_of_models(tmp_path):
     """A model comes back as it went; every wrong one is a line that names the part."""
     model = load_orders()

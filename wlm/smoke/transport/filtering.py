@@ -156,7 +156,8 @@ class OrdersModel:
         for value, share in shares.items():
             more = sum(part * multiple[node] for node, part in share.items())
             total = value * inputs.single + value**2 * more
-            colours[value] = torch.minimum(total, _BRIGHTEST * inputs.opacity)
+            # Beside a light within the smoke light scattered once alone may be brighter, and is exact.
+            colours[value] = torch.minimum(total, _BRIGHTEST * inputs.opacity).maximum(value * inputs.single)
         return torch.stack([colours[float(value)] for value in albedo], -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
