@@ -17,6 +17,7 @@ from wlm.smoke.flipbook_motion import (
     frames_motion,
     mip_levels,
     mip_padding,
+    open_motion,
     scale_of,
 )
 from wlm.smoke.lightmaps import SixWay
@@ -51,7 +52,7 @@ def test_between_two_frames_it_is_nearer_than_a_cross_fade(folder):
     """Halfway between a book's frames: the lightmaps by 3 dB, and of the ends nothing is changed."""
     numbers = (18, 22, 26)
     book, middle = baked(folder, numbers), baked(folder, (20, 24))
-    moved = frames_motion(smoke.load_frames(folder), numbers, book)
+    moved = frames_motion(open_motion(folder), numbers, book)
     assert moved.shape == (3, 2, 96, 96) and 0.01 < scale_of(moved) < 0.3
     # A texture of 8 bits is what engines have.
     scale = scale_of(moved)
@@ -75,7 +76,7 @@ def test_where_little_moves_it_is_a_cross_fade(folder):
     numbers = (22, 24)
     one, other = baked(folder, numbers, 32)
     wanted = baked(folder, (23,), 32)[0].lightmaps
-    moved = frames_motion(smoke.load_frames(folder), numbers, (one, other))
+    moved = frames_motion(open_motion(folder), numbers, (one, other))
     fade = psnr(0.5 * (one.lightmaps + other.lightmaps), wanted)
     assert psnr(between(one, other, moved[0], 0.5).lightmaps, wanted) > fade - 0.1
 
@@ -138,9 +139,9 @@ def test_velocities_that_are_missing_or_damaged(folder, tmp_path):
     simulate(bare)
     book = baked(bare.path, (1,))
     with pytest.raises(WlmError, match=r"velocity_0001.npz: expected the air's velocity, found none: simulate with"):
-        frames_motion(smoke.load_frames(bare.path), (1,), book)
+        open_motion(bare.path)
     with pytest.raises(WlmError, match=r"expected frame_0099.npz, of the flip book's frame 1"):
-        frames_motion(smoke.load_frames(folder), (99,), book)
+        frames_motion(open_motion(folder), (99,), book)
     path = tmp_path / "velocity.npz"
     for values, words in (
         (np.zeros((2, 2, 2), np.float16), "expected float16"),

@@ -340,14 +340,15 @@ def flipbook(
     quiet_warp()
     from wlm.formats.atomic import atomic_write
     from wlm.shading import ENDINGS
-    from wlm.smoke.data import load_frames
     from wlm.smoke.exporter import brightest_gain, channels, lay_out, write_flipbook, write_page
     from wlm.smoke.exporter import cells as cells_for
-    from wlm.smoke.flipbook_motion import ZERO, encoded, frames_motion, mip_padding, scale_of
+    from wlm.smoke.flipbook_motion import ZERO, encoded, frames_motion, mip_padding, open_motion, scale_of
     from wlm.smoke.shader import smoke_shader
 
     book = _book(smoke, textures, cells, source_layout, straight)
     source = _source(smoke, options, step, supersample, 0.5, book)
+    # Before what takes long.
+    air = None if motion is None else open_motion(motion, options.device)
     with running("flipbook") as progress:
         shots = list(_shots(source, progress, count))
         frames = [shot.six for shot in shots]
@@ -362,9 +363,9 @@ def flipbook(
         padding = mip_padding(height, width, mips)
     placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
     scale, moving = None, output.with_name(f"{output.stem}_motion{output.suffix}")
-    if motion is not None:
+    if air is not None:
         with running("motion") as progress:
-            moved = frames_motion(load_frames(motion), [shot.number for shot in shots], frames, progress)
+            moved = frames_motion(air, [shot.number for shot in shots], frames, progress)
         scale = scale_of(moved)
         write_page(moving, lay_out(encoded(moved, scale), rows_of_cells, columns, padding, ZERO))
     clipped = write_flipbook(paths, frames, layout, **placed)

@@ -6,6 +6,7 @@ frames reads the earlier one back along the motion and the later one ahead of it
 sharp, where a cross-fade would show it twice. Read first: `between`, which `wlm.smoke.shader` writes for engines.
 """
 
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,7 +15,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.smoke.data import Frames
+from wlm.smoke.data import Frames, load_frames
 from wlm.smoke.learn.motion import motion
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.velocity import read_velocity, velocity_file
@@ -31,6 +32,20 @@ _FEW = 1e-4  # square of a difference of light that doesn't count
 _STILL = 1e-6  # the least scale
 
 
+def open_motion(path: str | os.PathLike[str], device: str = "cpu") -> Frames:
+    """Opens a simulation's frames, for `frames_motion`.
+
+    Raises:
+        WlmError: As `load_frames`, or a frame's velocity isn't there.
+    """
+    frames = load_frames(path, device=device)
+    for number in frames.numbers:
+        file = velocity_file(frames.path, number)
+        if not file.is_file():
+            raise WlmError(f"{file}: expected the air's velocity, found none: simulate with --velocity keeps it")
+    return frames
+
+
 def frames_motion(
     frames: Frames, numbers: Sequence[int], book: Sequence[SixWay], progress: OnProgress | None = None
 ) -> torch.Tensor:
@@ -40,7 +55,7 @@ def frames_motion(
     the air's motion each place takes the share by which the next frame looks most like this one there.
 
     Args:
-        frames: Of a simulation that kept its velocities.
+        frames: Of `open_motion`.
         numbers: Of the flip book's frames, rising.
         book: These, with their transparency and their cameras, orthographic.
         progress: Called after each.
@@ -50,7 +65,7 @@ def frames_motion(
         frame goes on as it came. Where there is no smoke it is that of the smoke around.
 
     Raises:
-        WlmError: A frame or its velocity is missing or damaged.
+        WlmError: A frame or a velocity is missing or damaged.
     """
     found = []
     meter = Meter(progress, "motion", len(numbers))
@@ -60,7 +75,7 @@ def frames_motion(
         later = numbers[i + 1] if i + 1 < len(numbers) else number
         between = range(number + 1, later + 1) if later > number else [number]
         apart = len(between) if later > number else (number - numbers[i - 1] if i else 1)
-        mean = sum(_velocity(frames, each) for each in between) / len(between)
+        mean = sum(read_velocity(velocity_file(frames.path, each)) for each in between) / len(between)
         volume = frames.load(number)
         carried = wp.array(mean, dtype=wp.vec3, device=wp.device_from_torch(volume.device))
         # Forward: where the smoke of this frame will be, and not where that of the next was.
@@ -70,13 +85,6 @@ def frames_motion(
         found.append(_agreeing(moved, six, book[i + 1]) if i + 1 < len(book) else moved)
         meter.report(i + 1)
     return torch.stack(found)
-
-
-def _velocity(frames: Frames, number: int) -> np.ndarray:
-    path = velocity_file(frames.path, number)
-    if not path.is_file():
-        raise WlmError(f"{path}: expected the air's velocity, found none: simulate with --velocity keeps it")
-    return read_velocity(path)
 
 
 def _spread(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
