@@ -5,6 +5,7 @@ a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU
 for computing alone often lack; the denoiser runs on the CPU.
 """
 
+import functools
 import importlib.util
 import math
 import subprocess
@@ -219,8 +220,20 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
     return np.stack([pyoidn.denoise(image, filter_type=_FILTER)[..., 0] for image in grey])
 
 
+@functools.cache
+def denoiser_device(device: str) -> str:
+    """Where Open Image Denoise computes for pictures on a device: there, or "cpu" where it doesn't know the device."""
+    import pyoidn
+
+    try:
+        pyoidn.denoise(torch.zeros(16, 16, 3, device=device), filter_type="RT", hdr=True)
+    except (RuntimeError, ImportError, OSError):
+        return "cpu"
+    return device
+
+
 def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
-    """Denoises a picture [H, W, 3] of linear light, on its own device where the library can.
+    """Denoises a picture [H, W, 3] of linear light, on `denoiser_device`.
 
     Raises:
         WlmError: Open Image Denoise isn't installed.
@@ -229,4 +242,5 @@ def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
         raise WlmError("denoising needs pyoidn: install wlm[bake]")
     import pyoidn
 
-    return pyoidn.denoise(picture.float().contiguous(), filter_type="RT", hdr=True)
+    there = picture.float().contiguous().to(denoiser_device(str(picture.device)))
+    return pyoidn.denoise(there, filter_type="RT", hdr=True).to(picture.device)

@@ -31,7 +31,7 @@ import torch
 import torch.nn.functional as F
 
 from wlm.baselines.smoke_orders import CELLS, FITTED, diffused, octaves, three_octaves
-from wlm.bench.path_tracer import denoised_picture, has_denoiser
+from wlm.bench.path_tracer import denoised_picture, denoiser_device, has_denoiser
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
 from wlm.bench.timing import Timing
@@ -201,7 +201,9 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
         for way, timing in times.items():
             pictures = found[albedo][way]
             figures = _score(pictures, truth) | _flicker(shots, pictures, halves, opacity) | settings
-            rows.append(bench.row(METHOD, way, notes, scene=scene, timing=timing, **figures))
+            on_cpu = way == _DENOISED and denoiser_device(bench.device) == "cpu" != bench.device
+            note = f"{notes}, denoised on the CPU" if on_cpu else notes
+            rows.append(bench.row(METHOD, way, note, scene=scene, timing=timing, **figures))
         noise = [psnr(*pair) + _OF_MEAN for pair in halves]
         noise = {"psnr": float(np.mean(noise)), "psnr_min": min(noise), "psnr_max": max(noise)}
         figures = noise | {"samples": sizes.samples} | settings
