@@ -79,6 +79,17 @@ def test_flicker_is_what_the_smokes_motion_leaves():
     assert brighter["flicker"] > 20 and brighter["flicker_ratio"] == pytest.approx(1.0, abs=0.06)
 
 
+def test_plumes_of_finer_voxels_are_the_same_smoke():
+    """What a GPU's rows are of: resampled, as opaque as before from the same side."""
+    plain, fine = (bench._plume(replace(TINY, cells=20, voxels=voxels), 3, "cpu") for voxels in (None, 50))
+    assert fine.volume.shape == (50, 50, 50) and fine.camera == plain.camera
+    assert [light.irradiance for light in fine.lights] == [light.irradiance for light in plain.lights]
+    assert fine.volume.size == pytest.approx(plain.volume.size)
+    clear = [light_smoke(shot.volume, shot.camera, ()).transparency for shot in (plain, fine)]
+    assert clear[0].min() < 0.8 and torch.allclose(*clear, atol=0.05)
+    assert sum(np.sum(light.irradiance) for light in fine.lights) == pytest.approx(12 * np.pi)
+
+
 def test_rows_make_a_file_and_a_table(rows, tmp_path):
     write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
     assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT)
