@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+import warp as wp
 
 import wlm
 from wlm.errors import WlmError
@@ -20,6 +21,7 @@ from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform
 from wlm.smoke.learn.pool import load_pool
 from wlm.smoke.transport.filtering import load_orders
+from wlm.smoke.velocity import read_velocity, write_velocity
 from wlm.system import Meter
 
 from .containers import vary_artifact, vary_compact, vary_npz
@@ -109,6 +111,21 @@ def _orders(path: Path) -> None:
     model = load_orders(path)
     check_finite(**model.arrays)
     assert (model.arrays["spread"] > 0).all(), "accepted a spread of 0"
+
+
+@functools.cache
+def _velocities() -> Sequence[bytes]:
+    cells = np.linspace(-1.0, 1.0, 3 * 4 * 5 * 6).reshape(4, 5, 6, 3)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "velocity_0001.npz"
+        write_velocity(path, wp.array(cells, dtype=wp.vec3, device="cpu"), 0.5)
+        return (path.read_bytes(),)
+
+
+def _velocity(path: Path) -> None:
+    velocity = read_velocity(path)
+    check_finite(velocity=velocity)
+    assert velocity.ndim == 4 and velocity.shape[3] == 3, f"accepted {velocity.shape}"
 
 
 def _pool(path: Path) -> None:
@@ -325,6 +342,7 @@ READERS = (
     Reader("atlas-scene", "a.wlm", stored("atlas-scene.wlm", "atlas-scene-mixed.wlm"), vary_artifact, _atlas_scene),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
+    Reader("smoke-velocity", "a.npz", _velocities, vary_npz, _velocity),
     Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),
     Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
     Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),

@@ -36,6 +36,7 @@ from wlm.probe.volume_shader import volume_glsl
 from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import LAYOUTS, Camera
 from wlm.smoke.exporter import pack
+from wlm.smoke.flipbook_motion import ZERO
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shader import smoke_shader
 from wlm.smoke.shading import Light
@@ -237,6 +238,37 @@ vec4 shown(ivec2 pixel)
     return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 2e-5)
 
 
+def smoke_motion(_) -> Subject:
+    """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
+    random = np.random.default_rng(7)
+    size, scale = {"rows": 2, "columns": 3, "count": 5, "size": (24, 24), "padding": 4}, 0.07
+    text = smoke_shader("glsl", "unity", **size, motion=scale)
+    asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
+    way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
+    way[0, :2] = ZERO
+    moved = (way[:, :2] - ZERO) * 2.0 * scale * [1.0, -1.0]
+    before = np.clip(asked[:, :2] - asked[:, 2:] * moved, 0.0, 1.0)
+    after = np.clip(asked[:, :2] + (1.0 - asked[:, 2:]) * moved, 0.0, 1.0)
+    level = np.clip(np.log2(np.maximum(way[:, 2], 1.0)), 0.0, 3.0)
+    main = (
+        POINTS
+        + """uniform sampler2D u_ways;
+vec4 shown(ivec2 pixel)
+{
+    vec4 asked = texelFetch(u_points, pixel, 0);
+    vec4 way = texelFetch(u_ways, pixel, 0);
+    vec2 moved = wlm_smoke_motion(way);
+    vec2 before = wlm_smoke_before(asked.xy, moved, asked.z);
+    vec2 after = wlm_smoke_after(asked.xy, moved, asked.z);
+    return vec4(before.x - 2.0 * before.y, after.x - 2.0 * after.y, moved.y, wlm_smoke_level(way.z));
+}
+"""
+    )
+    columns = [before @ [1.0, -2.0], after @ [1.0, -2.0], moved[:, 1], level]
+    bound = {"u_points": points_of(asked), "u_ways": points_of(way)}
+    return Subject(text, main, np.float32(np.column_stack(columns))[None], bound, "", 2e-5)
+
+
 def volume(folder) -> Subject:
     random = np.random.default_rng(0)
     position = random.uniform(-1, 1, (400, 3)) * [9.0, 1.0, 9.0] + [4000.0, -30.0, 0.0]
@@ -333,6 +365,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "scene": partial(scene, False, False),
     "scene of one component": partial(scene, True, False),
     "scene mixed": partial(scene, False, True),
+    "smoke motion": smoke_motion,
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,

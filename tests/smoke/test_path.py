@@ -16,9 +16,12 @@ from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.marching import medium_of
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.lights import Environment, PointLight
 from wlm.smoke.transport.tracing import Transport, trace
+from wlm_kernels.smoke import path
+from wlm_kernels.smoke.march import BRICK
 
 WAY = (1.0, 0.7, 0.8)
 
@@ -185,6 +188,19 @@ def test_hard_smoke(device: str):
     assert torch.equal(first.planes, again.planes) and not torch.equal(first.planes, other.planes)
 
 
+def test_empty_bricks_around_smoke_are_left_out(device: str):
+    """Smoke in a corner of a large box is traced as in a box of its own, and paths walk through as few bricks."""
+    small = ball(20, device=device)
+    density = torch.zeros(64, 40, 48, device=device)
+    density[41:61, 3:23, 20:40] = small.density
+    large = DensityVolume(density, small.extinction, small.voxel, tuple(-small.voxel * n for n in (41, 3, 20)))
+    made = [trace(volume, facing(small, size=8), [Light(WAY)], samples=512, orders=2) for volume in (small, large)]
+    assert float(made[1].total.mean()) == pytest.approx(float(made[0].total.mean()), rel=0.02)
+    bounds = path.bounds(medium_of(large), 2 * BRICK)
+    assert bounds.low == (40, 0, 16) and bounds.size == (24, 24, 32) and bounds.most.shape == (3, 3, 4)
+    assert path.bounds(medium_of(from_array(np.zeros((9, 9, 9)), device=device)), 1.0).most.shape == (1, 1, 1)
+
+
 def test_the_noise_of_all_lights_counts_what_they_share(device: str):
     """Lights that nearly coincide share their paths; the spread between seeds is as stated, at other albedos too."""
     volume = ball(8, depth=8.0, device=device)
@@ -193,6 +209,8 @@ def test_the_noise_of_all_lights_counts_what_they_share(device: str):
     spread = torch.stack([each.total for each in made]).var(0).mean()
     stated = torch.stack([each.total_noise.square() for each in made]).mean()
     assert 0.7 < float(stated / spread) < 1.4
+    alone = trace(volume, facing(volume, size=8), lights, samples=1)
+    assert alone.error == math.inf and torch.isfinite(alone.total).all() and alone.total.any()
     darker = made[0].with_albedo((0.1, 0.1, 0.1))
     assert darker.error == pytest.approx(float(darker.total_noise.norm() / darker.total.norm()), rel=1e-4)
 
@@ -215,7 +233,7 @@ def test_half_floats_are_traced_as_floats(device: str):
 
 def test_wrong_settings_are_named():
     volume, camera = ball(), facing(ball(), size=4)
-    wrong = {"g": 1.0, "samples": 1, "orders": -1, "highest": -1, "seed": -1, "albedo": (1.0, 1.2, 0.0)}
+    wrong = {"g": 1.0, "samples": 0, "orders": -1, "highest": -1, "seed": -1, "albedo": (1.0, 1.2, 0.0)}
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name}: expected"):
             trace(volume, camera, [Light(WAY)], **{name: value})

@@ -5,6 +5,7 @@ a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU
 for computing alone often lack; the denoiser runs on the CPU.
 """
 
+import functools
 import importlib.util
 import math
 import subprocess
@@ -12,6 +13,7 @@ import sys
 from typing import Any
 
 import numpy as np
+import torch
 
 from wlm.errors import WlmError, one_line
 from wlm.fluid.volume import DensityVolume
@@ -216,3 +218,29 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
 
     grey = np.repeat(np.asarray(lightmaps, np.float32)[..., None], 3, axis=-1)
     return np.stack([pyoidn.denoise(image, filter_type=_FILTER)[..., 0] for image in grey])
+
+
+@functools.cache
+def denoiser_device(device: str) -> str:
+    """Where Open Image Denoise computes for pictures on a device: there, or "cpu" where it doesn't know the device."""
+    import pyoidn
+
+    try:
+        pyoidn.denoise(torch.zeros(16, 16, 3, device=device), filter_type="RT", hdr=True)
+    except (RuntimeError, ImportError, OSError):
+        return "cpu"
+    return device
+
+
+def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
+    """Denoises a picture [H, W, 3] of linear light, on `denoiser_device`.
+
+    Raises:
+        WlmError: Open Image Denoise isn't installed.
+    """
+    if not has_denoiser():
+        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+    import pyoidn
+
+    there = picture.float().contiguous().to(denoiser_device(str(picture.device)))
+    return pyoidn.denoise(there, filter_type="RT", hdr=True).to(picture.device)

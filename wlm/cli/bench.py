@@ -248,6 +248,21 @@ def smoke(
     _finish(rows, command, device, json_path, plot_path, PANELS, plotted(rows), baseline)
 
 
+@app.command("smoke-orders")
+def smoke_orders(
+    quick: _SmallGrids = False,
+    device: Device = "cpu",
+    json_path: _RowsFile = None,
+    baseline: _Baseline = None,
+) -> None:
+    """Smoke with light of all orders: PSNR, FLIP, flicker and time of shaded pictures, ours and the rivals'."""
+    device = _prepare(device, json_path, None, baseline)
+    from wlm.bench.smoke_orders import run
+
+    rows = run(quick=quick, device=device, progress=note)
+    _finish(rows, _command("smoke-orders", quick=quick, device=device), device, json_path, None, baseline=baseline)
+
+
 @app.command("smoke-network")
 def smoke_network(
     quick: _SmallGrids = False,

@@ -86,6 +86,9 @@ def simulate(
     scale: Annotated[
         float, typer.Option(min=0.001, max=100.0, help="Cells along each axis, as a multiple of the scene's.")
     ] = 1.0,
+    velocity: Annotated[
+        bool, typer.Option("--velocity", help="Keep the air's velocity too, for a flip book's --motion.")
+    ] = False,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
@@ -118,7 +121,7 @@ def simulate(
             figures.update(now.figures)
             report(now)
 
-        options = {"resume": resume, "checkpoint_every": checkpoint_every}
+        options = {"resume": resume, "checkpoint_every": checkpoint_every, "velocity": velocity}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         note(f"{output}: there was nothing to resume; started at frame 1")
@@ -310,6 +313,12 @@ def flipbook(
     source_layout: _From = None,
     straight: _Straight = False,
     padding: Annotated[int, typer.Option(min=0, max=64, help="Pixels around each cell that repeat its border.")] = 0,
+    mips: Annotated[
+        int | None, typer.Option(min=1, max=6, help="Pad such that so many halvings of the textures stay clean.")
+    ] = None,
+    motion: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity: write OUT_motion too.")
+    ] = None,
     shader: Annotated[
         bool, typer.Option("--shader", help="Write OUT.glsl, OUT.hlsl, OUT.metal and OUT.wgsl too.")
     ] = False,
@@ -324,27 +333,44 @@ def flipbook(
         raise WlmError(f"--layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
     if gain is not None and not 0 < gain < float("inf"):
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
+    if mips is not None and padding:
+        raise WlmError("--mips: expected without --padding, which it chooses")
+    if motion is not None and textures:
+        raise WlmError("--motion: expected lightmaps of bake or predict, or frames: a flip book's camera isn't known")
     quiet_warp()
     from wlm.formats.atomic import atomic_write
     from wlm.shading import ENDINGS
-    from wlm.smoke.exporter import brightest_gain, channels, write_flipbook
+    from wlm.smoke.exporter import brightest_gain, channels, lay_out, write_flipbook, write_page
     from wlm.smoke.exporter import cells as cells_for
+    from wlm.smoke.flipbook_motion import ZERO, encoded, frames_motion, mip_padding, open_motion, scale_of
     from wlm.smoke.shader import smoke_shader
 
     book = _book(smoke, textures, cells, source_layout, straight)
     source = _source(smoke, options, step, supersample, 0.5, book)
+    # Before what takes long.
+    air = None if motion is None else open_motion(motion, options.device)
     with running("flipbook") as progress:
-        frames = [shot.six for shot in _shots(source, progress, count)]
+        shots = list(_shots(source, progress, count))
+        frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
         raise WlmError(f"{smoke}: expected lightmaps of one size")
     rows_of_cells, columns = cells_for(len(frames), columns)
     if gain is None:
         gain = 1.0 if output.suffix.lower() == ".exr" else brightest_gain(frames)
     paths = tuple(output.with_name(f"{output.stem}_{i}{output.suffix}") for i in (1, 2))
-    placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
-    clipped = write_flipbook(paths, frames, layout, **placed)
     height, width = frames[0].lightmaps.shape[1:]
+    if mips is not None:
+        padding = mip_padding(height, width, mips)
+    placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
+    scale, moving = None, output.with_name(f"{output.stem}_motion{output.suffix}")
+    if air is not None:
+        with running("motion") as progress:
+            moved = frames_motion(air, [shot.number for shot in shots], frames, progress)
+        scale = scale_of(moved)
+        write_page(moving, lay_out(encoded(moved, scale), rows_of_cells, columns, padding, ZERO))
+    clipped = write_flipbook(paths, frames, layout, **placed)
     if shader:
+        placed["motion"] = scale
         hot = any(frame.emission is not None for frame in frames)
         for language in ("glsl", "hlsl", "msl", "wgsl"):
             text = smoke_shader(language, layout, **placed, count=len(frames), size=(height, width), hot=hot)
@@ -352,10 +378,14 @@ def flipbook(
     rows = table(str(smoke), ["file", "bytes", "channels"], text=["channels"])
     for path, names in zip(paths, channels(frames, layout), strict=True):
         rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))
+    if scale is not None:
+        rows.add_row(escape(str(moving)), f"{moving.stat().st_size:,}", "right up")
     rows.add_section()
     around = f", {padding} around each" if padding else ""
     rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}{around}")
     rows.add_row("gain", f"{gain:.4g}", f"{clipped:,} numbers clipped")
+    if scale is not None:
+        rows.add_row("motion", f"{scale:.4g}", "of a frame, at most, to the next")
     show(rows)
 
 

@@ -75,17 +75,24 @@ def pack(
     if not 1 <= len(frames) <= rows * columns:
         raise ValueError(f"expected 1 to {rows * columns} frames, got {len(frames)}")
     height, width = frames[0].lightmaps.shape[1:]
+    for i, frame in enumerate(frames):
+        if tuple(frame.lightmaps.shape[1:]) != (height, width):
+            raise ValueError(f"frame {i}: expected {height} x {width}, got {tuple(frame.lightmaps.shape[1:])}")
     pages = []
     for names in channels(frames, layout):
-        page = np.zeros((rows, height + 2 * padding, columns, width + 2 * padding, len(names)), np.float32)
-        for i, frame in enumerate(frames):
-            if tuple(frame.lightmaps.shape[1:]) != (height, width):
-                raise ValueError(f"frame {i}: expected {height} x {width}, got {tuple(frame.lightmaps.shape[1:])}")
-            for c, name in enumerate(names):
-                plane = np.broadcast_to(_plane(frame, name, gain), (height, width))
-                page[i // columns, :, i % columns, :, c] = np.pad(plane, padding, mode="edge")
-        pages.append(page.reshape(rows * page.shape[1], columns * page.shape[3], len(names)))
+        planes = [[np.broadcast_to(_plane(frame, name, gain), (height, width)) for name in names] for frame in frames]
+        pages.append(lay_out(np.moveaxis(np.array(planes, np.float32), 1, -1), rows, columns, padding))
     return pages[0], pages[1]
+
+
+def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
+    """Lays pictures [N, H, W, C] out in cells, each in `padding` pixels that repeat its border: one texture."""
+    count, height, width, channels = frames.shape
+    page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
+    around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
+    for i, cell in enumerate(np.pad(frames, around, mode="edge")):
+        page[i // columns, :, i % columns] = cell
+    return page.reshape(rows * page.shape[1], columns * page.shape[3], channels)
 
 
 def unpack(
@@ -166,20 +173,21 @@ def write_flipbook(
     """
     for path in paths:
         _suffix(path)
-    clipped = 0
     pages = pack(frames, layout, rows=rows, columns=columns, gain=gain, padding=padding)
-    for path, page in zip(paths, pages, strict=True):
-        if not np.isfinite(page).all():
-            raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
-        if _suffix(path) == ".exr":
-            clipped += int((page > 65504.0).sum())
-            write_exr(path, page)
-            continue
-        clipped += int((page > 1.0).sum())
-        image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
-        with atomic_path(path) as temporary:
-            image.save(temporary, format=_suffix(path)[1:].upper())
-    return clipped
+    return sum(write_page(path, page) for path, page in zip(paths, pages, strict=True))
+
+
+def write_page(path: str | os.PathLike[str], page: np.ndarray) -> int:
+    """Writes a texture [H, W, 3 or 4], whole or not at all; returns and raises as `write_flipbook`."""
+    if not np.isfinite(page).all():
+        raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
+    if _suffix(path) == ".exr":
+        write_exr(path, page)
+        return int((page > 65504.0).sum())
+    image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
+    with atomic_path(path) as temporary:
+        image.save(temporary, format=_suffix(path)[1:].upper())
+    return int((page > 1.0).sum())
 
 
 def read_flipbook(

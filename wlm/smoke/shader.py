@@ -1,7 +1,8 @@
-"""The shader of a six-way flip book: where a frame lies, and its light from a direction."""
+"""The shader of a six-way flip book: where a frame lies, its light from a direction, its motion to the next frame."""
 
 from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
+from wlm.smoke.flipbook_motion import ZERO, mip_levels
 
 _TEXT = """\
 // Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
@@ -43,6 +44,41 @@ float wlm_smoke_emission(vec4 first, vec4 second)
 {{
     return {emission};
 }}
+
+// The level for textureLod, of how many texels a pixel of the screen is wide: {levels} at most, beyond which
+// frames show their neighbours.
+float wlm_smoke_level(float texels)
+{{
+    return clamp(log2(max(texels, 1.0)), 0.0, {levels:.1f});
+}}
+"""
+
+_MOTION = """
+// Between two frames, at a share of 0 to 1 of the way from one to the next, both textures are read twice and mixed:
+//
+//     vec2 way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(place, frame)));
+//     way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)));
+//     first = mix(texture(first, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)),
+//                 texture(first, wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0)), share)
+//
+// The motion from a frame to the next, on the billboard, of the motion texture's texel; that is linear too.
+vec2 wlm_smoke_motion(vec4 texel)
+{{
+    vec2 way = texel.xy - vec2({zero}, {zero});
+    return vec2(way.x * {reach}, way.y * -{reach});
+}}
+
+// Where the earlier frame shows what is at a place.
+vec2 wlm_smoke_before(vec2 place, vec2 motion, float share)
+{{
+    return clamp(place - motion * share, vec2(0.0, 0.0), vec2(1.0, 1.0));
+}}
+
+// Where the later frame does.
+vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
+{{
+    return clamp(place + motion * (1.0 - share), vec2(0.0, 0.0), vec2(1.0, 1.0));
+}}
 """
 
 
@@ -57,6 +93,7 @@ def smoke_shader(
     padding: int = 0,
     gain: float = 1.0,
     hot: bool = True,
+    motion: float | None = None,
 ) -> str:
     """Writes the shader of a flip book.
 
@@ -68,6 +105,7 @@ def smoke_shader(
         padding: Pixels around it.
         gain: The factor on the light in the textures.
         hot: Whether they have a channel of emission.
+        motion: The scale of its motion texture; None: it has none.
 
     Raises:
         ValueError: No such language or layout.
@@ -93,10 +131,13 @@ def smoke_shader(
         share_x=_literal(size[1] / width),
         share_y=_literal(size[0] / height),
         factor=_literal(1.0 / gain),
+        levels=mip_levels(*size, padding),
         alpha=alpha,
         emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
         **places,
     )
+    if motion is not None:
+        text += _MOTION.format(zero=_literal(ZERO), reach=_literal(2.0 * motion))
     return translate(text, language)
 
 

@@ -18,6 +18,7 @@ from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
+from wlm.smoke.velocity import velocity_file, write_velocity
 from wlm.system import Meter, OnProgress
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
@@ -74,6 +75,7 @@ def simulate(
     device: str = "cpu",
     resume: bool = False,
     checkpoint_every: float = EVERY,
+    velocity: bool = False,
     progress: OnProgress | None = None,
 ) -> int:
     """Runs a scene and writes its frames.
@@ -90,6 +92,7 @@ def simulate(
         resume: Whether to go on from a state that was saved there, if there is one. A state past the last frame asked
             for stays there.
         checkpoint_every: Seconds between two saves; 0: after every step.
+        velocity: Whether to keep the air's velocity beside each frame, as motion vectors need it.
         progress: Called after each frame, with the figures `smoke`, the density's integral over the box, and
             `frame s`, the seconds that the frame took; and about twice a second within a frame, without figures.
 
@@ -101,7 +104,7 @@ def simulate(
             frame before the saved state is missing; another process is writing the folder.
     """
     with locked(frames.path):
-        return _simulate(frames, solver, device, resume, checkpoint_every, progress)
+        return _simulate(frames, solver, device, resume, checkpoint_every, velocity, progress)
 
 
 def _simulate(
@@ -110,6 +113,7 @@ def _simulate(
     device: str,
     resume: bool,
     checkpoint_every: float,
+    velocity: bool,
     progress: OnProgress | None,
 ) -> int:
     """`simulate`, once the folder is locked."""
@@ -142,6 +146,8 @@ def _simulate(
                 solver.check()
                 volume = volume_of(scene, solver)
                 # Before the state: one whose frame is missing would be resumed past it.
+                if velocity:
+                    write_velocity(velocity_file(frames.path, frame), solver.velocity, scene.grid.cell * scene.steps)
                 save_volume(frames.file(frame), volume, bricks=True)
             if pace.due():
                 with pace.saving():

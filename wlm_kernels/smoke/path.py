@@ -18,9 +18,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, Medium, View, density_at, phase, ray, size_of
+from wlm_kernels.smoke.march import BRICK, Medium, View, density_at, phase, ray
 from wlm_kernels.smoke.path_walk import drawn, enter, onward
 from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
 
@@ -85,6 +86,8 @@ def _fly(
     temperature: wp.array3d[Any],
     bounds: wp.array3d[float],
     edge: float,
+    low: wp.vec3,
+    size: wp.vec3,
     extinction: float,
     emission: float,
     p: wp.vec3,
@@ -97,7 +100,7 @@ def _fly(
     glow = float(0.0)
     random = following(random)
     left = -wp.log(1.0 - uniform(random))  # optical depth, of the majorants, to the next place that is looked at
-    w = enter(bounds, edge, size_of(density), p, d, limit)
+    w = enter(bounds, edge, size, p - low, d, limit)
     while w.t < w.end:
         through = w.most * (w.border - w.t)
         if left >= through:
@@ -127,6 +130,8 @@ def _passed(
     density: wp.array3d[Any],
     bounds: wp.array3d[float],
     edge: float,
+    low: wp.vec3,
+    size: wp.vec3,
     extinction: float,
     p: wp.vec3,
     d: wp.vec3,
@@ -138,7 +143,7 @@ def _passed(
     share = float(1.0)
     random = following(random)
     left = -wp.log(1.0 - uniform(random))
-    w = enter(bounds, edge, size_of(density), p, d, limit)
+    w = enter(bounds, edge, size, p - low, d, limit)
     while w.t < w.end:
         through = w.most * (w.border - w.t)
         if left >= through:
@@ -167,6 +172,7 @@ class _Kernels:
     """Of one type of density."""
 
     majorants: wp.Kernel
+    window: wp.Kernel
     coarser: wp.Kernel
     trace: wp.Kernel
 
@@ -202,6 +208,17 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
         out[a, b, c] = most
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    def window(
+        # in:
+        bounds: wp.array3d[float],
+        begin: wp.vec3i,
+        # out:
+        out: wp.array3d[float],
+    ):
+        a, b, c = wp.tid()
+        out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def coarser(
         # in:
         bounds: wp.array3d[float],
@@ -231,6 +248,8 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
         temperature: wp.array3d[dtype],
         bounds: wp.array3d[float],
         edge: float,
+        low: wp.vec3,
+        size: wp.vec3,
         extinction: float,
         emission: float,
         view: View,
@@ -285,7 +304,7 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
                     limit = free(mesh, p - view.moved * d, d) - view.moved
                 else:
                     limit = free(mesh, p, d)
-                flight = _fly(density, temperature, bounds, edge, extinction, emission, p, d, limit, random)
+                flight = _fly(density, temperature, bounds, edge, low, size, extinction, emission, p, d, limit, random)
                 random = flight.random
                 plane = wp.min(order, planes - 1)
                 if flight.glow > 0.0:
@@ -326,7 +345,7 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
                             strength = 1.0 / wp.max(away * away, 1.0e-12)
                             way = wp.normalize(way)
                         if free(mesh, p, way) >= reach:
-                            got = _passed(density, bounds, edge, extinction, p, way, reach, random)
+                            got = _passed(density, bounds, edge, low, size, extinction, p, way, reach, random)
                             random = got.random
                             strength = strength * got.share * phase(settings.g, wp.dot(d, way))
                             at = (base + n) * planes + plane
@@ -336,7 +355,8 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
                         far = toward_sky(sky, random)
                         random = far.random
                         if free(mesh, p, far.direction) >= _NEVER:
-                            got = _passed(density, bounds, edge, extinction, p, far.direction, _NEVER, random)
+                            toward = far.direction
+                            got = _passed(density, bounds, edge, low, size, extinction, p, toward, _NEVER, random)
                             random = got.random
                             own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
                             strength = got.share * own / (own + far.chance)
@@ -353,7 +373,7 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
                     d = scatter(settings.g, d, u, uniform(random))
                     chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
 
-    return _Kernels(majorants, coarser, trace)
+    return _Kernels(majorants, window, coarser, trace)
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
@@ -374,10 +394,16 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
 
 @dataclass(frozen=True)
 class Majorants:
-    """The greatest extinction per voxel that a sample in each brick can find, float [X, Y, Z] / edge, rounded up."""
+    """The greatest extinction per voxel that a sample in each brick can find, of the part of the grid with smoke.
+
+    `most` is float [X, Y, Z] of bricks of an edge of so many voxels, the first of which begins at `low`; they reach up
+    to `size` voxels from there. Beyond them there is nothing.
+    """
 
     most: wp.array
     edge: int
+    low: tuple[int, int, int]
+    size: tuple[int, int, int]
 
 
 def bounds(medium: Medium, densest: float) -> Majorants:
@@ -393,12 +419,27 @@ def bounds(medium: Medium, densest: float) -> Majorants:
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
     inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]
     wp.launch(kernels.majorants, most.shape, inputs=inputs, outputs=[most], device=device)
-    while 2 * edge * densest <= _DEEP and max(most.shape) > 1:
+    begin, end = _filled(most.numpy() > 0.0)
+    low = tuple(edge * n for n in begin)
+    size = tuple(min(edge * n, most) - least for n, most, least in zip(end, density.shape, low, strict=True))
+    inner = medium.buffer(tuple(b - a for a, b in zip(begin, end, strict=True)), float)
+    wp.launch(kernels.window, inner.shape, inputs=[most, wp.vec3i(*begin)], outputs=[inner], device=device)
+    while 2 * edge * densest <= _DEEP and max(inner.shape) > 1:
         edge *= 2
-        wider = medium.buffer(tuple(-(-n // 2) for n in most.shape), float)
-        wp.launch(kernels.coarser, wider.shape, inputs=[most], outputs=[wider], device=device)
-        most = wider
-    return Majorants(most, edge)
+        wider = medium.buffer(tuple(-(-n // 2) for n in inner.shape), float)
+        wp.launch(kernels.coarser, wider.shape, inputs=[inner], outputs=[wider], device=device)
+        inner = wider
+    return Majorants(inner, edge, low, size)
+
+
+def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
+    """The least box around what is there, first and past the last along each axis; one cell where there is nothing."""
+    begin, end = [], []
+    for axis in range(3):
+        found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))
+        begin.append(int(found[0]) if len(found) else 0)
+        end.append(int(found[-1]) + 1 if len(found) else 1)
+    return begin, end
 
 
 def trace(
@@ -434,7 +475,8 @@ def trace(
     # Fewer threads than keep a GPU busy wouldn't be faster for more paths each.
     together = max(1, traced * view.height * view.width // _THREADS) if density.device.is_cuda else 1
     size = (-(-traced // together), view.height, view.width)
-    inputs = [density, temperature, majorants.most, float(majorants.edge), medium.extinction, emission, view, lights]
+    inputs = [density, temperature, majorants.most, float(majorants.edge), wp.vec3(*map(float, majorants.low))]
+    inputs += [wp.vec3(*map(float, majorants.size)), medium.extinction, emission, view, lights]
     inputs += [sky, mesh, settings, first, first + traced, parts, together]
     kernel = path_kernels(density.dtype, mesh != 0).trace
     wp.launch(kernel, size, inputs=inputs, outputs=[out], device=density.device)

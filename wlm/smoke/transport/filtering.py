@@ -41,6 +41,7 @@ FAINT = 0.03
 
 _BRIGHTEST = 6.0  # light of all orders over opacity: a white surface under irradiance 4 pi has 4
 _SHIPPED = Path(__file__).resolve().parents[2] / "data" / "smoke-orders.npz"
+_LEAST, _WORTH = 0.06, 0.1  # RMS of a correction over the light's: none is taken up to the first, all from the second
 _BEYOND = 0.5  # of the logarithm of optical depth beyond training over which a correction fades
 _SHAPES = {
     "weights": (len(ALBEDOS), FEATURES * ANGLES),
@@ -120,6 +121,13 @@ class OrdersModel:
         beyond = torch.maximum(low - inputs.depth, inputs.depth - high).clamp(min=0.0)
         return (1.0 - beyond / _BEYOND).clamp(min=0.0)
 
+    def worth(self, inputs: Inputs, filtered: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
+        """Share of each correction that is taken for its size, [N, 1, 1]: where little is to be corrected, the network
+        errs by about as much."""
+        parts = [(inputs.opacity * light.square()).sum((1, 2), keepdim=True) for light in (correction, filtered)]
+        size = (parts[0] / parts[1].clamp(min=1e-12)).sqrt()
+        return ((size - _LEAST) / (_WORTH - _LEAST)).clamp(0.0, 1.0)
+
     def multiple(
         self, inputs: Inputs, nodes: Sequence[int] = range(len(ALBEDOS)), *, network: bool = True
     ) -> torch.Tensor:
@@ -128,8 +136,9 @@ class OrdersModel:
         gates = [self.gates[node] for node in nodes]
         if not network or not any(gates):
             return filtered
-        correction, trust = self.correction(inputs, filtered, nodes), self.trust(inputs)
-        planes = [plane + gate * trust * more for plane, more, gate in zip(filtered, correction, gates, strict=True)]
+        correction = self.correction(inputs, filtered, nodes)
+        correction = self.trust(inputs) * self.worth(inputs, filtered, correction) * correction
+        planes = [plane + gate * more for plane, more, gate in zip(filtered, correction, gates, strict=True)]
         return torch.stack(planes).clamp(min=0.0)
 
     def light(self, inputs: Inputs, albedo: Sequence[float], *, network: bool = True) -> torch.Tensor:
@@ -147,7 +156,8 @@ class OrdersModel:
         for value, share in shares.items():
             more = sum(part * multiple[node] for node, part in share.items())
             total = value * inputs.single + value**2 * more
-            colours[value] = torch.minimum(total, _BRIGHTEST * inputs.opacity)
+            # Beside a light within the smoke light scattered once alone may be brighter, and is exact.
+            colours[value] = torch.minimum(total, _BRIGHTEST * inputs.opacity).maximum(value * inputs.single)
         return torch.stack([colours[float(value)] for value in albedo], -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:

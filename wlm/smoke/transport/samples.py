@@ -36,17 +36,21 @@ class Sample:
     light: torch.Tensor
 
 
-def draw_view(seed: int, number: int, *, pixels: int = 64, lights: int = 6) -> tuple[DensityVolume, Camera, tuple]:
+def draw_view(
+    seed: int, number: int, *, pixels: int = 64, lights: int = 6, cells: int | None = None
+) -> tuple[DensityVolume, Camera, tuple]:
     """Draws smoke, a camera and lights; each is of the seed and the number alone.
 
     Args:
         seed, number: At least 0.
         pixels: H and W.
         lights: How many.
+        cells: Voxels along an edge; None: drawn, 40 to 64.
     """
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THIN), np.log(_THICK))))
-    n = int(random.choice(_SIZES))
+    drawn = int(random.choice(_SIZES))
+    n = drawn if cells is None else cells
     volume = make_plume(n, seed=int(random.integers(2**31)), hot=False, extinction=extinction)
     density = volume.density ** float(random.uniform(0.5, 2.0))
     density = density.permute(tuple(int(i) for i in random.permutation(3)))

@@ -98,7 +98,7 @@ class Transport:
         planes[:, :-1] = self.planes[:, :-1] * powers[:, None, None]
 
         def scaled(noise: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-            return noise * torch.where(before > 0, after / before.clamp(min=1e-30), 0.0)
+            return torch.where(after > 0, noise * (after / before.clamp(min=1e-30)), 0.0)
 
         noise = scaled(self.noise, self.planes.sum(1), planes.sum(1))
         total_noise = scaled(self.total_noise, self.total, planes.sum((0, 1)))
@@ -129,7 +129,7 @@ def trace(
         environment: Light from all around, seen behind the smoke too.
         albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
         g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
-        samples: Paths a pixel, at least 2.
+        samples: Paths a pixel, at least 1. Of one path the noise isn't known: it is infinite.
         orders: Orders of scattering that get planes of their own.
         highest: Scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
@@ -146,7 +146,7 @@ def trace(
     if not -1 < g < 1:
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
     for name, value, least in (
-        ("samples", samples, 2),
+        ("samples", samples, 1),
         ("orders", orders, 0),
         ("highest", highest, 0),
         ("seed", seed, 0),
@@ -215,6 +215,8 @@ def _require(planes: int, sources: int, view: View, parts: int, at_once: int, de
 def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
     """Standard errors [...] of the sum over parts [P, ...]."""
     parts = len(means)
+    if parts == 1:
+        return torch.full_like(means[0], math.inf)
     counts = torch.tensor([samples // parts + (n < samples % parts) for n in range(parts)])
     weight = (counts.double() / samples).to(means).reshape(-1, *[1] * (means.ndim - 1))
     off = means - weight * means.sum(0)

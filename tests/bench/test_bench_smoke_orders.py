@@ -1,0 +1,136 @@
+"""The benchmark of light of all orders on tiny pictures: every row, who is nearest, and diffusion by its own law."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from builders.bench_rows import ENVIRONMENT, check_command
+from builders.smoke_plumes import facing, plume
+
+import wlm.bench.smoke_orders as bench
+from wlm.baselines.smoke_orders import FITTED, diffused, fluence, octaves, three_octaves
+from wlm.bench import read_json, tables, write_json
+from wlm.bench.path_tracer import denoised_picture
+from wlm.bench.smoke_orders import ALBEDOS, METHOD, QUICK, run, run_rows
+from wlm.errors import WlmError
+from wlm.fluid.volume import from_array
+from wlm.smoke.camera import Camera
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.learning import psnr
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.tracing import trace
+
+TINY = replace(QUICK, plumes=1, pixels=10, samples=96, scale=0.08, frames=20, sides=1, diffusion=8, repeats=1)
+WAYS = ("single scattering", "single x gain", "three octaves", "fitted octaves", "diffusion", "filter")
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return run_rows(TINY, device="cpu")
+
+
+def test_every_row_has_its_figures(rows):
+    """Of each scene and albedo each way, what a frame takes by it, and the references' noise; flicker of the jet."""
+    scenes = [f"{name}, albedo {albedo:g}" for name in ("plumes", "jet") for albedo in ALBEDOS]
+    assert list(dict.fromkeys(row.scene for row in rows)) == scenes
+    for scene in scenes:
+        found = {row.option: row for row in rows if row.scene == scene}
+        denoised = {"1 sample, denoised"} if importlib.util.find_spec("pyoidn") else set()
+        assert set(found) == {*WAYS, "filter, network", "path tracing"} | denoised
+        for option, row in found.items():
+            assert (row.system, row.method) == ("smoke", METHOD) and row["pixels"] == 10 and row["lights"] == 3
+            assert row["psnr_min"] <= row["psnr"] <= row["psnr_max"]
+            if option == "path tracing":
+                assert row["samples"] == 96 and row["psnr"] > 30.0
+                continue
+            assert 0 < row["flip"] <= row["flip_max"] and row["time_ms"] > 0
+            assert ("flicker" in row.figures) == scene.startswith("jet")
+
+
+def test_who_is_nearest(rows):
+    """The filter to all light of a plume, the network no worse, and single scattering farthest off."""
+    for albedo in ALBEDOS:
+        found = {row.option: row for row in rows if row.scene == f"plumes, albedo {albedo:g}"}
+        for rival, gain in (("single scattering", 8.0), ("single x gain", 1.0), ("three octaves", 1.0)):
+            assert found["filter"]["psnr"] > found[rival]["psnr"] + gain
+            assert found["filter"]["flip"] < found[rival]["flip"]
+        assert found["filter, network"]["psnr"] > found["filter"]["psnr"] - 0.1
+        assert found["single x gain"]["psnr"] > found["single scattering"]["psnr"] + 3.0
+        assert found["fitted octaves"]["psnr"] > found["three octaves"]["psnr"] + 1.0
+
+
+def test_flicker_is_what_the_smokes_motion_leaves():
+    """Of a picture that moves as its smoke does there is none; of one that stays, the reference's and more."""
+    random = torch.Generator().manual_seed(2)
+    picture = torch.rand(16, 16, 3, generator=random)
+    later = picture.roll(2, 1)
+    motion = torch.stack([torch.full((16, 16), 2.0), torch.zeros(16, 16)])
+    volume, camera = plume(), facing(plume(), size=16)
+    shots = [bench.Shot(volume, camera, (), 0), bench.Shot(volume, camera, (), 1, motion)]
+    noise = [0.02 * torch.randn(16, 16, 3, generator=random) for _ in range(4)]
+    light = torch.full((16, 16, 3), 0.3)
+    halves = [(light + noise[0], light + noise[1]), (1.5 * light + noise[2], 1.5 * light + noise[3])]
+    opacity = [torch.ones(16, 16)] * 2
+    assert bench._flicker(shots, [picture, later], halves, opacity)["flicker"] < 1e-3
+    brighter = bench._flicker(shots, [light, 1.5 * light], halves, opacity)
+    # The references' noise isn't counted as their change.
+    assert brighter["flicker"] > 20 and brighter["flicker_ratio"] == pytest.approx(1.0, abs=0.06)
+
+
+def test_plumes_of_finer_voxels_are_the_same_smoke():
+    """What a GPU's rows are of: resampled, as opaque as before from the same side."""
+    plain, fine = (bench._plume(replace(TINY, cells=20, voxels=voxels), 3, "cpu") for voxels in (None, 50))
+    assert fine.volume.shape == (50, 50, 50) and fine.camera == plain.camera
+    assert [light.irradiance for light in fine.lights] == [light.irradiance for light in plain.lights]
+    assert fine.volume.size == pytest.approx(plain.volume.size)
+    clear = [light_smoke(shot.volume, shot.camera, ()).transparency for shot in (plain, fine)]
+    assert clear[0].min() < 0.8 and torch.allclose(*clear, atol=0.05)
+    assert sum(np.sum(light.irradiance) for light in fine.lights) == pytest.approx(12 * np.pi)
+
+
+def test_rows_make_a_file_and_a_table(rows, tmp_path):
+    write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
+    assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT)
+    assert "| filter, network |" in tables(rows)
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    command, _, options = check_command(monkeypatch, bench, rows, ["smoke-orders", "--quick"], tmp_path)
+    assert command == "wlm bench smoke-orders --quick --device cpu" and options["quick"]
+
+
+def test_what_is_refused(monkeypatch):
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        run(quick=True, device="tpu")
+    monkeypatch.setattr("wlm.bench.path_tracer.has_denoiser", lambda: False)
+    with pytest.raises(WlmError, match=r"needs pyoidn: install wlm\[bake\]"):
+        denoised_picture(torch.zeros(4, 4, 3))
+
+
+def test_diffused_light_fades_as_its_equation_says(device: str):
+    """Deep in even smoke as exp(-k x), where k is that of the equation with the bounded coefficient, k^2 D = lost."""
+    volume = from_array(np.ones((24, 24, 24), np.float32), extinction=30.0, voxel=1 / 24, device=device)
+    down = fluence(volume, [Light((0.0, 1.0, 0.0))], 0.9, cells=24)[0, 12, :, 12].cpu().numpy()
+    lost, steepest = 3.0, 3.0 * 30.0
+    expected = max(np.roots([1.0, -lost, -steepest * lost]))
+    assert 24 * np.log(down[8:17] / down[7:16]) == pytest.approx(expected, rel=0.03)
+    # From the other side as from this one.
+    up = fluence(volume, [Light((0.0, -1.0, 0.0))], 0.9, cells=24)[0, 12, :, 12].cpu().numpy()
+    assert up[::-1] == pytest.approx(down, rel=1e-3)
+
+
+def test_rivals_are_nearer_than_single_scattering(device: str):
+    """A thick plume from aside: diffusion by 6 dB; octaves of the smoke's own extinction are single scattering."""
+    volume = plume(device=device)
+    camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=16)
+    lights = [Light((1.0, 0.5, 0.6))]
+    wanted = trace(volume, camera, lights, samples=256).total
+    once = light_smoke(volume, camera, lights).shade()
+    diffuse = diffused(volume, camera, lights, 1.0, cells=16)
+    assert psnr(diffuse, wanted) > psnr(once, wanted) + 6.0
+    assert psnr(three_octaves(volume, camera, lights, 1.0), wanted) > psnr(once, wanted) + 2.0
+    made = octaves(volume, camera, lights)
+    assert made.shape == (len(FITTED), 16, 16, 3) and torch.allclose(made[0], once, atol=0.02)
+    assert not diffused(volume, camera, lights, 0.0, cells=8).any()
