@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
@@ -52,7 +53,13 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
             for name in parts[:-1]:
                 (staging / name).rename(staging / _of_unity(name))
             parts = [*map(_of_unity, parts[:-1]), parts[-1]]
-        texts = _TEXTS[engine](model)
+        if engine == "unreal":
+            for name in parts[:-1]:
+                (staging / name).unlink()
+            texts = unreal.write_lightmap(model, staging)
+            parts = [*sorted(path.name for path in staging.iterdir() if path.name != parts[-1]), parts[-1]]
+        else:
+            texts = _TEXTS[engine](model)
         for name, text in texts.items():
             (staging / name).write_bytes(text.encode())
     return [folder / name for name in (*texts, *parts)]
@@ -93,29 +100,31 @@ def _unity(model: LightmapModel) -> dict[str, str]:
     }
 
 
-def _unreal(model: LightmapModel) -> dict[str, str]:
-    shader = translate(decode_glsl(model), "hlsl")
-    return {
-        "WlmLightmap.usf": filled(
-            "unreal_lightmap.usf", SHADER=shader, WIDTH=str(model.width), HEIGHT=str(model.height)
-        ),
-        README_FILE: filled("unreal_lightmap.md", NAME=model.name),
-    }
-
-
 _TEXTS: dict[str, Callable[[LightmapModel], dict[str, str]]] = {
     "three": _three,
     "godot": _godot,
     "unity": _unity,
-    "unreal": _unreal,
 }
-_ENDINGS = (".hlsl", ".shader", ".cs", ".usf", ".gd", ".gdshader", ".js", ".glsl")
+_ENDINGS = (
+    ".hlsl",
+    ".shader",
+    ".cs",
+    ".py",
+    ".gd",
+    ".gdshader",
+    ".js",
+    ".glsl",
+    ".usf",
+)  # the last of earlier versions
 _STEMS = {"lightmap", "lit", "wlm_lightmap", "WlmLightmap"}
 _BYTES = {f"{name}.bytes" for name in ("uv", "uvt", "planes", "frames", "video", "networks", "hours", "valid")}
+_PICTURES = {f"{name}.tga" for name in ("uv", "uvt", "planes", "frames", "valid")} | {
+    f"{name}.exr" for name in ("video", "hour", "networks")
+}
 
 
 def _is_exported(name: str) -> bool:
     """Whether a file's name is one that an export for an engine may have."""
     path = Path(name)
     ours = path.stem in _STEMS and path.suffix in _ENDINGS
-    return ours or name in (README_FILE, MASK_FILE) or name in _BYTES or exporter.is_exported(name)
+    return ours or name in (README_FILE, MASK_FILE) or name in _BYTES | _PICTURES or exporter.is_exported(name)
