@@ -338,7 +338,7 @@ def test_metal_as_the_cpp_that_it_is(name, tmp_path):
 def test_heads_tell_what_other_languages_hold(tmp_path):
     """Macros are decided there, and nothing is of GLSL."""
     for name in ("lightmap", "atlas mips", "scene", "probes", "volume"):
-        text = SUBJECTS[name](tmp_path).text
+        text = SUBJECTS[name](tmp_path / name).text
         for defined in ((), ("WLM_ATLAS_EXACT", "WLM_LIGHTMAP_EXACT")):
             written = translate(text, "hlsl", defined)
             assert not re.search(r"//.*(_EXACT|before this file|GLSL|#version|WLM_\w+\(\w\))", written), name

@@ -15,7 +15,7 @@ from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled, godot_uniforms
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-atlas-engine"
@@ -60,10 +60,9 @@ def export_atlas(
     texts = _raw(model, shader, exact) if engine == "raw" else _TEXTS[engine](model)
     files = {name: name + (".bytes" if engine == "unity" else ending) for name in names}
     folder = Path(directory)
-    make_parents(folder)
     if folder.resolve() == output.folder.resolve():
         raise WlmError(f"{folder}: expected another folder than that of the compression")
-    with staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
         for name, file in files.items():
             if name == "colour" and engine != "raw" and ending == ".dds" and _odd_blocks(model):
                 _write_halves(staging / file, model.texels)

@@ -10,7 +10,7 @@ from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import make_parents, staged
+from wlm.formats.folder import made_parents, staged
 from wlm.lightmap import exporter, packed
 from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.model import LightmapModel
@@ -40,8 +40,7 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
     if isinstance(model, LayeredModel):
         raise WlmError(f"{model.name}: cannot export for {engine}: expected one light, found layers; export it raw")
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
+    with made_parents(folder), staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
         parts = exporter.write_parts(model, staging, form=FORMAT)
         (staging / exporter.VALID_FILE).unlink()
         height, width = model.mask.shape

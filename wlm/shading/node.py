@@ -65,7 +65,7 @@ class _NodeWriter(HlslWriter):
         return "".join(lines), [each for each in inputs if each != self.linear]
 
     def _drop_all_but(self, function: str) -> None:
-        """Leaves out functions that this one doesn't call with the comments over them, and the head, which is of files."""
+        """Leaves out functions that this one doesn't call with their comments, and the head, which is of files."""
         needed, found = set(), {function}
         while found - needed:
             needed |= found
