@@ -41,9 +41,7 @@ def scene_folder(folder, uv_set=1):
             light = share * sky[..., None] * [0.6, 0.8, 1.0] + (1 - share) * lamp[..., None] * [2.0, 1.2, 0.5]
             write_exr(folder / f"{number}_{state}.exr", light)
         sheets.append({"files": [f"{number}_{state}.exr" for state in STATES]})
-    objects = [
-        {"node": name, "sheet": sheet, "scale_offset": place} for name, (_, sheet, place) in _SQUARES.items()
-    ]
+    objects = [{"node": name, "sheet": sheet, "scale_offset": place} for name, (_, sheet, place) in _SQUARES.items()]
     text = {"states": STATES, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
     scene = load_scene(path, folder / "lights.json")

@@ -299,6 +299,8 @@ def test_a_scene_is_one_command(tmp_path):
     text = call("atlas", "evaluate", out, "--views", "2", "--resolution", "32", "--json", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["inside_views"] == 2 and report["psnr"] > 35.0 and "PSNR dB, from inside" in text
+    assert "scene.js" in call("atlas", "export", out, "-o", tmp_path / "three", "--engine", "three")
+    assert "--exact: expected with one lightmap" in fails("atlas", "export", out, "-o", tmp_path / "a", "--exact")
     words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out, "--flip")
     assert "--flip: expected with one lightmap alone" in fails(*words)
 
@@ -311,6 +313,3 @@ def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):
     assert "float3 wlm_atlas(float2 uv) const" in (tmp_path / "out" / "atlas.metal").read_text()
     assert "--shader: means nothing with --engine three" in fails(*out, "--engine", "three", "--shader", "wgsl")
     assert "another folder" in fails("atlas", "export", tiles, "-o", tiles)
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "report.json").write_text('{"format": "wlm-atlas-scene"}')
-    assert "found a scene" in fails("atlas", "export", tmp_path / "scene", "-o", tmp_path / "other")

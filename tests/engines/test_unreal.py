@@ -2,8 +2,6 @@
 
 import json
 import re
-import sys
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,99 +9,16 @@ from builders.atlas_meshes import charts
 from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
-from builders.shader_runs import run_hlsl
+from builders.engine_scripts import Script, node_gives, pixels_of
 from builders.synthetic import random_model as random_lightmap
-from PIL import Image
 
 from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
-from wlm.engines import export_atlas, export_lightmap
-from wlm.engines import unreal as unreal_folders
-from wlm.formats.exr import read_exr
+from wlm.engines import export_atlas, export_lightmap, kit
+from wlm.engines.unreal import asset_name
 from wlm.lightmap.decode import Decoder
 
 ALL = (4, 3, 2, 1, 5, 0)
-
-
-class Script:
-    """A script of a folder, run with a stand-in for Unreal's module that imports pictures of their size."""
-
-    def __init__(self, path, monkeypatch):
-        self.nodes, self.links, self.settings, self.slots = [], [], {}, []
-        self.unreal = MagicMock()
-        self.unreal.Texture2D, self.unreal.StaticMesh = type("Texture2D", (MagicMock,), {}), type("Mesh", (), {})
-        self.unreal.MaterialInstanceConstant = type("Instance", (), {})
-        self.unreal.AssetImportTask = self.task
-        self.unreal.CustomInput = self.held
-        self.unreal.MaterialEditingLibrary.create_material_expression = self.node
-        self.unreal.MaterialEditingLibrary.connect_material_expressions = self.link
-        mesh = self.unreal.StaticMesh()
-        mesh.get_name, mesh.set_material = lambda: "mesh", lambda number, material: self.slots.append(number)
-        mesh.get_editor_property = lambda name: [MagicMock()]
-        self.mesh = mesh
-        self.unreal.get_editor_subsystem.return_value.get_num_uv_channels.return_value = 2
-        monkeypatch.setitem(sys.modules, "unreal", self.unreal)
-        self.names = {"__file__": str(path), "__name__": "script"}
-        exec(compile(path.read_text(), str(path), "exec"), self.names)
-
-    def held(self):
-        values = {}
-        made = MagicMock(values=values)
-        made.set_editor_property = values.__setitem__
-        return made
-
-    def task(self):
-        made = self.held()
-        made.get_objects = lambda: [self.object(made.values["filename"])]
-        return made
-
-    def object(self, file):
-        if file.endswith(".glb"):
-            return self.mesh
-        name = file.rpartition("/")[2]
-        pixels = pixels_of(file)
-        texture = self.unreal.Texture2D()
-        texture.blueprint_get_size_x.return_value, texture.blueprint_get_size_y.return_value = pixels.shape[1::-1]
-        texture.set_editor_property = self.settings.setdefault(name, {}).__setitem__
-        return texture
-
-    def node(self, material, kind):
-        made = self.held()
-        made.kind = kind
-        self.nodes.append(made)
-        return made
-
-    def link(self, source, output, target, pin):
-        self.links.append((target, pin))
-        return True
-
-    def customs(self):
-        """The Custom nodes' codes, and the inputs that something is joined to."""
-        found = [each for each in self.nodes if each.kind is self.unreal.MaterialExpressionCustom]
-        return [(each.values["code"], [pin for target, pin in self.links if target is each]) for each in found]
-
-
-def pixels_of(file):
-    """A picture as Unreal has it: of bytes levels from 0 to 1."""
-    if file.endswith(".tga"):
-        return np.asarray(Image.open(file).convert("RGBA"))
-    pixels, _ = read_exr(file)
-    return np.pad(pixels, ((0, 0), (0, 0), (0, 4 - pixels.shape[2])))
-
-
-def computed(code, inputs, size, place, bound, folder, numbers=None):
-    """What a Custom node gives at `place`, an expression of the pixel."""
-    structure, _, body = code.partition("WlmNode wlm;")
-    numbers = numbers or {}
-    textures = [name for name in inputs if name in bound and name != "u_points"]
-    declared = "".join(f"Texture2D<float4> {name};\n" for name in (*textures, *({"u_points"} & set(bound))))
-    for name in textures:
-        if f"{name}Sampler" in body:
-            declared += f"SamplerState {name}Sampler;\n"
-    declared += "".join(f"static const float {name} = {value};\n" for name, value in numbers.items())
-    assert set(inputs) == {"UV", *textures, *numbers}
-    text = f"{declared}{structure}float3 wlm_custom(float2 UV)\n{{\nWlmNode wlm;{body}\n}}\n"
-    return run_hlsl(text, f"float4(wlm_custom({place}), 1.0)", size, bound, folder)[..., :3]
 
 
 @pytest.mark.parametrize("kind", [*KINDS, MIXED])
@@ -125,8 +40,8 @@ def test_an_atlas_node_gives_its_light(kind, tmp_path, monkeypatch):
     bound = {
         name: v.astype(np.float16) if model.method == "cascade" or "lut" not in name else v for name, v in bound.items()
     }
-    bound["u_points"] = np.pad(uv, ((0, 0), (0, 2)))[None]
-    found = computed(code, inputs, (1, len(uv)), "u_points.Load(int3(pixel, 0)).xy", bound, tmp_path)[0]
+    bound["points"] = np.pad(uv, ((0, 0), (0, 2)))[None]
+    found = node_gives(code, inputs, (1, len(uv)), "points.Load(int3(pixel, 0)).xy", bound, tmp_path)[0]
     allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
     np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=allowed)
 
@@ -145,9 +60,9 @@ def test_lightmap_nodes_decode_an_hour_and_fill_its_gaps(kinds, tmp_path, monkey
     size = mask.shape
     place = f"(float2(pixel) + 0.5) / float2({size[1]}, {size[0]})"
     for number in (0, 2):
-        found = computed(*decode, size, place, bound, tmp_path, {"wlm_hour": float(number)})
+        found = node_gives(*decode, size, place, bound, tmp_path, {"wlm_hour": f"float wlm_hour = {number}.0"})
         filled = bound | {"Decoded": np.pad(found, ((0, 0), (0, 0), (0, 1)))}
-        found = computed(*fill, size, place, filled, tmp_path)
+        found = node_gives(*fill, size, place, filled, tmp_path)
         want = Decoder(model).frame(float(model.times[number]))
         np.testing.assert_allclose(found, want, rtol=0, atol=want.max() / 255)
     for time in (0.0, 3.0, 7.5, 12.9, 23.0):
@@ -170,8 +85,8 @@ def test_times_without_a_day(tmp_path, monkeypatch):
 
 
 def test_what_unreal_does_not_import(tmp_path, monkeypatch):
-    monkeypatch.setattr(unreal_folders, "_MOST_SIDE", 127)
-    line = error_of(export_lightmap, random_lightmap(), tmp_path / "out", "unreal")
-    assert re.search(r"cannot export for unreal: uv is \d+x\d+ texels, of at most 127 a side", line)
-    assert not (tmp_path / "out").exists()
-    assert unreal_folders.asset_name("a b/ç.1") == "a_b___1"
+    monkeypatch.setitem(kit._MOST_SIDE, "unreal", 127)
+    line = error_of(export_lightmap, random_lightmap(), tmp_path / "deep" / "out", "unreal")
+    assert re.search(r"cannot export for unreal: uv: expected at most 127 texels along a side, found \d+x\d+", line)
+    assert not (tmp_path / "deep").exists()
+    assert asset_name("a b/ç.1") == "a_b___1"

@@ -1,4 +1,4 @@
-"""The lightmaps of a scene for three.js: its own loader of glTF, objects that share a material, states and what is between."""
+"""The lightmaps of a scene for three.js, with its own loader of glTF: objects that share a material, states."""
 
 import numpy as np
 import pytest

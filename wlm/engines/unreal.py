@@ -8,8 +8,7 @@ from PIL import Image
 
 from wlm.atlas.model import AtlasModel
 from wlm.atlas.shader import atlas_glsl
-from wlm.engines.kit import README_FILE, filled
-from wlm.errors import WlmError
+from wlm.engines.kit import README_FILE, check_sides, filled
 from wlm.formats.bc7 import blocks_image
 from wlm.formats.bc7_modes import decode_blocks
 from wlm.formats.exr import write_exr
@@ -18,7 +17,6 @@ from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl, texture_names
 from wlm.shading import custom_node
 
-_MOST_SIDE = 8192  # texels of an imported texture
 _ROW = 1024  # fours of floats in a row of a texture
 # Of the table of all hours: `wlm_hour` is the stored hour's number.
 _HOUR = """\
@@ -55,11 +53,7 @@ def write_lightmap(model: LightmapModel, folder: Path) -> dict[str, str]:
     inputs = {}
     for name, (pixels, form) in pictures.items():
         height, width = pixels.shape[:2]
-        if max(height, width) > _MOST_SIDE:
-            raise WlmError(
-                f"{model.name}: cannot export for unreal: {name} is {width}x{height} texels, of at most {_MOST_SIDE} a "
-                "side"
-            )
+        check_sides(model.name, "unreal", name, pixels)
         file = name + (".tga" if form == "bytes" else ".exr")
         if form == "bytes":
             Image.fromarray(pixels).save(folder / file)
