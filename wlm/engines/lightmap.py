@@ -10,7 +10,7 @@ from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import made_parents, staged
+from wlm.formats.folder import made_parents, read_index, staged, write_index
 from wlm.lightmap import exporter, packed
 from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.model import LightmapModel
@@ -19,6 +19,7 @@ from wlm.shading import translate
 
 FORMAT = "wlm-lightmap-engine"
 MASK_FILE = "valid.dds"
+_UNREAL_KEYS = ("format", "version", "name", "source", "width", "height", "times", "period")
 
 
 def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.PathLike[str], engine: str) -> list[Path]:
@@ -53,8 +54,11 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
                 (staging / name).rename(staging / _of_unity(name))
             parts = [*map(_of_unity, parts[:-1]), parts[-1]]
         if engine == "unreal":
+            # Of other files, and tables of them, its script reads none.
             for name in parts[:-1]:
                 (staging / name).unlink()
+            index = read_index(staging / parts[-1])
+            write_index(staging / parts[-1], {key: index[key] for key in _UNREAL_KEYS})
             texts = unreal.write_lightmap(model, staging)
             parts = [*sorted(path.name for path in staging.iterdir() if path.name != parts[-1]), parts[-1]]
         else:
@@ -104,17 +108,8 @@ _TEXTS: dict[str, Callable[[LightmapModel], dict[str, str]]] = {
     "godot": _godot,
     "unity": _unity,
 }
-_ENDINGS = (
-    ".hlsl",
-    ".shader",
-    ".cs",
-    ".py",
-    ".gd",
-    ".gdshader",
-    ".js",
-    ".glsl",
-    ".usf",
-)  # the last of earlier versions
+# ".usf" is of earlier versions.
+_ENDINGS = {".hlsl", ".shader", ".cs", ".py", ".gd", ".gdshader", ".js", ".glsl", ".usf"}
 _STEMS = {"lightmap", "lit", "wlm_lightmap", "WlmLightmap"}
 _BYTES = {f"{name}.bytes" for name in ("uv", "uvt", "planes", "frames", "video", "networks", "hours", "valid")}
 _PICTURES = {f"{name}.tga" for name in ("uv", "uvt", "planes", "frames", "valid")} | {

@@ -69,8 +69,8 @@ export async function loadScene(url, THREE) {
           const all = each.material;
           each.material = Array.isArray(all) ? all.map((one) => lit(one, own)) : lit(all, own);
         }
-        // Nodes within a node are others; its meshes without a place are its primitives.
-        for (const child of each.children) visit(child, child.isMesh ? own : undefined);
+        // A node's primitives, where it has several, are below it; the loader gives names to nodes, and none to those.
+        for (const child of each.children) visit(child, each.isMesh || child.userData.name ? undefined : own);
       };
       visit(root, undefined);
     },
