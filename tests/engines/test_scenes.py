@@ -15,6 +15,7 @@ from test_folders import TEXTS, UNITY, as_glsl, compiled
 from wlm.atlas.scene.decode import Decoder
 from wlm.engines import ENGINES, export_scene
 from wlm.formats.light import read_light
+from wlm.inspection import inspect
 
 SIZE = 64
 
@@ -51,6 +52,18 @@ def test_each_engines_files_take_the_place_of_anothers(made, tmp_path):
         assert info["uv_set"] == 1 and info["states"] == list(model.states) and len(info["objects"]) == 3
     paths = export_scene(source, tmp_path / "out", "raw", shader="wgsl")
     assert "fn wlm_object" in (tmp_path / "out" / "scene.wgsl").read_text() and paths[-1].name == "scene.json"
+
+
+def test_inspect_names_a_scenes_folders(made, tmp_path):
+    """Their pictures are no lightmaps to compress, the file no network."""
+    source, _ = made
+    ((folder,), (file,)) = inspect(source), inspect(source / "scene.wlm")
+    assert folder.what.startswith("the compressed lightmaps of a scene") and not folder.command
+    assert file.what.startswith("the lightmaps of a scene, compressed") and not file.command
+    for engine in (*ENGINES, "raw"):
+        export_scene(source, tmp_path / engine, engine)
+        (found,) = inspect(tmp_path / engine)
+        assert "of a scene for one engine" in found.what and not found.command
 
 
 def test_what_cannot_be_exported(made, tmp_path):
