@@ -1,5 +1,8 @@
 """Operations on images of light that the metrics, the baselines, the systems and their pictures share."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
@@ -19,6 +22,8 @@ _OFFSETS = sorted(
     ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
     key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
 )  # to a texel's neighbours in the order in which they are asked: the nearest first, then by row
+
+_STRIP = 1024  # rows of a lightmap in which nearest texels are looked for at once
 
 _WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
 _FILMIC_WHITE = 4.0
@@ -81,8 +86,10 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return np.zeros_like(image)
     if valid.all():
         return image.copy()
-    rows, columns = nearest_valid(valid)
-    return image[..., rows, columns, :]
+    rows, columns = (each[~valid] for each in nearest_valid(valid))
+    filled = image.copy()
+    filled[..., ~valid, :] = image[..., rows, columns, :]
+    return filled
 
 
 def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -134,10 +141,38 @@ def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Its row and its column, int32 [H, W] each: `image[rows, columns]` is the image with its gaps filled.
     """
-    rows, columns = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    rows, columns = _nearest_in_strips(mask) or _nearest(mask)
     target, source = near_gaps(mask)
     rows[tuple(target.T)], columns[tuple(target.T)] = source.T
     return rows, columns
+
+
+def _nearest(mask: np.ndarray) -> np.ndarray:
+    return distance_transform_edt(~mask, return_distances=False, return_indices=True)
+
+
+def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """`_nearest` of strips with rows of both neighbours, by threads; None where a nearest texel may lie further off."""
+    height, width = mask.shape
+    rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
+
+    def strip(first: int) -> bool:
+        end = min(first + _STRIP, height)
+        low, high = max(first - _STRIP // 8, 0), min(end + _STRIP // 8, height)
+        if not mask[low:high].any():
+            return False
+        found = _nearest(mask[low:high])[:, first - low : end - low]
+        rows[first:end], columns[first:end] = found[0] + low, found[1]
+        row, column = np.nonzero(~mask[first:end])
+        row += first
+        distance = (rows[row, column] - row) ** 2 + (columns[row, column] - column) ** 2
+        beyond = np.minimum(row - low + 1 if low > 0 else height, high - row if high < height else height)
+        return bool((distance <= beyond**2).all())
+
+    starts = range(0, height, _STRIP)
+    with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as threads:
+        done = list(threads.map(strip, starts))
+    return (rows, columns) if all(done) else None
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:

@@ -213,7 +213,7 @@ def test_weights_follow_the_views_and_the_borders():
 @pytest.mark.parametrize("profile", ["standard", "cascade"])
 def test_the_coverage_by_triangles_is_computed_once(profile, monkeypatch):
     """Of quarters of texels and of texels; the comparison with a plain lightmap shares the fit's grid."""
-    calls, names = [], ("covered_texels", "covered_texels", "mesh_charts", "texel_triangles")
+    calls, names = [], ("covered_on", "covered_on", "mesh_charts", "texel_triangles")
 
     def counted(name):
         function = getattr(wlm.atlas.weights, name)

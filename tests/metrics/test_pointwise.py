@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
+from wlm import texels
 from wlm.errors import WlmError
 from wlm.metrics import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr
 from wlm.texels import fill_gaps
@@ -98,6 +100,23 @@ def test_fill_gaps_takes_the_nearest_valid_texel():
     filled = fill_gaps(stack, mask)
     assert filled.dtype == np.float16
     np.testing.assert_array_equal(filled[1, 0, :, 0], [6, 6, 6, 14, 14, 14])
+
+
+@pytest.mark.parametrize("share", [0.0005, 0.02, 0.5])
+def test_nearest_texels_of_strips_are_the_nearest(share, monkeypatch):
+    """However far they are: where a strip doesn't hold them, all is looked at."""
+    monkeypatch.setattr(texels, "_STRIP", 16)
+    random, (y, x) = np.random.default_rng(3), np.mgrid[:90, :50]
+    in_strips = 0
+    for empty in (0, 5, 60):
+        mask = random.random(y.shape) < share
+        mask[:empty], mask[-1, 7] = False, True
+        rows, columns = texels.nearest_valid(mask)
+        assert mask[rows, columns].all()
+        distance = np.hypot(rows - y, columns - x)
+        np.testing.assert_allclose(distance, distance_transform_edt(~mask), rtol=1e-12)
+        in_strips += texels._nearest_in_strips(mask) is not None
+    assert in_strips == {0.0005: 0, 0.02: 0, 0.5: 2}[share]
 
 
 def test_fill_gaps_at_its_limits():

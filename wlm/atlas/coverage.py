@@ -7,6 +7,7 @@ middle. Each triangle is cut into the rows of texels that it meets; a row of it 
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 
 _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
@@ -54,7 +55,32 @@ def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
     Returns:
         int32 [height, width].
     """
-    change = np.zeros((height, width + 1), np.int32)
+    return covered_on(uv, triangle, height, width, "cpu").numpy()
+
+
+def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str) -> torch.Tensor:
+    """`covered_texels` on a device: the ends of spans are found on the host, the spans filled there.
+
+    Args:
+        uv, triangle, height, width: As `covered_texels` takes them.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        int32 [height, width], on the device.
+    """
+    change = torch.zeros((height, width + 1), dtype=torch.int32, device=device)
+    flat = change.view(-1)
+    for row, first, stop in _centre_spans(uv, triangle, height, width):
+        for column, step in ((first, 1), (stop, -1)):
+            at = torch.from_numpy(row * (width + 1) + column).to(device)
+            flat.index_add_(0, at, flat.new_full((len(at),), step))
+    return torch.cumsum(change, 1, dtype=torch.int32)[:, :width]
+
+
+def _centre_spans(
+    uv: np.ndarray, triangle: np.ndarray, height: int, width: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yields rows and their spans of texels, first <= column < stop, whose centres a triangle holds; int64 [N] each."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -66,8 +92,7 @@ def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
             np.maximum(high, x, out=high, where=meets)
         hit = low <= high
         first, stop = (np.ceil(x[hit] - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
-        _add_spans(change, row[hit], first, stop)
-    return np.cumsum(change, axis=1, dtype=np.int32)[:, :width]
+        yield row[hit], first, stop
 
 
 def _rows(

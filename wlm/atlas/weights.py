@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch.nn.functional import max_pool2d
 
-from wlm.atlas.coverage import covered_texels
+from wlm.atlas.coverage import covered_on
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.model import Profile
 from wlm.atlas.views import mesh_charts, mesh_views, surface_points, texel_triangles, visibility
@@ -43,8 +43,7 @@ class FineGrid:
     def covered(self) -> torch.Tensor:
         """bool [2 H, 2 W], whether a triangle holds the centre, exactly."""
         mesh = self.mesh
-        inside = covered_texels(mesh.uv, mesh.triangle[mesh.active], self.height, self.width) > 0
-        return torch.from_numpy(inside).to(self.device)
+        return covered_on(mesh.uv, mesh.triangle[mesh.active], self.height, self.width, self.device) > 0
 
     @cached_property
     def border(self) -> torch.Tensor:
@@ -59,16 +58,16 @@ class FineGrid:
     def texels(self) -> torch.Tensor:
         """bool [2 H, 2 W], the quarters of the texels of the mask whose own centres a triangle holds."""
         mesh = self.mesh
-        inside = covered_texels(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape) > 0
-        return _quarters(torch.from_numpy(inside & mesh.mask).to(self.device))
+        inside = covered_on(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape, self.device) > 0
+        return _quarters(inside & torch.from_numpy(mesh.mask).to(self.device))
 
     @cached_property
     def relative(self) -> torch.Tensor:
         """float64 [2 H, 2 W], what a squared error of linear light counts as one of relative light, up to a factor."""
-        light = self.mesh.filled.mean(2, dtype=np.float64)
-        bright = light[self.mesh.mask]
-        dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)], _BRIGHT))
-        light = torch.from_numpy(light).to(self.device)
+        mesh = self.mesh
+        light = torch.from_numpy(mesh.filled).to(self.device).mean(2, dtype=torch.float64)
+        bright = light[torch.from_numpy(mesh.mask).to(self.device)]
+        dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)].cpu().numpy(), _BRIGHT))
         return _quarters(1.0 / (light + (dark or 1.0)).square())
 
 
