@@ -20,7 +20,12 @@ window.draw = async (name, state) => {
   const { scene } = await new GLTFLoader().loadAsync('scene.glb');
   const shared = new THREE[`Mesh${name}Material`]({color: 0xffffff});
   scene.traverse((each) => { if (each.isMesh) each.material = shared; });
+  // A node below one that has light, and its own has none.
+  const below = new THREE.Mesh(new THREE.BufferGeometry(), shared);
+  below.userData.name = 'below';
+  scene.getObjectByName('left').add(below);
   light.apply(scene);
+  if (below.material !== shared) throw new Error('light of another node');
   light.setState(state);
   const target = new THREE.WebGLRenderTarget(size, size, {type: THREE.FloatType});
   const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, -1, 1), root = new THREE.Scene();
