@@ -9,6 +9,7 @@ from builders.atlas_models import grouped
 
 from wlm.atlas import pack as packing
 from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.fit import compress
 from wlm.atlas.pack import Packed, pack, regenerate
 from wlm.errors import WlmError
 from wlm_kernels.atlas.patches import ORDERS
@@ -226,8 +227,14 @@ def test_the_mask_has_no_more_than_is_read():
 
 def test_the_packer_is_missing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "uvunwrap", None)
-    with pytest.raises(WlmError, match="packing UVs needs uvunwrap: install the extra 'atlas'"):
-        pack(_mesh(_quad(5, 5, 8, 6)), None, 0.5)
+    mesh = _mesh(_quad(5, 5, 8, 6))
+    line = r"atlas: uvunwrap is missing; needs the extra: pip install 'wlm\[atlas\]'"
+    with pytest.raises(WlmError, match=line):
+        pack(mesh, None, 0.5)
+    begun = []
+    with pytest.raises(WlmError, match=line):
+        compress(mesh, "cascade", progress=begun.append)
+    assert not begun
 
 
 def test_a_packer_that_stretches(monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,6 @@
 """What a bake reads: scene files, surfaces, where texels and probes are, where the sun is; none of it needs Mitsuba."""
 
+import io
 import json
 import math
 import shutil
@@ -9,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.bake_rooms import ROOM, quad
+from builders.gltf_scene import Thing, write_scene
+from PIL import Image
 from typer.testing import CliRunner
 
 from wlm.bake.daylight import sun_direction
@@ -24,6 +27,7 @@ from wlm.formats.gltf import read_gltf, vertex_normals
 from wlm.formats.parts import Part
 from wlm.inspection import inspect
 from wlm.lightmap import load
+from wlm.lightmap.layers.data import load as load_layers
 from wlm.probe.data import load as load_probes
 
 
@@ -202,6 +206,15 @@ def test_what_is_written_is_a_set(tmp_path):
     assert baked.error == pytest.approx([0.01, 0.01], rel=0.01)
     told = inspect(tmp_path / "set")
     assert len(told) == 1 and told[0].command.startswith("wlm lightmap compress")
+    direction = generator.random((2, 16, 16, 4)).astype(np.float16)
+    write_lightmaps(tmp_path / "set", task, replace(baked, direction=direction))
+    told = inspect(tmp_path / "set")
+    assert len(told) == 1 and "dir" in told[0].what and told[0].command.startswith("wlm lightmap compress")
+    layers = load_layers(tmp_path / "set").sheets
+    shown = {(sheet.layer, sheet.channels): own.frames for sheet, own in layers.items()}
+    assert (shown["light", ("R", "G", "B")] == light).all()
+    assert (shown["dir", ("R", "G", "B")] == direction[..., :3]).all()
+    assert (shown["dir", ("A",)] == direction[..., 3:]).all()
     # A second bake of one hour replaces it all.
     write_lightmaps(tmp_path / "set", task, replace(baked, hours=(7.0,), light=light[:1], noise=light[:1]))
     assert not (tmp_path / "set" / "light_18h.exr").exists()
@@ -239,3 +252,39 @@ def test_the_demo_scene_is_of_all_parts():
         "lamp",
         "box",
     }
+
+
+def textured(folder, transform, data=None):
+    """A square with a texture of one white pixel, in a glTF file."""
+    picture = io.BytesIO()
+    Image.new("RGB", (1, 1), "white").save(picture, "PNG")
+    used = {"index": 0, "extensions": {"KHR_texture_transform": transform}}
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
+    square = Thing(
+        "square",
+        np.column_stack([corners, np.zeros(4)]),
+        [[0, 1, 2], [0, 2, 3]],
+        [corners * 0.5, corners],
+        material={"pbrMetallicRoughness": {"baseColorTexture": used}},
+    )
+    (folder / "a.png").write_bytes(picture.getvalue() if data is None else data)
+    extra = {"textures": [{"source": 0}], "images": [{"uri": "a.png"}]}
+    return write_scene(folder / "square.gltf", [square], extra)
+
+
+def test_a_textures_place_is_read(tmp_path):
+    """Scale, then a quarter turn, then offset, of the set that the extension names."""
+    given = {"scale": [2.0, 0.5], "rotation": math.pi / 2, "offset": [0.25, 0.0], "texCoord": 1}
+    (surface,) = read_geometry(textured(tmp_path, given), None).surfaces
+    u, v = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float).T
+    assert surface.texture_uv == pytest.approx(np.column_stack([0.5 * v + 0.25, -2.0 * u]), abs=1e-6)
+    (surface,) = read_geometry(textured(tmp_path, {}), None).surfaces
+    assert surface.texture_uv == pytest.approx(0.5 * np.column_stack([u, v]), abs=1e-6)
+    for wrong in ({"scale": 2.0}, {"offset": [0, math.nan]}, {"rotation": [1]}, {"scale": ["x", 1]}):
+        with pytest.raises(WlmError, match=r"square.gltf: "):
+            read_geometry(textured(tmp_path, wrong), None)
+
+
+def test_what_is_no_picture_is_refused_without_pythons_words(tmp_path):
+    with pytest.raises(WlmError, match=r"textures\[0\]: expected a PNG, JPEG or WebP image$"):
+        read_geometry(textured(tmp_path, {}, b"not a picture"), None)

@@ -303,6 +303,8 @@ def test_a_scene_is_one_command(tmp_path):
     for place in (out, out / "scene.wlm"):
         facts = json.loads(call("atlas", "info", place, "--json"))
         assert facts["states"] == ["0", "1"] and facts["cr"] >= 0.7 and not facts["levels"]
+    assert "scene.js" in call("atlas", "export", out, "-o", tmp_path / "three", "--engine", "three")
+    assert "--exact: expected with one lightmap" in fails("atlas", "export", out, "-o", tmp_path / "a", "--exact")
     words = ("atlas", "compress", path, tmp_path / "lights.json", "-o", out)
     assert "--colour: expected 'rgb9e5' or 'mixed', got 'half'" in fails(*words, "--colour", "half")
     words += ("--flip",)
@@ -317,6 +319,3 @@ def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):
     assert "float3 wlm_atlas(float2 uv) const" in (tmp_path / "out" / "atlas.metal").read_text()
     assert "--shader: means nothing with --engine three" in fails(*out, "--engine", "three", "--shader", "wgsl")
     assert "another folder" in fails("atlas", "export", tiles, "-o", tiles)
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "report.json").write_text('{"format": "wlm-atlas-scene"}')
-    assert "found a scene" in fails("atlas", "export", tmp_path / "scene", "-o", tmp_path / "other")

@@ -1,6 +1,7 @@
 """Every shader that we export, in every language that runs here, beside what Python decodes."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -442,6 +443,17 @@ def test_metal_as_the_cpp_that_it_is(name, tmp_path):
     found = shown(subject, "msl", False, tmp_path)[..., :channels]
     # Filters mix in floats here.
     np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
+
+
+def test_heads_tell_what_other_languages_hold(tmp_path):
+    """Macros are decided there, and nothing is of GLSL."""
+    for name in ("lightmap", "atlas mips", "scene", "probes", "volume"):
+        text = SUBJECTS[name](tmp_path / name).text
+        for defined in ((), ("WLM_ATLAS_EXACT", "WLM_LIGHTMAP_EXACT")):
+            written = translate(text, "hlsl", defined)
+            assert not re.search(r"//.*(_EXACT|before this file|GLSL|#version|WLM_\w+\(\w\))", written), name
+            exact = "our texels are fetched and mixed in floats." in written
+            assert exact == (bool(defined) and name in ("lightmap", "atlas mips"))
 
 
 def test_what_is_no_shader_of_ours():

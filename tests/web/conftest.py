@@ -18,7 +18,7 @@ def browser():
     """Headless Chromium with WebGL2 in software."""
     program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
     if program is None:
-        pytest.skip("no browser is installed")
+        pytest.skip("no browser: install chromium-headless-shell, or chromium")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as started:
         opened = started.chromium.launch(executable_path=program, args=list(_OPTIONS))

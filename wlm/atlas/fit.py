@@ -36,6 +36,7 @@ from wlm.atlas.views import corner_weights
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.hdr_blocks import need
 from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
@@ -43,6 +44,7 @@ from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
+_PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # of the extra, by method and colour
 
 
 def compress(
@@ -80,6 +82,9 @@ def compress(
     device = interop.check_device(device)
     profile = Profile.load(profile).override(overrides)
     check_size(*mesh.mask.shape)
+    for choice in (profile.method, profile.colour):
+        if choice in _PACKAGES:  # said now, and not after minutes
+            need(_PACKAGES[choice], "atlas")
     tail, tiles = tail_bits(*mesh.mask.shape), profile.method == "tiles"
     if profile.mips and tiles and tail >= profile.budget * mesh.mask.size * SOURCE_BITS:
         raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")

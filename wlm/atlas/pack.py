@@ -32,6 +32,7 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.cluster import Clusters
 from wlm.atlas.data import LightmappedMesh
 from wlm.errors import WlmError
+from wlm.formats.hdr_blocks import need
 from wlm.ops.raster import rasterize_uv, texture
 from wlm_kernels.atlas.patches import ORDERS
 
@@ -197,10 +198,7 @@ def _uvunwrap(
         float64 [N, 3, 2], new corners in texels; int [N], the chart, also of a triangle that the packer left out of
         one, -1 where there is none; bool [N], whether it has new corners; float64 [2], W_r and H_r.
     """
-    try:
-        import uvunwrap
-    except ImportError as error:
-        raise WlmError("packing UVs needs uvunwrap: install the extra 'atlas'") from error
+    uvunwrap = need("uvunwrap", "atlas")
     if not len(points):
         return np.zeros((0, 3, 2)), np.zeros(0, np.int64), np.zeros(0, bool), np.ones(2)
     order, meshes = _chart_meshes(points, numbers, label)

@@ -14,7 +14,7 @@ _HEAD = """\
 //
 {textures}
 // {mips} have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
-// sampler does that, in one fetch, with the 8 or so bits that a GPU gives to a place between two texels.
+// sampler mixes four texels, in one fetch, with the 8 or so bits that a GPU gives to a place between two of them.
 
 """
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from wlm.bake.settings import LightmapSettings
 from wlm.errors import WlmError, one_line
@@ -19,6 +19,7 @@ from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES
 from wlm.formats.reading import read_file
 
+_TRANSFORM = "KHR_texture_transform"
 _UNWRAPPED = 1  # n of the new `TEXCOORD_n`
 _MOST_IMAGE = 1 << 26  # pixels
 _STRONGEST = 1e9  # radiance
@@ -36,6 +37,7 @@ class Material:
         colour: Linear RGB albedo, a factor of the texture's where there is one.
         texture: Linear RGB albedo, float32 [H, W, 3], or None.
         uv_set: n of the texture's `TEXCOORD_n`.
+        placed: Of `KHR_texture_transform`, [2, 3]: the texture lies at this matrix times (u, v, 1); None: at (u, v).
         emission: Radiance on the front, RGB.
         double: Whether the back reflects as well; otherwise it absorbs all light.
     """
@@ -44,6 +46,7 @@ class Material:
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
     texture: np.ndarray | None = None
     uv_set: int = 0
+    placed: np.ndarray | None = None
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     double: bool = False
 
@@ -179,6 +182,8 @@ def _surface(
     if material.texture is not None:
         texture_uv = primitive.uv.get(material.uv_set)
         texture_uv = None if texture_uv is None else texture_uv[gather]
+        if texture_uv is not None and material.placed is not None:
+            texture_uv = (texture_uv @ material.placed[:, :2].T + material.placed[:, 2]).astype(np.float32)
     return Surface(position, triangle, normal, uv, texture_uv, material)
 
 
@@ -287,18 +292,35 @@ def _material(document: GltfDocument, number: int | None) -> Material:
         )
     if factor.shape != (3,) or np.isnan(factor).any():
         raise WlmError(f"{document.path}: materials[{number}]: expected a base colour of three numbers, not NaN")
-    texture, uv_set = None, 0
+    texture, uv_set, placed = None, 0, None
     if "baseColorTexture" in surface:
-        texture = _texture(document, surface["baseColorTexture"]["index"])
-        uv_set = surface["baseColorTexture"].get("texCoord", 0)
+        used = surface["baseColorTexture"]
+        texture = _texture(document, used["index"])
+        uv_set = used.get("texCoord", 0)
+        if _TRANSFORM in used.get("extensions", {}):
+            transform = used["extensions"][_TRANSFORM]
+            uv_set = transform.get("texCoord", uv_set)
+            placed = _placed(f"{document.path}: materials[{number}]", transform)
     return Material(
         str(content.get("name", "")),
         tuple(map(float, factor)),
         texture,
         uv_set,
+        placed,
         tuple(map(float, emission)),
         bool(content.get("doubleSided", False)),
     )
+
+
+def _placed(where: str, transform: dict[str, Any]) -> np.ndarray:
+    """The matrix of `KHR_texture_transform`: scale, then rotation against the clock as v runs down, then offset."""
+    names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
+    scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())
+    numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
+    if (scale.shape, turn.shape, offset.shape) != ((2,), (), (2,)) or not np.abs(numbers).max() <= _LARGEST:
+        raise WlmError(f"{where}: {_TRANSFORM}: expected two numbers of scale and of offset, and one of rotation")
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
 
 
 def _texture(document: GltfDocument, number: int) -> np.ndarray:
@@ -317,6 +339,8 @@ def _texture(document: GltfDocument, number: int) -> np.ndarray:
             if picture.width * picture.height > _MOST_IMAGE:
                 raise WlmError(f"{where}: expected at most {_MOST_IMAGE:,} pixels")
             pixels = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255.0)
+    except UnidentifiedImageError as error:
+        raise WlmError(f"{where}: expected a PNG, JPEG or WebP image") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise WlmError(f"{where}: expected a PNG, JPEG or WebP image: {one_line(error)}") from error
     return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)

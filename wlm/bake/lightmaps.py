@@ -28,12 +28,16 @@ FORMAT = "wlm-bake"
 _VERSION = 1
 SET_FILE = "set.json"
 _MESH, _MASK, _COVERAGE = "scene.glb", "mask.png", "coverage.exr"
+_ATLAS, _LIGHT, _DIRECTION = "0", "light", "dir"  # of a set with layers
+_LUMINANCE = (0.212671, 0.715160, 0.072169)  # as Mitsuba has it
 _NOISE = "noise"  # begins the names of pictures of the noise
 _HIDDEN = 0.5  # share of rays that hit backs: of more, the place is within an object
 _ABOUT = (
-    "set.json lists the lightmaps. noise_*.exr: the standard error of each texel before denoising, as noise.R, noise.G "
-    "and noise.B. coverage.exr: coverage, the share of a texel that is on a surface, and back, the share of "
-    "rays that hit backs: above one half the texel is within an object, and has its neighbours' light."
+    "set.json lists the lightmaps, and of a directional bake dir_*.exr, where light comes from: 0.5 + 0.5 times the "
+    "mean direction, in glTF's axes, and 0.5 + 0.5 times its cosine to the normal. noise_*.exr: the standard error of "
+    "each texel's light before denoising, as noise.R, noise.G and noise.B. coverage.exr: coverage, the share of a "
+    "texel that is on a surface, and back, the share of rays that hit backs: above one half the texel is within an "
+    "object, and has its neighbours' light."
 )
 
 
@@ -49,6 +53,10 @@ class BakedLightmaps:
         coverage: float32 [H, W], the share of each texel that is on a surface.
         back: float32 [H, W], the share of rays that hit backs.
         geometry: The surfaces, with their lightmap UVs.
+        direction: float16 [T, H, W, 4] or None, where the light comes from, as Unity's `comp_dir` has it, in glTF's
+            axes: 0.5 + 0.5 d, with d the mean of the directions that light the texel, each by the luminance that it
+            gives, of length 1 where there is but one; then 0.5 + 0.5 n.d, with n the texel's normal. Under a normal
+            m the light is about (0.5 + 0.5 m.d) / (0.5 + 0.5 n.d) of the lightmap's.
     """
 
     hours: tuple[float, ...]
@@ -58,6 +66,7 @@ class BakedLightmaps:
     coverage: np.ndarray
     back: np.ndarray
     geometry: Geometry
+    direction: np.ndarray | None = None
 
     @property
     def error(self) -> list[float]:
@@ -103,22 +112,16 @@ def bake_lightmaps(
     geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
     check_lamps(task.path, scene, geometry)
     texels = place_texels(str(task.geometry), geometry.surfaces, scene.lightmap.resolution, scene.lightmap.supersample)
-    hours = sorted(scene.hours)
+    hours, directional = sorted(scene.hours), scene.lightmap.directional
 
     def make(hour: float, report) -> dict[str, np.ndarray]:
         now = make_hour(scene, geometry, task.sky, hour)
-        gathered = irradiance(
-            now.scene,
-            texels,
-            outside=now.outside,
-            sun_direct=scene.sun_direct,
-            samples=scene.samples,
-            bounces=scene.bounces,
-            seed=scene.seed,
-            report=report,
-        )
-        light, noise = (np.minimum(values, HALF_MAX) for values in (gathered.mean, gathered.noise))
-        return {"light": light, "noise": noise, "back": gathered.back}
+        gathered = irradiance(now.scene, texels, now.tracing, directional=directional, report=report)
+        light, noise = (np.minimum(values[:, :3], HALF_MAX) for values in (gathered.mean, gathered.noise))
+        made = {"light": light, "noise": noise, "back": gathered.back}
+        if directional:
+            made["direction"] = _directions(gathered.mean)
+        return made
 
     count = len(texels.index)
     table = {
@@ -126,21 +129,49 @@ def bake_lightmaps(
         "noise": Part(np.float32, (count, 3), least=0.0),
         "back": Part(np.float32, (count,), least=0.0, most=1.0),
     }
+    if directional:
+        table["direction"] = Part(np.float32, (count, 3), least=-1.0, most=1.0)
     results = each_hour(hours, checkpoint, table, make, progress)
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():
         raise WlmError(f"{task.geometry}: every texel is within an object: do its faces point inwards?")
     mask = texels.image(visible.astype(np.float32)) > 0
-    light = np.stack([_finished(texels, each["light"], mask, denoise) for each in results])
+    light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
     noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
+    direction = None
+    if directional:
+        normal = fill_gaps(texels.image(texels.mean_normal()), mask)
+        direction = np.stack([_encoded(texels, each["direction"], normal, mask, denoise) for each in results])
     return BakedLightmaps(
-        tuple(hours), light, noise, mask, texels.image(texels.coverage), texels.image(back.astype(np.float32)), geometry
+        tuple(hours),
+        light,
+        noise,
+        mask,
+        texels.image(texels.coverage),
+        texels.image(back.astype(np.float32)),
+        geometry,
+        direction,
     )
 
 
+def _directions(sums: np.ndarray) -> np.ndarray:
+    """Mean directions [T, 3] of light [T, 6], see `wlm.bake.paths.irradiance`; 0 where it is dark."""
+    total = sums[:, :3] @ np.array(_LUMINANCE, np.float32)
+    mean = np.divide(sums[:, 3:], total[:, None], out=np.zeros_like(sums[:, 3:]), where=total[:, None] > 0)
+    # Rounding may leave a single direction a little too long.
+    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
+
+
+def _encoded(texels: Texels, mean: np.ndarray, normal: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
+    """Mean directions [T, 3] as `BakedLightmaps.direction` has them, half floats [H, W, 4]."""
+    levels = np.clip(_finished(texels, 0.5 + 0.5 * mean, mask, denoise), 0.0, 1.0)
+    share = 0.5 + 0.5 * ((2.0 * levels - 1.0) * normal).sum(-1, keepdims=True)
+    return np.concatenate([levels, np.clip(share, 0.0, 1.0)], -1).astype(np.float16)
+
+
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """A picture of half floats whose gaps have the nearest light, filtered where that is wanted."""
+    """A picture, float32, whose gaps have the nearest texel's values, filtered where that is wanted."""
     picture = fill_gaps(texels.image(values), mask)
     if denoise is not None:
         try:
@@ -148,7 +179,7 @@ def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> 
         except RuntimeError as error:
             raise WlmError(f"bake: Open Image Denoise: {one_line(error)}") from error
         picture = fill_gaps(np.clip(picture, 0.0, HALF_MAX), mask)
-    return picture.astype(np.float16)
+    return picture
 
 
 def check_folder(folder: str | os.PathLike[str]) -> None:
@@ -177,21 +208,32 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     folder = Path(folder)
     height, width = baked.mask.shape
     stamps = [f"{hour:.9g}h" for hour in baked.hours]
-    files = [f"light_{stamp}.exr" for stamp in stamps]
     listed: dict[str, object] = {"name": task.scene.name, "width": width, "height": height}
     if task.scene.period is not None:
         listed["period_hours"] = task.scene.period
-    listed["mask"] = _MASK
+    about: dict[str, object] = {"mask": _MASK}
     if baked.geometry.usual:  # whoever reads the set knows no other
-        listed["mesh"] = _MESH
-    listed["lightmaps"] = [{"time_hours": hour, "file": file} for hour, file in zip(baked.hours, files, strict=True)]
+        about["mesh"] = _MESH
+    names = {layer: [f"{layer}_{stamp}.exr" for stamp in stamps] for layer in (_LIGHT, _DIRECTION)}
+    files: list[dict[str, object]] = [{"file": file} for file in names[_LIGHT]]
+    if baked.direction is None:
+        listed |= about
+    else:
+        listed["layers"] = {_LIGHT: "radiance", _DIRECTION: {"encoding": "unit", "channels": list("RGBA")}}
+        listed["atlases"] = {_ATLAS: about}
+        pairs = zip(names[_LIGHT], names[_DIRECTION], strict=True)
+        files = [{"files": {_ATLAS: {_LIGHT: light, _DIRECTION: toward}}} for light, toward in pairs]
+    listed["lightmaps"] = [{"time_hours": hour} | file for hour, file in zip(baked.hours, files, strict=True)]
     with staged(folder, INDEX, FORMAT, _is_ours) as made:
-        for file, stamp, light, noise in zip(files, stamps, baked.light, baked.noise, strict=True):
+        for file, stamp, light, noise in zip(names[_LIGHT], stamps, baked.light, baked.noise, strict=True):
             write_exr(made / file, light)
             _write_planes(
                 made / f"{_NOISE}_{stamp}.exr",
                 dict(zip(("noise.R", "noise.G", "noise.B"), noise.transpose(2, 0, 1), strict=True)),
             )
+        if baked.direction is not None:
+            for file, direction in zip(names[_DIRECTION], baked.direction, strict=True):
+                write_exr(made / file, direction)
         planes = {"coverage": baked.coverage, "back": baked.back}
         _write_planes(made / _COVERAGE, {name: plane.astype(np.float16) for name, plane in planes.items()})
         write_mask(made / _MASK, baked.mask)
@@ -207,8 +249,8 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
             "error": baked.error,
         }
         (made / INDEX).write_text(compact_json(content), encoding="utf-8")
-        names = sorted(path.name for path in made.iterdir())
-    return [folder / name for name in names]
+        written = sorted(path.name for path in made.iterdir())
+    return [folder / name for name in written]
 
 
 def _write_planes(path: Path, planes: dict[str, np.ndarray]) -> None:
@@ -217,5 +259,5 @@ def _write_planes(path: Path, planes: dict[str, np.ndarray]) -> None:
 
 def _is_ours(name: str) -> bool:
     return name in (INDEX, SET_FILE, _MESH, _MASK, _COVERAGE) or (
-        name.endswith("h.exr") and name.startswith(("light_", f"{_NOISE}_"))
+        name.endswith("h.exr") and name.startswith((f"{_LIGHT}_", f"{_DIRECTION}_", f"{_NOISE}_"))
     )

@@ -53,6 +53,25 @@ class Outside:
     ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+@dataclass(frozen=True)
+class Tracing:
+    """How paths are traced.
+
+    Attributes:
+        outside: The sun and the ambient light.
+        sun_direct: Whether the sun's direct light counts.
+        samples: Paths a texel or probe, rounded up to a multiple of 8.
+        bounces: Surfaces that reflect light on its way.
+        seed: Of the random numbers.
+    """
+
+    outside: Outside
+    sun_direct: bool
+    samples: int
+    bounces: int
+    seed: int
+
+
 @dataclass(frozen=True, eq=False)
 class Gathered:
     """What arrives at N places.
@@ -86,36 +105,24 @@ class _Outside:
         return self.frame.to_world(mi.warp.square_to_uniform_cone(square, math.cos(SUN_ANGLE)))
 
 
-def irradiance(
-    scene: Any,
-    texels: Any,
-    *,
-    outside: Outside,
-    sun_direct: bool,
-    samples: int,
-    bounces: int,
-    seed: int,
-    report: Any = None,
-) -> Gathered:
+def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool = False, report: Any = None) -> Gathered:
     """Irradiance at the texels of a lightmap, the mean over their places.
 
     Args:
         scene: Of Mitsuba.
         texels: `wlm.bake.texels.Texels`, T of them.
-        outside: The sun and the ambient light.
-        sun_direct: Whether the sun's direct light counts.
-        samples: Paths a texel, rounded up to a multiple of 8.
-        bounces: Surfaces that reflect light on its way.
-        seed: Of the random numbers.
+        tracing: How.
+        directional: Whether to tell where it comes from, too.
         report: Called with the share that is done.
 
     Returns:
-        Of three numbers, RGB.
+        Of three numbers, RGB. With `directional` three more: the sum of the directions that light comes from, each by
+        the luminance (ITU-R BT.709) that it gives to the surface.
     """
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
     count = mi.UInt32(np.diff(texels.first).astype(np.uint32))
-    sky = _Outside(outside)
+    sky = _Outside(tracing.outside)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         held = dr.gather(mi.UInt32, count, number)
@@ -126,57 +133,56 @@ def irradiance(
         cosine = dr.dot(d, normal)
         # What is behind the triangle itself is dark whatever the shading normal says.
         seen = (dr.dot(d, face) > 0) & (cosine > 0)
-        light, back = _radiance(scene, it, d, cosine * dr.inv_pi, sky, rng, bounces, seen)
-        total = light * dr.pi
+        light, back = _radiance(scene, it, d, cosine * dr.inv_pi, sky, rng, tracing.bounces, seen)
+        parts = [(light * dr.pi, d)]
         ds, weight = scene.sample_emitter_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
         cosine = dr.dot(ds.d, normal)
         ahead = (cosine > 0) & (dr.dot(ds.d, face) > 0)
         pdf = dr.select(ds.delta, 0.0, cosine * dr.inv_pi)
-        total += dr.select(ahead, weight * cosine * _heuristic(ds.pdf, pdf), 0.0)
-        if sky.has_sun and sun_direct:
+        parts.append((dr.select(ahead, weight * cosine * _heuristic(ds.pdf, pdf), 0.0), ds.d))
+        if sky.has_sun and tracing.sun_direct:
             toward = sky.sample(rng)
             cosine = dr.dot(toward, normal)
             ahead = (cosine > 0) & (dr.dot(toward, face) > 0)
             ahead &= ~scene.ray_test(it.spawn_ray(toward), active=ahead)
-            total += dr.select(ahead, sky.irradiance * cosine, 0.0)
-        return [total.x, total.y, total.z], dr.select(back, 1.0, 0.0)
+            parts.append((dr.select(ahead, sky.irradiance * cosine, 0.0), toward))
+        total = sum((value for value, _ in parts), mi.Color3f(0.0))
+        values = [total.x, total.y, total.z]
+        if directional:
+            values += [mi.Float(0.0)] * 3
+            for value, toward in parts:
+                shown = mi.luminance(value)
+                for c in range(3):
+                    # A light that wasn't sampled has no direction.
+                    values[3 + c] = values[3 + c] + dr.select(shown > 0, shown * toward[c], 0.0)
+        return values, dr.select(back, 1.0, 0.0)
 
-    return _gather(one, len(texels.index), 3, samples, seed, report)
+    return _gather(one, len(texels.index), 6 if directional else 3, tracing, report)
 
 
-def harmonics(
-    scene: Any,
-    position: np.ndarray,
-    *,
-    outside: Outside,
-    sun_direct: bool,
-    samples: int,
-    bounces: int,
-    seed: int,
-    report: Any = None,
-) -> Gathered:
+def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
     """Radiance at points as L2 spherical harmonics, orthonormal, in the order of `wlm.probe.sphere.basis`.
 
     Args:
         scene: Of Mitsuba.
         position: float [N, 3].
-        outside, sun_direct, samples, bounces, seed, report: As for `irradiance`.
+        tracing, report: As for `irradiance`.
 
     Returns:
         Of 27 numbers, the coefficients with red, green and blue of each.
     """
     place = mi.Point3f(np.asarray(position, np.float32).T)
-    sky = _Outside(outside)
+    sky = _Outside(tracing.outside)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         it = _interaction(dr.gather(mi.Point3f, place, number), mi.Vector3f(0.0))
         d = mi.warp.square_to_uniform_sphere(mi.Point2f(at[0], at[1]))
-        light, back = _radiance(scene, it, d, mi.Float(dr.inv_four_pi), sky, rng, bounces, mi.Bool(True))
+        light, back = _radiance(scene, it, d, mi.Float(dr.inv_four_pi), sky, rng, tracing.bounces, mi.Bool(True))
         parts = [(light * (4.0 * dr.pi), d)]
         ds, weight = scene.sample_emitter_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
         pdf = dr.select(ds.delta, 0.0, mi.Float(dr.inv_four_pi))
         parts.append((weight * _heuristic(ds.pdf, pdf), ds.d))
-        if sky.has_sun and sun_direct:
+        if sky.has_sun and tracing.sun_direct:
             toward = sky.sample(rng)
             lit = ~scene.ray_test(it.spawn_ray(toward))
             parts.append((dr.select(lit, sky.irradiance, 0.0), toward))
@@ -189,16 +195,16 @@ def harmonics(
                     out[3 * k + c] = out[3 * k + c] + dr.select(value[c] > 0, value[c] * shape, 0.0)
         return out, dr.select(back, 1.0, 0.0)
 
-    return _gather(one, len(position), 3 * _COEFFICIENTS, samples, seed, report)
+    return _gather(one, len(position), 3 * _COEFFICIENTS, tracing, report)
 
 
-def _gather(one: Any, count: int, channels: int, samples: int, seed: int, report: Any) -> Gathered:
+def _gather(one: Any, count: int, channels: int, tracing: Tracing, report: Any) -> Gathered:
     """Means over samples in parts, and what the parts' spread says of the noise."""
-    each = -(-samples // _PARTS)
+    each = -(-tracing.samples // _PARTS)
     at_once = max(1, _LANES // each)
     total, square = np.zeros((2, count, channels))
     back = np.zeros(count)
-    keys = np.random.SeedSequence(seed)
+    keys = np.random.SeedSequence(tracing.seed)
     for part in range(_PARTS):
         key = int(keys.spawn(1)[0].generate_state(1, np.uint64)[0])
         for begin in range(0, count, at_once):

@@ -112,16 +112,7 @@ def bake_probes(
 
     def make(hour: float, report) -> dict[str, np.ndarray]:
         now = make_hour(scene, geometry, task.sky, hour)
-        gathered = harmonics(
-            now.scene,
-            position,
-            outside=now.outside,
-            sun_direct=scene.sun_direct,
-            samples=scene.samples,
-            bounces=scene.bounces,
-            seed=scene.seed,
-            report=report,
-        )
+        gathered = harmonics(now.scene, position, now.tracing, report=report)
         return {"values": gathered.mean, "noise": gathered.noise, "back": gathered.back}
 
     count = len(position)

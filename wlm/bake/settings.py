@@ -119,6 +119,7 @@ class LightmapSettings(_Settings):
         unwrap: Whether to make new UVs, `TEXCOORD_1`, and write the mesh with them.
         padding: Texels between new charts.
         supersample: Places along a texel's side that its light is the mean of.
+        directional: Whether to bake where the light comes from, too.
     """
 
     resolution: int = Field(256, ge=8, le=4096)
@@ -126,6 +127,7 @@ class LightmapSettings(_Settings):
     unwrap: bool = False
     padding: int = Field(4, ge=0, le=64)
     supersample: int = Field(4, ge=1, le=8)
+    directional: bool = False
 
 
 class ProbeSettings(_Settings):

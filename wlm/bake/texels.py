@@ -43,6 +43,11 @@ class Texels:
         picture[self.index] = values
         return picture.reshape(self.height, self.width, *values.shape[1:])
 
+    def mean_normal(self) -> np.ndarray:
+        """The texels' normals for shading, float32 [T, 3], of unit length."""
+        total = np.add.reduceat(self.normal, self.first[:-1])
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
+
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
     """Finds the places of all texels: a lattice in each, as far as it is covered.

@@ -41,13 +41,21 @@ class Task:
     trust: bool
 
 
-def open_task(path: str | os.PathLike[str], trust: bool = False) -> Task:
+def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bool = False) -> Task:
     """Reads a scene file and the sky's picture.
+
+    Args:
+        path: The YAML file.
+        trust: Whether it may name files outside its folder.
+        directional: Whether lightmaps tell where their light comes from, also where the file doesn't say so.
 
     Raises:
         WlmError: A file can't be read, a setting is wrong, or the picture isn't one of light from all around.
     """
     scene, geometry, picture = load_scene(path, trust)
+    if directional:
+        lightmap = scene.lightmap.model_copy(update={"directional": True})
+        scene = scene.model_copy(update={"lightmap": lightmap})
     digest = hashlib.blake2b(read_file(geometry, MESH_BYTES, "the glTF file"), digest_size=16)
     sky = None
     if picture is not None:

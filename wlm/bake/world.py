@@ -11,7 +11,7 @@ import numpy as np
 
 from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, Surface
-from wlm.bake.paths import SUN_ANGLE, Outside, Sun
+from wlm.bake.paths import SUN_ANGLE, Outside, Sun, Tracing
 from wlm.bake.settings import BakeScene, Daylight
 from wlm.errors import WlmError
 
@@ -25,12 +25,12 @@ class Hour:
     """What lights a scene at an hour.
 
     Attributes:
-        scene: Of Mitsuba, with all other lights.
-        outside: The sun, and light that is the same from all around.
+        scene: Of Mitsuba, with all lights but the sun, and light that is the same from all around.
+        tracing: How paths are traced in it, and those two.
     """
 
     scene: Any
-    outside: Outside
+    tracing: Tracing
 
 
 def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
@@ -75,7 +75,8 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
         # Mitsuba's middle column is +z, and columns to the right of it turn towards -x.
         turned = np.roll(sky, sky.shape[1] // 2, axis=1)
         content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(turned, np.float32))}
-    return Hour(mi.load_dict(content), Outside(sun, ambient))
+    tracing = Tracing(Outside(sun, ambient), scene.sun_direct, scene.samples, scene.bounces, scene.seed)
+    return Hour(mi.load_dict(content), tracing)
 
 
 def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None, np.ndarray]:

@@ -311,12 +311,16 @@ def export(
     quiet_warp()
     from wlm.atlas.exporter import read_folder
     from wlm.atlas.scene.exporter import is_scene
-    from wlm.engines import export_atlas
+    from wlm.engines import export_atlas, export_scene
 
     if is_scene(folder):
-        raise WlmError(f"{folder}: expected one lightmap alone, found a scene, whose folder has scene.glsl already")
+        if exact:
+            raise WlmError("--exact: expected with one lightmap alone, not with a scene")
+        paths = export_scene(folder, output, engine, shader=language)
+    else:
+        paths = export_atlas(read_folder(folder), output, engine, shader=language, exact=exact)
     rows = table(str(output), ["file", "bytes"])
-    for path in export_atlas(read_folder(folder), output, engine, shader=language, exact=exact):
+    for path in paths:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

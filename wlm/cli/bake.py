@@ -20,6 +20,9 @@ _Scene = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A glTF file,
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "The folder of the set.")],
+    directional: Annotated[
+        bool, typer.Option("--directional", help="Bake where the light comes from, too: a layer as Unity's comp_dir.")
+    ] = False,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
@@ -33,7 +36,7 @@ def lightmaps(
     from wlm.bake.work import open_checkpoint, open_task
 
     check_folder(output)
-    task = open_task(scene, trust)
+    task = open_task(scene, trust, directional)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
     note_start(checkpoint, resume, "anew")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:

@@ -6,6 +6,7 @@ _PLACES = {
     "ENGINES": "wlm.engines.kit",
     "export_atlas": "wlm.engines.atlas",
     "export_lightmap": "wlm.engines.lightmap",
+    "export_scene": "wlm.engines.scene",
 }
 
 __all__ = sorted(_PLACES)

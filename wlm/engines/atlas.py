@@ -11,10 +11,11 @@ import numpy as np
 from wlm.atlas.exporter import MESH_FILE, Output
 from wlm.atlas.model import BLOCK_SIDE, AtlasModel
 from wlm.atlas.shader import atlas_glsl
+from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled, godot_uniforms
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-atlas-engine"
@@ -46,7 +47,7 @@ def export_atlas(
     if engine not in (*ENGINES, "raw"):
         raise WlmError(f"engine: expected one of raw, {', '.join(ENGINES)}, got {engine!r}")
     check_language(shader)
-    model, ending = output.model, ".exr" if engine == "godot" else ".dds"
+    model, ending = output.model, ".exr" if engine in ("godot", "unreal") else ".dds"
     if model.colour == "astc" and engine == "raw":
         ending = ".ktx2"
     if model.colour == "astc" and ending == ".dds":
@@ -55,13 +56,13 @@ def export_atlas(
         model = dataclasses.replace(model, tail=model.tail[:0])
     has = {"lut": model.method != "plain", "blocks": model.colour == "mixed", "tail": len(model.tail) > 0}
     names = ["colour", *(name for name, given in has.items() if given)]
+    sizes = {name: made.shape[1::-1] for name, made in _made(model).items()}
     texts = _raw(model, shader, exact) if engine == "raw" else _TEXTS[engine](model)
     files = {name: name + (".bytes" if engine == "unity" else ending) for name in names}
     folder = Path(directory)
-    make_parents(folder)
     if folder.resolve() == output.folder.resolve():
         raise WlmError(f"{folder}: expected another folder than that of the compression")
-    with staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
         for name, file in files.items():
             if name == "colour" and engine != "raw" and ending == ".dds" and _odd_blocks(model):
                 _write_halves(staging / file, model.texels)
@@ -78,11 +79,17 @@ def export_atlas(
             "method": model.method,
             "colour": model.colour,
             "textures": files,
+            "sizes": {name: list(sizes[name]) for name in names},
             "shader": next(iter(texts)),
             "uv_set": output.report.get("new_uv_set") if len(model.uv) else output.report.get("uv_set"),
         }
         write_index(staging / INFO_FILE, info)
     return [folder / name for name in (*texts, *files.values(), MESH_FILE, INFO_FILE)]
+
+
+def _made(model: AtlasModel) -> dict[str, np.ndarray]:
+    """The model's textures by name."""
+    return {"colour": model.texels, "lut": model.lut, "blocks": model.block_texels, "tail": model.tail}
 
 
 def _odd_blocks(model: AtlasModel) -> bool:
@@ -135,21 +142,15 @@ def _unity(model: AtlasModel) -> dict[str, str]:
     }
 
 
-def _unreal(model: AtlasModel) -> dict[str, str]:
-    return {
-        "WlmAtlas.usf": translate(atlas_glsl(model), "hlsl"),
-        README_FILE: filled("unreal_atlas.md", NAME=model.name),
-    }
-
-
 _TEXTS: dict[str, Callable[[AtlasModel], dict[str, str]]] = {
     "three": _three,
     "godot": _godot,
     "unity": _unity,
-    "unreal": _unreal,
+    "unreal": unreal.atlas_texts,
 }
-_STEMS = {"atlas", "colour", "lut", "blocks", "tail", "WlmAtlas"}
-_ENDINGS = {*ENDINGS.values(), ".dds", ".ktx2", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".usf"}
+_STEMS = {"atlas", "colour", "lut", "blocks", "tail", "WlmAtlas", "wlm_atlas"}
+# ".usf" is of earlier versions.
+_ENDINGS = {*ENDINGS.values(), ".dds", ".ktx2", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".py", ".usf"}
 
 
 def _is_exported(name: str) -> bool:

@@ -3,10 +3,16 @@
 import re
 from importlib import resources
 
+import numpy as np
+
+from wlm.errors import WlmError
+
 ENGINES = ("three", "godot", "unity", "unreal")
 """Engines that folders are made for."""
 
 README_FILE = "README.md"
+
+_MOST_SIDE = {"unreal": 8192, "godot": 16384}  # texels along a side of a picture that the editor imports
 
 _MARK = re.compile(r"@(\w+)@")
 _SAMPLER = re.compile(
@@ -22,6 +28,18 @@ def filled(asset: str, **parts: str) -> str:
     """
     text = (resources.files("wlm.engines") / "assets" / asset).read_text(encoding="utf-8")
     return _MARK.sub(lambda match: parts[match[1]].rstrip("\n"), text)
+
+
+def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
+    """Checks that an engine's editor imports a picture; `name` is the model's.
+
+    Raises:
+        WlmError: It is too large.
+    """
+    height, width = pixels.shape[:2]
+    if max(height, width) > _MOST_SIDE[engine]:
+        most = f"expected at most {_MOST_SIDE[engine]} texels along a side"
+        raise WlmError(f"{name}: cannot export for {engine}: {file}: {most}, found {width}x{height}")
 
 
 def godot_uniforms(text: str) -> str:

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import make_parents, staged
+from wlm.formats.folder import made_parents, read_index, staged, write_index
 from wlm.lightmap import exporter, packed
 from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.model import LightmapModel
@@ -18,6 +19,7 @@ from wlm.shading import translate
 
 FORMAT = "wlm-lightmap-engine"
 MASK_FILE = "valid.dds"
+_UNREAL_KEYS = ("format", "version", "name", "source", "width", "height", "times", "period")
 
 
 def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.PathLike[str], engine: str) -> list[Path]:
@@ -39,8 +41,7 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
     if isinstance(model, LayeredModel):
         raise WlmError(f"{model.name}: cannot export for {engine}: expected one light, found layers; export it raw")
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
+    with made_parents(folder), staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
         parts = exporter.write_parts(model, staging, form=FORMAT)
         (staging / exporter.VALID_FILE).unlink()
         height, width = model.mask.shape
@@ -52,7 +53,16 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
             for name in parts[:-1]:
                 (staging / name).rename(staging / _of_unity(name))
             parts = [*map(_of_unity, parts[:-1]), parts[-1]]
-        texts = _TEXTS[engine](model)
+        if engine == "unreal":
+            # Of other files, and tables of them, its script reads none.
+            for name in parts[:-1]:
+                (staging / name).unlink()
+            index = read_index(staging / parts[-1])
+            write_index(staging / parts[-1], {key: index[key] for key in _UNREAL_KEYS})
+            texts = unreal.write_lightmap(model, staging)
+            parts = [*sorted(path.name for path in staging.iterdir() if path.name != parts[-1]), parts[-1]]
+        else:
+            texts = _TEXTS[engine](model)
         for name, text in texts.items():
             (staging / name).write_bytes(text.encode())
     return [folder / name for name in (*texts, *parts)]
@@ -93,29 +103,22 @@ def _unity(model: LightmapModel) -> dict[str, str]:
     }
 
 
-def _unreal(model: LightmapModel) -> dict[str, str]:
-    shader = translate(decode_glsl(model), "hlsl")
-    return {
-        "WlmLightmap.usf": filled(
-            "unreal_lightmap.usf", SHADER=shader, WIDTH=str(model.width), HEIGHT=str(model.height)
-        ),
-        README_FILE: filled("unreal_lightmap.md", NAME=model.name),
-    }
-
-
 _TEXTS: dict[str, Callable[[LightmapModel], dict[str, str]]] = {
     "three": _three,
     "godot": _godot,
     "unity": _unity,
-    "unreal": _unreal,
 }
-_ENDINGS = (".hlsl", ".shader", ".cs", ".usf", ".gd", ".gdshader", ".js", ".glsl")
+# ".usf" is of earlier versions.
+_ENDINGS = {".hlsl", ".shader", ".cs", ".py", ".gd", ".gdshader", ".js", ".glsl", ".usf"}
 _STEMS = {"lightmap", "lit", "wlm_lightmap", "WlmLightmap"}
 _BYTES = {f"{name}.bytes" for name in ("uv", "uvt", "planes", "frames", "video", "networks", "hours", "valid")}
+_PICTURES = {f"{name}.tga" for name in ("uv", "uvt", "planes", "frames", "valid")} | {
+    f"{name}.exr" for name in ("video", "hour", "networks")
+}
 
 
 def _is_exported(name: str) -> bool:
     """Whether a file's name is one that an export for an engine may have."""
     path = Path(name)
     ours = path.stem in _STEMS and path.suffix in _ENDINGS
-    return ours or name in (README_FILE, MASK_FILE) or name in _BYTES or exporter.is_exported(name)
+    return ours or name in (README_FILE, MASK_FILE) or name in _BYTES | _PICTURES or exporter.is_exported(name)

@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +51,28 @@ def claim(folder: Path, index: str, format_name: str) -> None:
             raise WlmError(f"{folder}: cannot write: the folder {place} is read-only")
 
 
-def make_parents(folder: Path) -> None:
+@contextmanager
+def made_parents(folder: Path) -> Iterator[None]:
     """Makes the folders above a folder, for an output that may lie deeper than `claim` allows.
+
+    Those that it made go again where the block raises, as far as they are empty.
 
     Raises:
         WlmError: They can't be made.
     """
+    parent = Path(os.path.abspath(folder)).parent
+    missing = [each for each in (parent, *parent.parents) if not each.exists()]
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for each in missing:
+                each.rmdir()
+        raise
 
 
 @contextmanager

@@ -353,7 +353,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
         if drawn > document.most:
             raise WlmError(
                 f"{document.path}: draws more than {document.most} corners and vertices, which is more than its data "
-                "accounts for; trust=True (--trust of compress and evaluate) allows it, where the author is trusted"
+                "accounts for; trust=True (--trust of commands that have it) allows it, where the author is trusted"
             )
 
     def floats(number: int, kind: str) -> np.ndarray:

@@ -123,7 +123,7 @@ def named_file(document: str | os.PathLike[str], name: str, where: str, trust: b
         raise WlmError(f"{where}: cannot follow the name {name}: {error}") from error
     if not inside:
         raise WlmError(
-            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust of compress and evaluate) "
+            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust of commands that have it) "
             "allows it, where the author is trusted"
         )
     return path

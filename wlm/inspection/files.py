@@ -36,6 +36,8 @@ _EXPORTS = {
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
+    "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
+    "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",
@@ -184,13 +186,17 @@ def _model(path: Path) -> Finding:
         if isinstance(model, RegionModel):
             # It is read piece by piece; here all of it is asked for.
             model.check_pieces()
-    kind = {"lightmap": "lightmaps over time", "atlas": "a mesh's lightmap", "probe": "light probes"}.get(
-        model.SYSTEM.removesuffix("-layers")
-    )
-    if kind is None:
+    if model.SYSTEM == "smoke-network":
         what = "a network that predicts six-way lightmaps"
         return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
-    command = "" if model.SYSTEM == "atlas" else f"wlm web {quoted(path)} -o PAGE.html"
+    kind = {
+        "lightmap": "lightmaps over time",
+        "lightmap-layers": "layered lightmaps over time",
+        "atlas": "a mesh's lightmap",
+        "atlas-scene": "the lightmaps of a scene",
+        "probe": "light probes",
+    }[model.SYSTEM]
+    command = "" if model.SYSTEM.startswith("atlas") else f"wlm web {quoted(path)} -o PAGE.html"
     return Finding(path, f"{kind}, compressed: {model.name}", command)
 
 

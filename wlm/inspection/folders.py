@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
+from PIL import Image
+
 from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
@@ -204,10 +206,26 @@ def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
                 continue
             stated = re.search(r"(\d+)x(\d+)", file.stem)
             cells = "ROWSxCOLUMNS" if stated is None else f"{stated[2]}x{stated[1]}"
-            options = f"--with {quoted(other)} --from {layout} --cells {cells}"
+            book = f"{quoted(file)} --with {quoted(other)} --from {layout} --cells {cells}"
             what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
-            found.append((Finding(file, what, f"wlm smoke shade {quoted(file)} {options} -o DIR"), {file, other}))
+            told = Finding(file, what, f"wlm smoke shade {book} -o DIR")
+            if not any(map(_may_have_alpha, (file, other))):
+                lacking = "no opacity: wlm smoke shade needs the texture that has it, by a second --with"
+                told = Finding(file, what, f"wlm smoke flipbook {book} -o OUT.png --layout unity", (lacking,))
+            found.append((told, {file, other}))
     return found
+
+
+def _may_have_alpha(file: Path) -> bool:
+    """Whether a texture has an alpha; true of one that can't be read, of which its reader says what is wrong."""
+    try:
+        head = picture_of(file)
+        if head is not None and head.kind == "EXR":
+            return "A" in head.channels
+        with Image.open(file, formats=["PNG", "TGA"]) as image:
+            return "A" in image.getbands()
+    except (WlmError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return True
 
 
 def _pictures(folder: Path, files: Sequence[Path]) -> _Found:

@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.exr import write_exr
-from wlm.formats.folder import compact_json, make_parents, rounded, staged
+from wlm.formats.folder import compact_json, made_parents, rounded, staged
 from wlm.lightmap import packed
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
@@ -119,8 +119,7 @@ def export(
     frame = Decoder(model, device).frame(float(model.times[0]))
     if values is not None:
         frame = np.float32(values[0]) + np.float32(values[1] - values[0]) * frame
-    make_parents(folder)
-    with staged(folder, WEIGHTS_FILE, FORMAT, is_exported) as staging:
+    with made_parents(folder), staged(folder, WEIGHTS_FILE, FORMAT, is_exported) as staging:
         write_exr(staging / FRAME_FILE, frame, half=False)
         text = translate(decode_glsl(model, values), shader, [EXACT] if exact else [])
         (staging / name).write_bytes(text.encode())

@@ -44,11 +44,11 @@ _HEAD = """\
 //
 // Textures; row 0 is v = 0. Filters are linear, without mip levels.
 {textures}//
-// Where WLM_LIGHTMAP_EXACT is defined four texels are fetched and mixed in floats; else the filter unit does that, with
-// the 8 or so bits that it gives to a place between two texels.
+// Where WLM_LIGHTMAP_EXACT is defined four texels are fetched and mixed in floats; else the filter unit mixes four
+// texels, with the 8 or so bits that it gives to a place between two of them.
 //
-// WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) read four floats of networks and of the table; where these are in
-// buffers define them before this file, or change the functions below that call them.
+// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: where these are in
+// buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
 
 {samplers}{reads}
 const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map

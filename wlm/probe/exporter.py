@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import make_parents, rounded, staged, write_index
+from wlm.formats.folder import made_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
 from wlm.probe.day import DayModel
@@ -140,8 +140,7 @@ def _write(
     """Writes the files, the reference and the document, which lists them."""
     sizes = {name: len(content) for name, content in files.items()}
     document = {"format": FORMAT, "version": _VERSION} | document | {"bytes": sizes}
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         for name, content in files.items():
             (temporary / name).write_bytes(content)
         save_probes(temporary / REFERENCE_FILE, position, values)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.godot import relit
 from wlm.formats.godot_writer import lmbake_bytes
 from wlm.probe.conventions import from_canonical
@@ -95,8 +95,7 @@ def export_godot(
             raise WlmError(f"{bake}: expected the {model.probes} probes of {model.name}, in their order")
         content = relit(bake, _godot(model.name, model.decoder(device).decode_probes(places)))
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, {INFO_FILE, BAKE_FILE}.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, {INFO_FILE, BAKE_FILE}.__contains__) as temporary:
         (temporary / BAKE_FILE).write_bytes(content)
         document = {"format": FORMAT, "version": _VERSION, "about": _ABOUT, "name": model.name}
         write_index(temporary / INFO_FILE, document | info)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.ktx2 import read_half_volume, write_ktx2
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
@@ -111,8 +111,7 @@ def export_grid(
         "corners": [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()],
     }
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         depth, height, width, _ = texels.shape
         write_ktx2(temporary / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
         (temporary / LOADER_FILE).write_text(_LOADER, encoding="utf-8")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import compact_json, make_parents, rounded, staged
+from wlm.formats.folder import compact_json, made_parents, rounded, staged
 from wlm.probe.conventions import from_canonical
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
@@ -215,8 +215,7 @@ def export_unity(
         "sh": rounded(light.astype(np.float32).swapaxes(1, 2).reshape(-1)),
     }
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, {INFO_FILE, SCRIPT_FILE}.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, {INFO_FILE, SCRIPT_FILE}.__contains__) as temporary:
         (temporary / SCRIPT_FILE).write_text(_SCRIPT, encoding="utf-8")
         (temporary / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
     return [folder / SCRIPT_FILE, folder / INFO_FILE]

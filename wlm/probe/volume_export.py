@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.sphere import sh_count
 from wlm.probe.volume import Volume
@@ -73,8 +73,7 @@ def export_volume(volume: Volume, directory: str | os.PathLike[str]) -> list[Pat
         HLSL_FILE: volume_hlsl(volume.channels).encode(),
     }
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         for name, content in files.items():
             (temporary / name).write_bytes(content)
         write_index(temporary / REFERENCE_FILE, _reference(volume))

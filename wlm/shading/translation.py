@@ -1,9 +1,9 @@
 """The exported shaders in the languages of engines, from their one GLSL text."""
 
-import re
 from collections.abc import Iterable
 
 from wlm.errors import WlmError
+from wlm.shading.heads import decided
 from wlm.shading.hlsl import HlslWriter
 from wlm.shading.metal import MetalWriter
 from wlm.shading.source import read_words
@@ -21,8 +21,6 @@ _VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "msl": "Metal 2 and later
 _PRECISIONS = "".join(
     f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D", "usampler2D", "sampler2DArray")
 )
-# What GLSL's text says of its own.
-_FOR_GLSL = re.compile(r"For GLSL [^;]*;\s*(//\s*)?include it below #version[^.:]*\.")
 
 
 def check_language(language: str) -> None:
@@ -52,7 +50,8 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
     """
     check_language(language)
     if not language.startswith("glsl"):
-        text = _FOR_GLSL.sub(f"For {_VERSIONS[language]}.", text)
+        defined = tuple(defined)
+        text = decided(text, _VERSIONS[language], defined)
         return _WRITERS[language](read_shader(read_words(text, defined))).text()
     defines = "".join(f"#define {name}\n" for name in defined)
     return (_PRECISIONS if language == "glsl-es" else "") + defines + text

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import torch
 
-from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.formats.hdr_blocks import need
 from wlm.smoke.model import SixWayNetwork, SmokeModel
 from wlm.smoke.planes import GUIDES
 
@@ -35,11 +35,8 @@ def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512
     """
     if height < 1 or width < 1:
         raise ValueError(f"expected at least one pixel, got {height} x {width}")
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise WlmError(f"ONNX needs {error.name}: install wlm[onnx]") from error
+    for package in ("onnx", "onnxscript"):
+        need(package, "onnx")
     # A copy: the exporter changes what it traces.
     network = SixWayNetwork(model.settings)
     network.load_state_dict(model.network.state_dict())

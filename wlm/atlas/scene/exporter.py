@@ -100,6 +100,7 @@ def export_scene(
             "states": list(model.states),
             "sheets": [dataclasses.asdict(sheet) for sheet in (*model.sheets, *model.levels)],
             "objects": [dataclasses.asdict(each) for each in scene.objects],
+            "uv_set": scene.uv_set,
             "cr": model.compression_ratio,
             "cr_disk": 1.0 - 8 * size / scene.source_bits,
             "profile": model.profile.model_dump(mode="json"),

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from wlm.errors import WlmError
-from wlm.formats.folder import UNFINISHED, claim, make_parents, read_index, write_index
+from wlm.formats.folder import UNFINISHED, claim, made_parents, read_index, write_index
 from wlm.formats.lock import locked
 from wlm.lightmap import exporter
 from wlm.lightmap.layers.model import LayeredModel
@@ -49,9 +49,8 @@ def export(
         WlmError: As `wlm.lightmap.exporter.export`.
     """
     folder = Path(directory)
-    make_parents(folder)
     written, sheets = [], []
-    with locked(folder):
+    with made_parents(folder), locked(folder):
         claim(folder, INDEX_FILE, FORMAT)
         try:
             folder.mkdir(exist_ok=True)
