@@ -166,7 +166,8 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
         row, column = np.nonzero(~mask[first:end])
         row += first
         distance = (rows[row, column] - row) ** 2 + (columns[row, column] - column) ** 2
-        beyond = np.minimum(row - low + 1 if low > 0 else height, high - row if high < height else height)
+        far = height + width  # nothing lies beyond the lightmap's ends
+        beyond = np.minimum(row - low + 1 if low > 0 else far, high - row if high < height else far)
         return bool((distance <= beyond**2).all())
 
     starts = range(0, height, _STRIP)

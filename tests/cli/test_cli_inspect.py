@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
 from wlm.engines import export_atlas
 from wlm.formats.exr import write_exr
-from wlm.inspection import inspect
+from wlm.inspection import files, inspect
 from wlm.inspection.folders import MOST
 
 
@@ -87,6 +89,14 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     export_atlas(read_folder(tmp_path / "atlas"), tmp_path / "engine", "unity")
     # No command takes it.
     assert told(tmp_path / "engine").endswith("for one engine: textures, the mesh and a material or a shader -> ")
+
+
+def test_all_folders_that_are_written_are_known():
+    """Else their textures would be taken for lightmaps that can be compressed."""
+    package = Path(wlm.__file__).parent
+    texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
+    formats = {name for text in texts for name in re.findall(r'^FORMAT = "([^"]+)"$', text, re.MULTILINE)}
+    assert len(formats) > 10 and formats <= set(files._EXPORTS)
 
 
 def test_pictures_of_several_atlases_are_no_times(tmp_path):

@@ -9,13 +9,14 @@ from builders.checks import assert_same, error_of
 from builders.running import call
 from builders.small_sets import moving_light, tiny_profile, write_set
 
-from wlm.lightmap import rate, worker
+from wlm.lightmap import fit, rate, worker
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import bits_per_texel, evaluate
 from wlm.lightmap.fit import Trials, compress
 from wlm.lightmap.rate import RESOLUTIONS, Choice, choose
 from wlm.lightmap.survey import Survey
 from wlm.lightmap.targets import Targets
+from wlm.lightmap.tiles import TileKind
 
 SIZES = (4, 8, 16)
 OPTIONS = {"seed": 0, "device": "cpu", "workers": 1, "cluster": None, "progress": None}
@@ -94,6 +95,16 @@ def test_what_another_set_or_setting_was_looked_at_for_is_refused(light, changes
     other = light if changes else moving_light()
     with pytest.raises(ValueError, match="expected a survey of all tiles"):
         compress(other, tiny_profile(**changes), survey=survey)
+
+
+def test_a_survey_serves_a_fit_that_stores_other_tiles_as_frames(monkeypatch):
+    light = moving_light(128, 256)
+    survey = Survey(light, tiny_profile())
+    compress(light, tiny_profile(), survey=survey)
+    monkeypatch.setattr(fit, "choose_frames", lambda kinds, *_: np.arange(len(kinds)) == 0)
+    model = compress(light, tiny_profile(), survey=survey)
+    assert model.kind.tolist() == [TileKind.FRAMES, TileKind.DYNAMIC]
+    assert_same(model, compress(light, tiny_profile()))
 
 
 def test_a_size_comes_before_a_psnr(light):

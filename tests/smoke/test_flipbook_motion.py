@@ -140,6 +140,8 @@ def test_velocities_that_are_missing_or_damaged(folder, tmp_path):
     book = baked(bare.path, (1,))
     with pytest.raises(WlmError, match=r"velocity_0001.npz: expected the air's velocity, found none: simulate with"):
         open_motion(bare.path)
+    with pytest.raises(WlmError, match="nowhere: expected a folder of frames, with the air's velocity, found none"):
+        open_motion(tmp_path / "nowhere")
     with pytest.raises(WlmError, match=r"expected frame_0099.npz, of the flip book's frame 1"):
         frames_motion(open_motion(folder), (99,), book)
     path = tmp_path / "velocity.npz"

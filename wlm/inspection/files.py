@@ -44,6 +44,7 @@ _EXPORTS = {
     "wlm-light-probe-grid": "a grid of light for three.js",
     "wlm-godot-light": "light probes for Godot",
     "wlm-unity-probes": "light probes for Unity",
+    "wlm-unreal-light": "light probes for Unreal: volume textures and a shader",
     "wlm-smoke-frames": "frames of smoke that wlm smoke simulate wrote",
 }
 

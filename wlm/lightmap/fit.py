@@ -379,7 +379,8 @@ class _Fit:
         """Some tiles as they are sent to a worker."""
         # Where other fits follow, and memory for all tiles is needed anyway.
         kept = self._survey if len(rows) == len(self._mapped) else None
-        if kept is not None and kept.piece is not None:
+        # With other frames other tiles have maps.
+        if kept is not None and kept.piece is not None and np.array_equal(kept.piece.tiles.index, self.index[rows]):
             return kept.piece
         slots = np.searchsorted(self._mapped, rows)
         piece = Piece(

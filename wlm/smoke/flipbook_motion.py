@@ -36,8 +36,10 @@ def open_motion(path: str | os.PathLike[str], device: str = "cpu") -> Frames:
     """Opens a simulation's frames, for `frames_motion`.
 
     Raises:
-        WlmError: As `load_frames`, or a frame's velocity isn't there.
+        WlmError: As `load_frames`, it is no folder, or a frame's velocity isn't there.
     """
+    if not os.path.isdir(path):
+        raise WlmError(f"{path}: expected a folder of frames, with the air's velocity, found none")
     frames = load_frames(path, device=device)
     for number in frames.numbers:
         file = velocity_file(frames.path, number)
