@@ -309,6 +309,7 @@ def test_a_scene_is_one_command(tmp_path):
     assert "--colour: expected 'rgb9e5' or 'mixed', got 'half'" in fails(*words, "--colour", "half")
     words += ("--flip",)
     assert "--flip: expected with one lightmap alone" in fails(*words)
+    assert "--resume: expected with one lightmap alone; a scene's" in fails(*words[:-1], "--resume")
 
 
 def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):

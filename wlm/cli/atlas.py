@@ -102,11 +102,12 @@ def compress(
             "node": node,
             "encoding": encoding,
             "flip": flip,
-            "resume": resume,
         }
         for name, value in lone.items():
             if value:
                 raise WlmError(f"--{name}: expected with one lightmap alone; of a scene its list says it")
+        if resume:
+            raise WlmError("--resume: expected with one lightmap alone; a scene's compression isn't kept while it runs")
         quiet_warp()
         from wlm.cli.atlas_scene import compress_scene
 

@@ -74,7 +74,8 @@ def show_scene(path: Path, as_json: bool) -> None:
     width, height, pages = facts["colour_size"]
     rows.add_row("colour texture", f"{width}x{height}, {pages} pages")
     if facts["colour"] == "mixed":
-        rows.add_row("texture of blocks", "x".join(map(str, facts["block_size"])))
+        width, height, pages = facts["block_size"]
+        rows.add_row("texture of blocks", f"{width}x{height}, {pages} pages")
     rows.add_row("table", "x".join(map(str, facts["lut_size"])))
     rows.add_row("factors of a state", f"{facts['factors']:,}")
     rows.add_row("CR of all textures", f"{facts['cr']:.2%}")
