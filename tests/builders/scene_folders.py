@@ -1,5 +1,6 @@
 """Compressed scenes of three squares, in folders as `wlm atlas compress` writes them."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ from wlm.atlas.scene.data import load_scene
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.exporter import export_scene
 from wlm.atlas.scene.fit import compress_scene
+from wlm.atlas.scene.model import COUNT_BITS, ENTRY
 from wlm.formats.exr import write_exr
 
 STATES = ("dawn", "noon", "night")
@@ -21,8 +23,8 @@ _SQUARES = {
 }
 
 
-def scene_folder(folder, uv_set=1):
-    """Writes one, and gives its model."""
+def scene_folder(folder, uv_set=1, colour="mixed"):
+    """Writes one, whose first page is black and nowhere read, and gives its model."""
     folder.mkdir()
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
     things = []
@@ -45,7 +47,11 @@ def scene_folder(folder, uv_set=1):
     text = {"states": STATES, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
     scene = load_scene(path, folder / "lights.json")
-    model = compress_scene(scene, budget=0.4, views=1)
+    model = compress_scene(scene, budget=0.4, views=1, colour=colour)
+    assert model.colour == colour and model.lut.shape[2] == ENTRY
+    pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
+    pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}
+    model = dataclasses.replace(model, lut=model.lut + np.array([0, 0, 0, 1 << COUNT_BITS], np.uint16), **pages)
     export_scene(model, folder / "made", scene)
     return model
 
