@@ -12,6 +12,7 @@ from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
 from test_folders import TEXTS, UNITY, as_glsl, compiled
 
+from wlm.atlas.scene.model import SHORT_ENTRY
 from wlm.engines import ENGINES, export_scene
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.inspection import inspect
@@ -26,13 +27,16 @@ def made(tmp_path_factory):
     return folder / "made", scene_folder(folder)
 
 
-@pytest.fixture(scope="module", params=["mixed", "rgb9e5"])
-def either(request, tmp_path_factory):
-    """The same of each way of storing colours."""
+@pytest.fixture(scope="module", params=["mixed", "rgb9e5", "short"])
+def each_form(request, tmp_path_factory):
+    """The same of each way of storing colours; and of one state, which has short entries, with mips."""
     if request.param == "mixed":
         return request.getfixturevalue("made")
-    folder = tmp_path_factory.mktemp("plain") / "scene"
-    return folder / "made", scene_folder(folder, colour="rgb9e5")
+    folder = tmp_path_factory.mktemp(request.param) / "scene"
+    settings = {"states": ("noon",), "mips": True} if request.param == "short" else {}
+    model = scene_folder(folder, colour="rgb9e5", **settings)
+    assert bool(model.levels) == (model.lut.shape[2] == SHORT_ENTRY) == (request.param == "short")
+    return folder / "made", model
 
 
 def squares(info):
@@ -50,7 +54,7 @@ def textures_of(folder, info):
 
 
 def check(found, model, state):
-    expected, inside = expected_picture(model, SIZE, state)
+    expected, inside = expected_picture(model, SIZE, float(np.clip(state, 0, len(model.states) - 1)))
     np.testing.assert_allclose(found[inside], expected[inside], rtol=0, atol=expected.max() / 255)
 
 
@@ -94,10 +98,10 @@ def test_what_cannot_be_exported(made, tmp_path):
     assert os.listdir(tmp_path) == ["other"]
 
 
-@pytest.mark.parametrize("state", [0.0, 1.5])
-def test_the_shader_alone_reads_each_objects_part(state, either, tmp_path):
-    """With the textures as they lie in their files, but for the blocks, which llvmpipe's context here doesn't take."""
-    source, model = either
+@pytest.mark.parametrize("state", [-0.5, 1.5])
+def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
+    """With the textures as they lie in their files; of the blocks the bytes are compared, and their texels bound."""
+    source, model = each_form
     export_scene(source, tmp_path, "raw")
     info = json.loads((tmp_path / "scene.json").read_text())
     assert ("blocks" in info["textures"]) == (model.colour == "mixed")
@@ -116,17 +120,20 @@ def test_the_shader_alone_reads_each_objects_part(state, either, tmp_path):
         assert data[148:] == model.blocks.tobytes()
         bound["wlm_scene_blocks"] = np.pad(model.block_texels, [(0, 0)] * 3 + [(0, 1)])
     text = (tmp_path / "scene.glsl").read_text()
+    assert ("wlm_scene_grad" in text) == bool(model.levels)
     picture = np.zeros((SIZE, SIZE, 3))
     for (x, y, width, height), place, sheet in squares(info):
         uv = f"(vec2(pixel) + 0.5) / vec2({width}.0, {height}.0)"
-        main = f"light = vec4(wlm_object({uv}, vec4({', '.join(map(repr, map(float, place)))}), {sheet}, {state}), 1.0);"
+        main = (
+            f"light = vec4(wlm_object({uv}, vec4({', '.join(map(repr, map(float, place)))}), {sheet}, {state}), 1.0);"
+        )
         picture[y : y + height, x : x + width] = run_glsl(text, main, (height, width), bound)[..., :3]
     check(picture, model, state)
 
 
 @pytest.mark.parametrize("state", [0.0, 1.5, 2.0])
-def test_unreals_node_reads_each_objects_part(state, made, tmp_path, monkeypatch):
-    source, model = made
+def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkeypatch):
+    source, model = each_form
     export_scene(source, tmp_path, "unreal")
     script = Script(tmp_path / "wlm_scene.py", monkeypatch, ["left", "above", "floor"])
     # One of the level's actors has no light, one object no actor.
@@ -146,8 +153,8 @@ def test_unreals_node_reads_each_objects_part(state, made, tmp_path, monkeypatch
     check(picture, model, state)
 
 
-def test_godots_shader_reads_each_objects_part(made, tmp_path):
-    source, model = made
+def test_godots_shader_reads_each_objects_part(each_form, tmp_path):
+    source, model = each_form
     export_scene(source, tmp_path, "godot")
     text = as_glsl((tmp_path / "scene.gdshader").read_text())
     info = json.loads((tmp_path / "scene.json").read_text())
@@ -169,8 +176,8 @@ def test_godots_shader_reads_each_objects_part(made, tmp_path):
     parser.parse((tmp_path / "wlm_scene.gd").read_text())
 
 
-def test_unitys_surface_compiles_and_its_component_parses(made, tmp_path):
-    source, model = made
+def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
+    source, model = each_form
     export_scene(source, tmp_path, "unity")
     assert (tmp_path / "factors.bytes").stat().st_size == 148 + 16 * len(model.states) * model.factor.shape[1]
     text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmScene.shader").read_text(), re.DOTALL)[1]
