@@ -17,9 +17,9 @@ func _ready() -> void:
 	var shader: Shader = load(folder.path_join("scene.gdshader"))
 	var textures: Dictionary = {}
 	for key: String in _info["textures"]:
-		var picture: Texture2D = load(folder.path_join(_info["textures"][key]))
-		var layered: bool = key in _info["layer_heights"]
-		textures[key] = _layers(picture, int(_info["layer_heights"][key])) if layered else picture
+		textures[key] = load(folder.path_join(_info["textures"][key]))
+	for key: String in _info["layer_heights"]:
+		textures[key] = _layers(textures[key], int(_info["layer_heights"][key]))
 	for each: Dictionary in _info["objects"]:
 		var label: String = each["label"]
 		var found: MeshInstance3D = find_child(label.validate_node_name(), true, false) as MeshInstance3D
