@@ -13,7 +13,15 @@ from wlm.formats.dds import DXGI_FORMATS, write_dds
 FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
 PIXEL_FLAGS, FOUR_CC, CAPS, CAPS2 = 80, 84, 108, 112
 FORMAT, DIMENSION, MISC, ARRAY, ALPHA = 128, 132, 136, 140, 144
-FOUR_BYTES = "R16G16_FLOAT", "R16G16_UNORM", "R16G16_UINT", "R9G9B9E5_SHAREDEXP", "R10G10B10A2_UNORM"
+FOUR_BYTES = (
+    "R16G16_FLOAT",
+    "R16G16_UNORM",
+    "R16G16_UINT",
+    "R9G9B9E5_SHAREDEXP",
+    "R10G10B10A2_UNORM",
+    "R11G11B10_FLOAT",
+    "R8G8B8A8_UNORM",
+)
 
 
 def _blocks(count: int) -> bytes:
@@ -96,9 +104,10 @@ def test_an_array(tmp_path):
 @pytest.mark.parametrize("depth", [1, 3])
 def test_every_format(tmp_path, fmt, depth):
     path = tmp_path / "a.dds"
-    texel = {"R16G16B16A16_FLOAT": 8, "R8G8_UNORM": 2, "R8_UNORM": 1} | dict.fromkeys(FOUR_BYTES, 4)
+    texel = {"R32G32B32A32_FLOAT": 16, "R8G8_UNORM": 2, "R8_UNORM": 1} | dict.fromkeys(FOUR_BYTES, 4)
+    texel |= dict.fromkeys(("R16G16B16A16_FLOAT", "R16G16B16A16_UINT"), 8)
     texel = texel.get(fmt)
-    blocks = _blocks(10 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
+    blocks = _blocks(20 * depth)[: (5 * 4 * texel if texel else 2 * 16) * depth]
     write_dds(path, blocks, width=5, height=4, depth=depth, fmt=fmt)
     data = path.read_bytes()
     volume = depth > 1

@@ -13,7 +13,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import make_parents, staged, write_index
+from wlm.formats.folder import made_parents, staged, write_index
 from wlm.probe.conventions import from_canonical
 from wlm.probe.lattice import CELLS, lattice_of
 from wlm.probe.model import ProbeModel
@@ -158,8 +158,7 @@ def export_unreal(
         "resolution": lattice.count.tolist(),
     }
     folder = Path(directory)
-    make_parents(folder)
-    with staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
+    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
         for name, (fmt, texels) in textures.items():
             write_dds(temporary / name, texels.tobytes(), width, height, depth, fmt, volume=True)
         (temporary / SHADER_FILE).write_text(text, encoding="utf-8")
