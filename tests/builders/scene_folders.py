@@ -1,5 +1,6 @@
 """Compressed scenes of three squares, in folders as `wlm atlas compress` writes them."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ from wlm.atlas.scene.data import load_scene
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.exporter import export_scene
 from wlm.atlas.scene.fit import compress_scene
+from wlm.atlas.scene.model import COUNT_BITS, ENTRY
 from wlm.formats.exr import write_exr
 
 STATES = ("dawn", "noon", "night")
@@ -21,8 +23,8 @@ _SQUARES = {
 }
 
 
-def scene_folder(folder, uv_set=1):
-    """Writes one, and gives its model."""
+def scene_folder(folder, uv_set=1, states=STATES, **settings):
+    """Writes one, whose first page is black and nowhere read, and gives its model; of one state it has one page."""
     folder.mkdir()
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
     things = []
@@ -35,17 +37,21 @@ def scene_folder(folder, uv_set=1):
     sheets = []
     for number, (height, width) in enumerate(((40, 64), (36, 36))):
         row, column = np.mgrid[:height, :width] / [[[height]], [[width]]]
-        for state, share in zip(STATES, (0.3, 1.0, 0.1), strict=True):
+        for state, share in zip(states, (0.3, 1.0, 0.1), strict=False):
             sky = 1.2 + np.sin(4 * column + number) * np.cos(3 * row)
             lamp = np.exp(-8 * ((row - 0.3) ** 2 + (column - 0.6) ** 2))
             light = share * sky[..., None] * [0.6, 0.8, 1.0] + (1 - share) * lamp[..., None] * [2.0, 1.2, 0.5]
             write_exr(folder / f"{number}_{state}.exr", light)
-        sheets.append({"files": [f"{number}_{state}.exr" for state in STATES]})
+        sheets.append({"files": [f"{number}_{state}.exr" for state in states]})
     objects = [{"node": name, "sheet": sheet, "scale_offset": place} for name, (_, sheet, place) in _SQUARES.items()]
-    text = {"states": STATES, "sheets": sheets, "objects": objects, "uv_set": uv_set}
+    text = {"states": states, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
     scene = load_scene(path, folder / "lights.json")
-    model = compress_scene(scene, budget=0.4, views=1)
+    model = compress_scene(scene, views=1, **{"budget": 0.4} | settings)
+    if model.lut.shape[2] == ENTRY:
+        pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
+        pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}
+        model = dataclasses.replace(model, lut=model.lut + np.array([0, 0, 0, 1 << COUNT_BITS], np.uint16), **pages)
     export_scene(model, folder / "made", scene)
     return model
 

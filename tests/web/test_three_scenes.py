@@ -43,9 +43,10 @@ window.ready = true;
 """
 
 
-@pytest.mark.parametrize("uv_set", [0, 1])
-def test_three_shows_each_object_its_part(uv_set, tmp_path, browser, serve):
-    model = scene_folder(tmp_path / "scene", uv_set)
+@pytest.mark.parametrize(("uv_set", "colour"), [(0, "mixed"), (1, "rgb9e5")])
+def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, browser, serve):
+    model = scene_folder(tmp_path / "scene", uv_set, colour=colour)
+    assert model.colour == colour
     export_scene(tmp_path / "scene" / "made", tmp_path / "out", "three")
     (tmp_path / "out" / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
     page, errors = browser.new_page(), []

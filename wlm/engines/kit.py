@@ -42,6 +42,11 @@ def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
         raise WlmError(f"{name}: cannot export for {engine}: {file}: {most}, found {width}x{height}")
 
 
+def _whole(read: re.Match[str]) -> str:
+    count = len(read[1]) - 1 if read[1] else 4
+    return f"{'uint' if count == 1 else f'uvec{count}'}({read[0]})"
+
+
 def godot_uniforms(text: str) -> str:
     """Our GLSL as Godot's shading language has it: textures with hints, and none of whole numbers.
 
@@ -57,5 +62,5 @@ def godot_uniforms(text: str) -> str:
 
     text = _SAMPLER.sub(declared, text)
     for name in whole:
-        text = re.sub(rf"(texelFetch\({name}, [^;]*?, 0\)\.\w+)", r"uvec2(\1)", text)
+        text = re.sub(rf"texelFetch\({name}, [^;]*?, 0\)(\.\w+)?", _whole, text)
     return text

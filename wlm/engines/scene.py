@@ -3,13 +3,13 @@
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wlm.atlas.scene.exporter import REPORT_FILE, SCENE_FILE, read_scene
+from wlm.atlas.scene.exporter import LUT_FORMATS, REPORT_FILE, SCENE_FILE, factor_texels, read_scene, sheet_texels
 from wlm.atlas.scene.model import SceneModel
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.engines import unreal
@@ -25,25 +25,13 @@ from wlm.shading import ENDINGS, check_language, custom_node, translate
 FORMAT = "wlm-scene-engine"
 INFO_FILE = "scene.json"
 _VERSION = 1
-# An object's part: its rectangle; texels and first entry of its sheet; its tiles and its page.
+# An object's part: its rectangle, the number of its sheet, and the state.
 _OBJECT = """
-vec3 wlm_object(vec2 uv, vec4 place, vec4 sheet, vec3 tiles)
+// An object's light: `place` is its scale and offset, and `sheet` its number, in `objects` of scene.json.
+vec3 wlm_object(vec2 uv, vec4 place, int sheet, float state)
 {
-    return wlm_scene(uv * place.xy + place.zw, sheet.xy, ivec2(sheet.zw), ivec2(tiles.xy), int(tiles.z));
+    return wlm_scene(uv * place.xy + place.zw, sheet, max(state, 0.0));
 }
-"""
-# Factors from a texture, a row for each state; `wlm_state` is a state's number, or between two.
-_STATE = """\
-uniform sampler2D wlm_factors;
-uniform float wlm_state;
-vec3 wlm_factor(int k)
-{
-    int last = textureSize(wlm_factors, 0).y - 1;
-    float at = clamp(wlm_state, 0.0, float(last));
-    vec3 early = texelFetch(wlm_factors, ivec2(k, int(at)), 0).xyz;
-    return mix(early, texelFetch(wlm_factors, ivec2(k, min(int(at) + 1, last)), 0).xyz, at - float(int(at)));
-}
-#define WLM_SCENE_FACTOR(k) wlm_factor(k)
 """
 
 Pictures = dict[str, tuple[str, str, list[int]]]
@@ -53,6 +41,8 @@ def export_scene(
     source: str | os.PathLike[str], directory: str | os.PathLike[str], engine: str, *, shader: str = "glsl"
 ) -> list[Path]:
     """Writes what `wlm atlas compress` left of a scene for an engine: textures, the scene, materials, and a page.
+
+    Engines' materials read the sheets alone: `wlm_scene_grad` of a model with mips is in "raw" only.
 
     Args:
         source: The folder of the compression.
@@ -76,24 +66,25 @@ def export_scene(
     objects, uv_set = report.get("objects"), report.get("uv_set")
     if not isinstance(objects, list) or not isinstance(uv_set, int):
         raise WlmError(f"{source / REPORT_FILE}: expected objects and uv_set; compress again")
+    if engine != "raw":
+        model = replace(model, levels=())
     info: dict[str, Any] = {
         "format": FORMAT,
         "version": _VERSION,
         "name": model.name,
         "source": model.source,
         "states": list(model.states),
-        "factors": model.factor.tolist(),
-        "sheets": [asdict(sheet) for sheet in model.sheets],
+        "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
         "objects": objects,
         "uv_set": uv_set,
     }
     with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
         if engine in ("godot", "unreal"):
-            info["layer_height"] = model.texels.shape[1]
+            info["layer_heights"] = {name: pages.shape[1] for name, pages in _layered(model).items()}
             pictures = _write_pictures(model, staging, engine)
         else:
-            pictures = {}
-            _write_textures(model, staging, ".bytes" if engine == "unity" else ".dds")
+            pictures = _write_textures(model, staging, ".bytes" if engine == "unity" else ".dds")
+        info["textures"] = {name: file for name, (file, _, _) in pictures.items()}
         texts = _raw(model, shader) if engine == "raw" else _TEXTS[engine](model, uv_set, pictures)
         try:
             shutil.copyfile(source / SCENE_FILE, staging / SCENE_FILE)
@@ -106,51 +97,59 @@ def export_scene(
     return [folder / name for name in (*names, INFO_FILE)]
 
 
-def _write_textures(model: SceneModel, folder: Path, ending: str) -> None:
-    """The table and the texture array; for Unity the factors too, as its reader of JSON has no arrays of arrays."""
-    rows, columns = model.lut.shape[:2]
-    lut = np.ascontiguousarray(model.lut, "<u2").tobytes()
-    count, height, width = model.texels.shape
-    if count > MOST_LAYERS:
-        raise WlmError(f"{model.name}: cannot export: {count} layers of colours, of at most {MOST_LAYERS}")
-    texels = np.ascontiguousarray(model.texels, "<u4").tobytes()
-    write_dds(folder / "lut.dds", lut, columns, rows, fmt="R16G16_UINT")
-    write_dds(folder / "colour.dds", texels, width, height, fmt="R9G9B9E5_SHAREDEXP", layers=count)
-    if ending != ".dds":
-        for name in ("lut", "colour"):
-            (folder / f"{name}.dds").rename(folder / (name + ending))
-        (folder / f"factors{ending}").write_bytes(_factors(model).astype("<f4").tobytes())
-
-
-def _write_pictures(model: SceneModel, folder: Path, engine: str) -> Pictures:
-    """The same as EXRs, the layers one below the other: file, form and size by the shader's names."""
-    pictures = {
-        "wlm_scene_lut": ("lut.exr", "floats", np.pad(model.lut, ((0, 0), (0, 0), (0, 1)))),
-        "wlm_scene_colour": ("colour.exr", "halves", unreal.stacked(unpack_rgb9e5(model.texels))),
+def _write_textures(model: SceneModel, folder: Path, ending: str) -> Pictures:
+    """All textures as DDS files: file, form and size by name."""
+    textures = {
+        "sheets": ("R16G16B16A16_UINT", sheet_texels(model)),
+        "lut": (LUT_FORMATS[model.lut.shape[2]], model.lut.astype("<u2")),
+        "factors": ("R32G32B32A32_FLOAT", factor_texels(model)),
+        "colour": ("R9G9B9E5_SHAREDEXP", model.texels.astype("<u4")),
     }
-    if engine == "unreal":
-        pictures["wlm_factors"] = ("factors.exr", "floats", _factors(model))
-    made = {}
-    for name, (file, form, pixels) in pictures.items():
-        height, width = pixels.shape[:2]
-        check_sides(model.name, engine, file, pixels)
-        write_exr(folder / file, np.asarray(pixels, np.float32), half=form == "halves")
-        made[name] = file, form, [width, height]
+    if model.colour == "mixed":
+        textures["blocks"] = ("BC6H_UF16", model.blocks)
+    layered, made = _layered(model), {}
+    for name, (form, texels) in textures.items():
+        layers = len(texels) if name in layered else 0
+        height, width = layered[name].shape[1:3] if layers else texels.shape[:2]
+        if layers > MOST_LAYERS:
+            raise WlmError(f"{model.name}: cannot export: {layers} layers of {name}, of at most {MOST_LAYERS}")
+        # Under another ending in Unity's folder.
+        write_dds(folder / f"{name}.dds", texels.tobytes(), width, height, fmt=form, layers=layers)
+        (folder / f"{name}.dds").rename(folder / (name + ending))
+        made[name] = name + ending, form, [width, height]
     return made
 
 
-def _factors(model: SceneModel) -> np.ndarray:
-    """The factors as fours, float32 [M, K, 4]."""
-    return np.pad(model.factor, ((0, 0), (0, 0), (0, 1)))
+def _write_pictures(model: SceneModel, folder: Path, engine: str) -> Pictures:
+    """The same as EXRs, the layers one below the other; the whole numbers are below 65,536, which floats hold."""
+    pictures = {
+        "sheets": ("floats", sheet_texels(model)),
+        "lut": ("floats", np.pad(model.lut, ((0, 0), (0, 0), (0, 4 - model.lut.shape[2])))),
+        "factors": ("floats", factor_texels(model)),
+        "colour": ("halves", unreal.stacked(unpack_rgb9e5(model.texels))),
+    }
+    if model.colour == "mixed":
+        pictures["blocks"] = ("halves", unreal.stacked(model.block_texels))
+    made = {}
+    for name, (form, pixels) in pictures.items():
+        height, width = pixels.shape[:2]
+        check_sides(model.name, engine, f"{name}.exr", pixels)
+        write_exr(folder / f"{name}.exr", np.asarray(pixels, np.float32), half=form == "halves")
+        made[name] = f"{name}.exr", form, [width, height]
+    return made
+
+
+def _glsl(model: SceneModel) -> str:
+    return scene_glsl(model) + _OBJECT
 
 
 def _raw(model: SceneModel, language: str) -> dict[str, str]:
-    return {"scene" + ENDINGS[language]: translate(scene_glsl(model) + _OBJECT, language)}
+    return {"scene" + ENDINGS[language]: translate(_glsl(model), language)}
 
 
 def _three(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]:
     return {
-        "scene.glsl": scene_glsl(model) + _OBJECT,
+        "scene.glsl": _glsl(model),
         "scene.js": filled("three_scene.js", DDS=filled("three_dds.js")),
         README_FILE: filled("three_scene.md", NAME=model.name),
     }
@@ -161,7 +160,7 @@ def _godot(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]
         raise WlmError(
             f"{model.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the light is at {uv_set}"
         )
-    shader = godot_uniforms(scene_glsl(model) + _OBJECT)
+    shader = godot_uniforms(_glsl(model))
     return {
         "scene.gdshader": filled("godot_scene.gdshader", SHADER=shader, UV=("UV", "UV2")[uv_set]),
         "wlm_scene.gd": filled("godot_scene.gd"),
@@ -170,11 +169,8 @@ def _godot(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]
 
 
 def _unity(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]:
-    # Of float3 in an array of constants it isn't said how far apart they are.
-    count = model.factor.shape[1]
-    factors = f"uniform vec4 wlm_factors[{count}];\n#define WLM_SCENE_FACTOR(k) wlm_factors[k].xyz\n"
     return {
-        "WlmScene.hlsl": translate(factors + scene_glsl(model) + _OBJECT, "hlsl"),
+        "WlmScene.hlsl": translate(_glsl(model), "hlsl"),
         "WlmScene.shader": filled("unity_scene.shader", SET=str(uv_set)),
         "WlmScene.cs": filled("unity_scene.cs", DDS=filled("unity_dds.cs")),
         README_FILE: filled("unity_scene.md", NAME=model.name),
@@ -182,13 +178,10 @@ def _unity(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]
 
 
 def _unreal(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str]:
-    count, height, _ = model.texels.shape
-    arguments = "UV, Place, Sheet, Tiles.xyz"
-    code, _ = custom_node(
-        _STATE + scene_glsl(model) + _OBJECT, "wlm_object", arguments, {"wlm_scene_colour": (height, count)}
-    )
+    layers = {f"wlm_scene_{name}": (pages.shape[1], len(pages)) for name, pages in _layered(model).items()}
+    code, _ = custom_node(_glsl(model), "wlm_object", "UV, Place, int(Sheet + 0.5), State", layers)
     rows = [
-        f'    "{name}": {{"file": "{file}", "form": "{form}", "size": {size}}},\n'
+        f'    "wlm_scene_{name}": {{"file": "{file}", "form": "{form}", "size": {size}}},\n'
         for name, (file, form, size) in pictures.items()
     ]
     place = unreal.asset_name(model.name)
@@ -199,13 +192,18 @@ def _unreal(model: SceneModel, uv_set: int, pictures: Pictures) -> dict[str, str
     }
 
 
+def _layered(model: SceneModel) -> dict[str, np.ndarray]:
+    """The textures that are arrays: pages, rows, columns."""
+    return {"colour": model.texels} | ({"blocks": model.block_texels} if model.colour == "mixed" else {})
+
+
 _TEXTS: dict[str, Callable[[SceneModel, int, Pictures], dict[str, str]]] = {
     "three": _three,
     "godot": _godot,
     "unity": _unity,
     "unreal": _unreal,
 }
-_STEMS = {"scene", "lut", "colour", "factors", "wlm_scene", "WlmScene"}
+_STEMS = {"scene", "sheets", "lut", "factors", "colour", "blocks", "wlm_scene", "WlmScene"}
 _ENDINGS = {*ENDINGS.values(), ".dds", ".exr", ".bytes", ".js", ".gd", ".gdshader", ".shader", ".cs", ".py"}
 
 

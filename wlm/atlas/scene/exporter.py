@@ -36,7 +36,8 @@ from wlm.system import load, plain
 FORMAT = "wlm-atlas-scene"
 MODEL_FILE, SCENE_FILE, REPORT_FILE = "scene.wlm", "scene.glb", "report.json"
 _VERSION = 1
-_LUT_FORMATS = {2: "R16G16_UINT", 4: "R16G16B16A16_UINT"}
+LUT_FORMATS = {2: "R16G16_UINT", 4: "R16G16B16A16_UINT"}
+"""Of T_c by the numbers of its entries."""
 _NAMES = re.compile(r"scene\.(wlm|glb|glsl)|(lut|sheets|factors)\.dds|(colour|blocks)_\d+\.dds|report\.json")
 
 
@@ -81,7 +82,7 @@ def export_scene(
             write_glb(temporary / SCENE_FILE, dataclasses.replace(scene.document, content=content), [], 1)
         rows, columns = model.lut.shape[:2]
         lut = np.ascontiguousarray(model.lut, "<u2").tobytes()
-        write_dds(temporary / "lut.dds", lut, columns, rows, fmt=_LUT_FORMATS[model.lut.shape[2]])
+        write_dds(temporary / "lut.dds", lut, columns, rows, fmt=LUT_FORMATS[model.lut.shape[2]])
         sheets, factors = sheet_texels(model), factor_texels(model)
         write_dds(temporary / "sheets.dds", sheets.tobytes(), *sheets.shape[1::-1], fmt="R16G16B16A16_UINT")
         write_dds(temporary / "factors.dds", factors.tobytes(), *factors.shape[1::-1], fmt="R32G32B32A32_FLOAT")

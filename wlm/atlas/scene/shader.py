@@ -12,7 +12,8 @@ _TEXT = """\
 // wlm_scene_sheets: sheets.dds, usampler2D, filter nearest.
 // wlm_scene_lut: lut.dds, usampler2D, filter nearest.
 // wlm_scene_factors: factors.dds, sampler2D of 32-bit floats, filter nearest.
-// wlm_scene_colour: colour_0.dds and so on as the layers of a sampler2DArray, filter linear, clamped to its edge.
+// wlm_scene_colour: colour_0.dds and so on as the layers of a sampler2DArray, filter linear, clamped to its edge; or
+// colour.dds, which is all of them.
 {second}//
 // Call wlm_scene with the lightmap's UVs, u to the right, v down, after the object's scale and offset; the number of
 // the sheet that the object reads; and the number of the state, 1.5 for example half-way from the second to the third.

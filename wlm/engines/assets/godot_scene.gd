@@ -15,8 +15,11 @@ var _materials: Array[ShaderMaterial] = []
 func _ready() -> void:
 	_info = JSON.parse_string(FileAccess.get_file_as_string(folder.path_join("scene.json")))
 	var shader: Shader = load(folder.path_join("scene.gdshader"))
-	var lut: Texture2D = load(folder.path_join("lut.exr"))
-	var colour: Texture2DArray = _layers(load(folder.path_join("colour.exr")))
+	var textures: Dictionary = {}
+	for key: String in _info["textures"]:
+		textures[key] = load(folder.path_join(_info["textures"][key]))
+	for key: String in _info["layer_heights"]:
+		textures[key] = _layers(textures[key], int(_info["layer_heights"][key]))
 	for each: Dictionary in _info["objects"]:
 		var label: String = each["label"]
 		var found: MeshInstance3D = find_child(label.validate_node_name(), true, false) as MeshInstance3D
@@ -25,8 +28,8 @@ func _ready() -> void:
 			continue
 		for i: int in found.mesh.get_surface_count():
 			var material: ShaderMaterial = _lit(shader, each, found.get_active_material(i) as BaseMaterial3D)
-			material.set_shader_parameter("wlm_scene_lut", lut)
-			material.set_shader_parameter("wlm_scene_colour", colour)
+			for key: String in textures:
+				material.set_shader_parameter("wlm_scene_" + key, textures[key])
 			found.set_surface_override_material(i, material)
 			_materials.append(material)
 	set_state(state)
@@ -34,18 +37,8 @@ func _ready() -> void:
 
 func set_state(value: float) -> void:
 	state = value
-	if _info.is_empty():
-		return
-	var factors: Array = _info["factors"]
-	var at: float = clampf(value, 0.0, factors.size() - 1)
-	var low: int = int(at)
-	var early: Array = factors[low]
-	var late: Array = factors[mini(low + 1, factors.size() - 1)]
-	var mixed: PackedVector3Array = []
-	for i: int in early.size():
-		mixed.append(_vector(early[i]).lerp(_vector(late[i]), at - low))
 	for material: ShaderMaterial in _materials:
-		material.set_shader_parameter("wlm_scene_factor", mixed)
+		material.set_shader_parameter("wlm_state", value)
 
 
 func _lit(shader: Shader, object: Dictionary, old: BaseMaterial3D) -> ShaderMaterial:
@@ -55,26 +48,17 @@ func _lit(shader: Shader, object: Dictionary, old: BaseMaterial3D) -> ShaderMate
 		material.set_shader_parameter("albedo", old.albedo_texture)
 		material.set_shader_parameter("colour", old.albedo_color)
 	var place: Array = object["scale_offset"]
-	var sheet: Dictionary = _info["sheets"][int(object["sheet"])]
 	material.set_shader_parameter("wlm_place", Vector4(place[0], place[1], place[2], place[3]))
-	material.set_shader_parameter(
-		"wlm_sheet", Vector4(sheet["width"], sheet["height"], sheet["column"], sheet["row"])
-	)
-	material.set_shader_parameter("wlm_tiles", Vector3(sheet["columns"], sheet["rows"], sheet["page"]))
+	material.set_shader_parameter("wlm_sheet", int(object["sheet"]))
 	return material
 
 
 ## The layers of a picture, one below the other.
-func _layers(picture: Texture2D) -> Texture2DArray:
+func _layers(picture: Texture2D, height: int) -> Texture2DArray:
 	var image: Image = picture.get_image()
-	var height: int = int(_info["layer_height"])
 	var images: Array[Image] = []
 	for top: int in range(0, image.get_height(), height):
 		images.append(image.get_region(Rect2i(0, top, image.get_width(), height)))
 	var made: Texture2DArray = Texture2DArray.new()
 	made.create_from_images(images)
 	return made
-
-
-func _vector(values: Array) -> Vector3:
-	return Vector3(values[0], values[1], values[2])

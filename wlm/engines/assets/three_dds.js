@@ -26,6 +26,12 @@ async function readDds(url, THREE, array = false) {
   else if (format === 36) {
     texture = plain(levels(Uint16Array), THREE.RGIntegerFormat, THREE.UnsignedShortType);
     filter = THREE.NearestFilter;
+  } else if (format === 12) {
+    texture = plain(levels(Uint16Array), THREE.RGBAIntegerFormat, THREE.UnsignedShortType);
+    filter = THREE.NearestFilter;
+  } else if (format === 2) {
+    texture = plain(levels(Float32Array), THREE.RGBAFormat, THREE.FloatType);
+    filter = THREE.NearestFilter;
   } else if (format === 35) {
     texture = plain(Float32Array.from(levels(Uint16Array), (v) => v / 65535), THREE.RGFormat, THREE.FloatType);
   } else if (format === 24) {

@@ -14,8 +14,11 @@ export async function loadScene(url, THREE) {
   const base = new URL(url, document.baseURI), beside = (name) => new URL(name, base).href;
   const info = await (await fetched(base)).json();
   const shader = await (await fetched(beside('scene.glsl'))).text();
-  const [lut, colour] = await Promise.all([readDds(beside('lut.dds'), THREE), readDds(beside('colour.dds'), THREE, true)]);
-  const factor = info.factors[0].map(() => new THREE.Vector3());
+  const state = {value: 0}, shared = {wlm_state: state};
+  await Promise.all(Object.entries(info.textures).map(async ([name, file]) => {
+    const layered = name === 'colour' || name === 'blocks';
+    shared[`wlm_scene_${name}`] = {value: await readDds(beside(file), THREE, layered)};
+  }));
   // What switches the materials' lightmap on; the shader reads the others in its place.
   const shown = new THREE.DataTexture(new Uint8Array(4), 1, 1);
   shown.channel = info.uv_set;
@@ -28,22 +31,14 @@ export async function loadScene(url, THREE) {
     return made.get(key);
   };
   const withLight = (material, object) => {
-    const {width, height, column, row, columns, rows, page} = info.sheets[object.sheet];
-    const own = {
-      wlm_scene_lut: {value: lut},
-      wlm_scene_colour: {value: colour},
-      wlm_scene_factor: {value: factor},
-      wlm_place: {value: new THREE.Vector4(...object.scale_offset)},
-      wlm_sheet: {value: new THREE.Vector4(width, height, column, row)},
-      wlm_tiles: {value: new THREE.Vector3(columns, rows, page)},
-    };
+    const own = {wlm_place: {value: new THREE.Vector4(...object.scale_offset)}, wlm_sheet: {value: object.sheet}};
     material.lightMap = shown;
     material.lightMapIntensity = Math.PI;
     material.onBeforeCompile = (program) => {
-      Object.assign(program.uniforms, own);
+      Object.assign(program.uniforms, shared, own);
       const head = 'precision highp usampler2D;\nprecision highp sampler2DArray;\n'
-        + 'uniform vec4 wlm_place, wlm_sheet;\nuniform vec3 wlm_tiles;\n';
-      const read = 'vec4( wlm_object( vLightMapUv, wlm_place, wlm_sheet, wlm_tiles ), 1.0 )';
+        + 'uniform vec4 wlm_place;\nuniform int wlm_sheet;\nuniform float wlm_state;\n';
+      const read = 'vec4( wlm_object( vLightMapUv, wlm_place, wlm_sheet, wlm_state ), 1.0 )';
       program.fragmentShader = head + program.fragmentShader
         .replace('#include <lights_fragment_maps>', THREE.ShaderChunk.lights_fragment_maps)
         .replaceAll('texture2D( lightMap, vLightMapUv )', read)
@@ -56,10 +51,8 @@ export async function loadScene(url, THREE) {
   const light = {
     info,
     // A state's number; between two they are mixed.
-    setState(state) {
-      const last = info.states.length - 1, at = Math.min(Math.max(state, 0), last), low = Math.floor(at);
-      const late = info.factors[Math.min(low + 1, last)];
-      info.factors[low].forEach((early, i) => factor[i].set(...early).lerp(new THREE.Vector3(...late[i]), at - low));
+    setState(number) {
+      state.value = number;
     },
     // The light on all that reads it, of scene.glb as GLTFLoader gives it: it keeps what nodes have to say.
     apply(root) {
@@ -75,9 +68,9 @@ export async function loadScene(url, THREE) {
       visit(root, undefined);
     },
     dispose() {
-      for (const each of [lut, colour, shown, ...made.values()]) each.dispose();
+      for (const each of [shown, ...made.values()]) each.dispose();
+      for (const {value} of Object.values(shared)) value.dispose?.();
     },
   };
-  light.setState(0);
   return light;
 }

@@ -6,7 +6,9 @@
         int layers = BitConverter.ToInt32(bytes, 140);
         GraphicsFormat format = BitConverter.ToInt32(bytes, 128) switch
         {
+            2 => GraphicsFormat.R32G32B32A32_SFloat,
             10 => GraphicsFormat.R16G16B16A16_SFloat,
+            12 => GraphicsFormat.R16G16B16A16_UInt,
             24 => GraphicsFormat.A2B10G10R10_UNormPack32,
             35 => GraphicsFormat.R16G16_UNorm,
             36 => GraphicsFormat.R16G16_UInt,

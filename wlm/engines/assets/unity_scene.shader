@@ -20,7 +20,8 @@ Shader "Wlm/Scene"
 
             sampler2D _MainTex;
             float4 _MainTex_ST, _Color;
-            float4 wlm_place, wlm_sheet, wlm_tiles;
+            float4 wlm_place;
+            float wlm_sheet, wlm_state;
 
             struct Varying
             {
@@ -41,7 +42,8 @@ Shader "Wlm/Scene"
             float4 frag(Varying at) : SV_Target
             {
                 float4 albedo = tex2D(_MainTex, at.uv) * _Color;
-                return float4(albedo.rgb * wlm_object(at.place, wlm_place, wlm_sheet, wlm_tiles.xyz), albedo.a);
+                float3 light = wlm_object(at.place, wlm_place, int(wlm_sheet + 0.5), wlm_state);
+                return float4(albedo.rgb * light, albedo.a);
             }
             ENDHLSL
         }
