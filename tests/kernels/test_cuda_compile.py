@@ -28,6 +28,7 @@ MODULES = (
     "atlas.patch_graph",
     "atlas.patches",
     "atlas.scene",
+    "atlas.solve",
     pytest.param("bc6h", marks=pytest.mark.slow),  # several seconds
     "fluid.advection_places",
     "fluid.grids",
