@@ -22,7 +22,7 @@ from wlm.cli.console import (
 )
 from wlm.cli.options import (
     AsJson,
-    CheckpointEvery,
+    CheckpointEveryIfKept,
     Device,
     ModelFile,
     PageFile,
@@ -30,6 +30,7 @@ from wlm.cli.options import (
     Resume,
     Seed,
     output_option,
+    seconds_between,
 )
 from wlm.cli.probe_day import (
     Time,
@@ -106,7 +107,7 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
+    checkpoint_every: CheckpointEveryIfKept = None,
     positions: Annotated[
         bool, typer.Option("--positions", help="Store the probes' positions too, 16 bits per axis.")
     ] = False,
@@ -133,6 +134,8 @@ def compress(
     overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
     check_method(settings, overrides, "--")
+    if checkpoint_every is not None and (times is not None or settings.method == "transform"):
+        raise WlmError("--checkpoint-every: expected with Gaussians of one hour; a transform is made anew in seconds")
     device = check_device(device)
     sets, hours = [], None if times is None else read_times(times)
     if hours is None:
@@ -141,7 +144,8 @@ def compress(
         sets = read_hours(probes_paths, hours, key, convention)
         probes = joined(sets, hours)
     options = {"seed": seed, "device": device}
-    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
+    every = seconds_between(checkpoint_every)
+    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=every, **options)
     note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
