@@ -14,7 +14,7 @@ from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
 from builders.layered_sets import random_layers
-from builders.shader_runs import run_glsl
+from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
 from wlm.atlas import exporter
@@ -219,6 +219,49 @@ def test_unitys_passes_compile(kinds, tmp_path):
     for each in passes:
         compiled(shared + each, tmp_path, "-D", "-S", "frag", "-e", "frag", "--auto-map-bindings")
     compiled(shared + passes[0], tmp_path, "-D", "-S", "vert", "-e", "vert", "--auto-map-bindings")
+
+
+# Constants and functions of Unity, to run a pass as a function.
+RUN = """
+static const float4 _MainTex_ST = float4(1, 1, 0, 0), _Color = float4(1, 1, 1, 1);
+static const float _WlmShare = 0.25, _WlmDown = WLM_DOWN;
+float4 UnityObjectToClipPos(float4 p) { return p; }
+#define TRANSFORM_TEX(uv, name) (uv * name##_ST.xy + name##_ST.zw)
+#define tex2D(s, uv) float4(0.5, 0.5, 0.5, 1.0)
+"""
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_light_has_its_top_where_unity_has_it(down, tmp_path):
+    """The picture's top row at v = 1, the last row of a texture of Unity; or at v = 0."""
+    export_lightmap(random_lightmap(), tmp_path, "unity")
+    text = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmLightmap.shader").read_text(), re.DOTALL)[2]
+    named = "Texture2D<float4> _WlmEarly;\nTexture2D<float4> _WlmLate;\n"
+    text = f"#define WLM_DOWN {down}\n{named}{RUN}{text}"
+    early, late = np.random.default_rng(0).random((2, 5, 4, 4)).astype(np.float32)
+    maps = {"_WlmEarly": early, "_WlmLate": late}
+    found = run_hlsl(text, "frag(float4(float2(pixel) + 0.5, 0.0, 1.0))", (5, 4), maps, tmp_path)
+    expected = 0.75 * early + 0.25 * late
+    np.testing.assert_allclose(found, expected if down else expected[::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_surface_shows_its_light(down, tmp_path):
+    """At UVs whose v an importer turned round, and at glTF's own."""
+    model, output = atlas_folder(tmp_path / "made", "plain", mesh=charts())
+    export_atlas(output, tmp_path / "out", "unity")
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "out" / "WlmAtlas.shader").read_text(), re.DOTALL)[1]
+    text = re.sub(r"^ *(#pragma|#include \"UnityCG|sampler2D|float4 _MainTex_ST).*$", "", text, flags=re.MULTILINE)
+    text = text.replace('#include "WlmAtlas.hlsl"', "\n" + (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
+    head = "#define WLM_DOWN 0\n" + "#define WLM_V_DOWN\n" * down + "Texture2D<float4> u_points;\n"
+    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
+    given = uv if down else np.float32([0, 1]) + np.float32([1, -1]) * uv
+    colour = np.concatenate([model.texels, np.ones_like(model.texels[..., :1])], 2).astype(np.float16)
+    bound = {"u_points": np.pad(given, ((0, 0), (0, 2)))[None], "wlm_atlas_colour": colour}
+    place = "u_points.Load(int3(pixel, 0)).xy"
+    shown = f"frag(vert(float4(0, 0, 0, 1), float2(0.5, 0.5), {place}))"
+    found = run_hlsl(head + RUN + text, shown, (1, len(uv)), bound, tmp_path)[0, :, :3]
+    np.testing.assert_allclose(found, 0.5 * decode64(model, uv), atol=3.0 / 512)
 
 
 UNITY = """

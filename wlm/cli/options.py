@@ -50,7 +50,7 @@ ExactShader = Annotated[
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
 
 
-def shader_of(engine: str, shader: str | None, exact: bool) -> str:
+def shader_of(engine: str, shader: str | None, exact: bool = False) -> str:
     """The language of a raw export's shader.
 
     Raises:
