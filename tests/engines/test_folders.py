@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from wlm.atlas.exact import decode64
 from wlm.atlas.mips import make_tail
 from wlm.engines import ENGINES, export_atlas, export_lightmap
 from wlm.formats.light import read_light
+from wlm.inspection import inspect
 from wlm.lightmap.shader import texture_names
 
 ALL = (4, 3, 2, 1, 5, 0)
@@ -79,6 +81,35 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
 
 
+def test_layers_have_a_folder_for_each_sheet_of_light(tmp_path):
+    """What a project can have but once is written once, and what engines name after the model has the sheet's name."""
+    model, out = random_layers(), tmp_path / "out"
+    places = set()
+    for engine in ("unity", "three", "unreal", "godot"):
+        paths = export_lightmap(model, out, engine)
+        assert {path for path in out.rglob("*") if path.is_file()} == set(paths) and paths[-1] == out / "sheets.json"
+        index = json.loads(paths[-1].read_text())
+        assert [(each["folder"], each["atlas"]) for each in index["sheets"]] == [("sheet_00", "a"), ("sheet_03", "b")]
+        shared = [path.relative_to(out).as_posix() for path in paths if path.suffix == ".cs"]
+        assert shared == (["WlmLightmap.cs"] if engine == "unity" else [])
+        for each in index["sheets"]:
+            light = next(
+                own for sheet, own in model.sheets.items() if sheet.atlas == each["atlas"] and not sheet.linear
+            )
+            alone = {path.name: path for path in export_lightmap(light, tmp_path / f"alone-{engine}", engine)}
+            same = [name for name in alone if Path(name).suffix in (".bytes", ".dds", ".bin", ".tga", ".exr")]
+            for name in same:
+                assert (out / each["folder"] / name).read_bytes() == alone[name].read_bytes(), name
+            assert same
+            for name in ("WlmLightmap.shader", "wlm_lightmap.py"):
+                if name in alone:
+                    text = (out / each["folder"] / name).read_text()
+                    places.add(re.search(r'^(Shader|PLACE =) "(.*)"', text, re.MULTILINE)[0])
+    assert len(places) == 4
+    (finding,) = inspect(out)
+    assert "for one engine" in finding.what
+
+
 KEY = """
 import { readFile } from "node:fs/promises";
 globalThis.document = { baseURI: import.meta.url };
@@ -122,7 +153,9 @@ def test_a_file_that_three_cannot_load_is_named(tmp_path):
 
 def test_what_cannot_be_exported_for_an_engine(tmp_path):
     assert "engine: expected one of three" in error_of(export_lightmap, random_lightmap(), tmp_path / "a", "cry")
-    assert "found layers" in error_of(export_lightmap, random_layers(), tmp_path / "a", "three")
+    layers = random_layers()
+    layers.sheets = {sheet: model for sheet, model in layers.sheets.items() if sheet.linear}
+    assert "expected a layer of light, found dir" in error_of(export_lightmap, layers, tmp_path / "a", "three")
     _, output = atlas_folder(tmp_path / "made", "plain", "astc")
     assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
     assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")

@@ -38,6 +38,7 @@ _EXPORTS = {
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
     "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
     "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
+    "wlm-lightmap-layers-engine": "layered lightmaps over time for one engine: a folder for each sheet of light",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",

@@ -1,5 +1,4 @@
 # Light over the day, decoded by a compute shader on the rendering device. See README.md.
-class_name WlmLightmap
 extends Node
 
 @export_dir var folder := "res://lightmap"

@@ -1,5 +1,5 @@
 // Passes of WlmLightmap.cs: decode, fill the gaps, mix two hours.
-Shader "Hidden/Wlm/Lightmap"
+Shader "Hidden/Wlm/Lightmap/@NAME@"
 {
     SubShader
     {
