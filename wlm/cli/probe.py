@@ -54,8 +54,9 @@ if TYPE_CHECKING:
     from wlm.baselines.rival import Rival
     from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
-app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
-register(app)
+app = typer.Typer(
+    help="Light probes: a transform over their places, or 3D Gaussians and a small network; a cascaded volume of both."
+)
 
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _Convention = Annotated[
@@ -466,3 +467,4 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
 
 
 register_export(app)
+register(app)
