@@ -181,6 +181,10 @@ def test_what_is_refused(change, words):
     assert words in text and text.startswith("thing")
 
 
+def test_a_reflection_probe_is_asked_about():
+    assert "6 x 1, as a cube's six faces" in from_arrays(POSITION, TRIANGLE, UV, np.ones((1, 6, 3))).warnings[0]
+
+
 def test_uvs_outside_are_clamped():
     uv = UV.copy()
     uv[[1, 3], 0] = 1.5

@@ -5,6 +5,7 @@ import sys
 import pytest
 from builders.atlas_meshes import charts, sheet
 from builders.bench_rows import check_command, check_outputs, keys
+from builders.running import fails
 
 import wlm.bench.atlas_ablation as bench
 from wlm.atlas.evaluation import evaluate
@@ -87,3 +88,7 @@ def test_the_command(rows, tmp_path, monkeypatch):
     assert command == "wlm bench atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC"
     assert [lightmap.scene for lightmap in lightmaps] == ["room"] and names == ["cascade", ["ASTC"]]
     assert options["quick"] and options["steps"] == 9
+    # Before any mesh is read.
+    assert "--only: expected one of whole" in fails(
+        "bench", *words[:1], "--only", "none", "--meshes", tmp_path / "none"
+    )

@@ -93,6 +93,11 @@ def test_lengths(monkeypatch):
     assert (long.steps, long.samples, long.name, only) == (70, 4096, "M", ["hybrid"])
 
 
+def test_names_are_checked_before_a_set_is_read(tmp_path):
+    with pytest.raises(WlmError, match="--only: expected one of hybrid, .*; found 'none'"):
+        bench.run(["none"], quick=True, device="cpu", set_path=tmp_path / "none")
+
+
 def test_the_command(made, monkeypatch, tmp_path):
     from wlm.cli.bench import app
 

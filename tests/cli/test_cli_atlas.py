@@ -309,7 +309,10 @@ def test_a_scene_is_one_command(tmp_path):
     assert "--colour: expected 'rgb9e5' or 'mixed', got 'half'" in fails(*words, "--colour", "half")
     words += ("--flip",)
     assert "--flip: expected with one lightmap alone" in fails(*words)
-    assert "--resume: expected with one lightmap alone; a scene's" in fails(*words[:-1], "--resume")
+    for option in (["--resume"], ["--checkpoint-every", "5"]):
+        assert f"{option[0]}: expected with one lightmap alone; a scene's" in fails(*words[:-1], *option)
+    assert "the lightmaps of a scene" in fails("atlas", "decode", out, "-o", tmp_path / "a.exr")
+    assert "1 page\n" in call("atlas", "info", out).replace(" │", "")
 
 
 def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):

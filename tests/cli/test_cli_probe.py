@@ -330,8 +330,9 @@ def test_shaders_in_other_languages(fitted, tmp_path):
     for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
         assert name in call("probe", "export", fitted, "-o", tmp_path / "out", "--shader", language)
         assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
-    words = ["probe", "export", fitted, "-o", tmp_path / "no", "--engine", "three", "--shader", "hlsl"]
-    assert "--shader: means nothing" in fails(*words)
+    words = ["probe", "export", fitted, "-o", tmp_path / "no", "--engine"]
+    assert "--shader: means nothing" in fails(*words, "three", "--shader", "hlsl")
+    assert "'--engine': 'any' is not one of 'raw', 'three'" in fails(*words, "any")
 
 
 def test_textures_for_unreal(fitted, tmp_path):

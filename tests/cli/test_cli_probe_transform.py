@@ -74,6 +74,7 @@ def test_walks_and_exports_have_the_places(folder, tmp_path):
 def test_options_of_the_other_method_are_refused(folder, tmp_path):
     words = ["probe", "compress", folder / "room.npz", "-o", tmp_path / "a.wlm"]
     assert "--ratio: expected a profile of the method gaussians" in fails(*words, "--ratio", 0.1)
+    assert "--checkpoint-every: expected with Gaussians" in fails(*words, "--checkpoint-every", 1)
     assert "--max-bytes: expected a profile of the method transform" in fails(
         *words, "--profile", "small", "--max-bytes", 9
     )

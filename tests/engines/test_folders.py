@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
 from builders.layered_sets import random_layers
-from builders.shader_runs import run_glsl
+from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
 from wlm.atlas import exporter
@@ -22,6 +23,7 @@ from wlm.atlas.exact import decode64
 from wlm.atlas.mips import make_tail
 from wlm.engines import ENGINES, export_atlas, export_lightmap
 from wlm.formats.light import read_light
+from wlm.inspection import inspect
 from wlm.lightmap.shader import texture_names
 
 ALL = (4, 3, 2, 1, 5, 0)
@@ -79,6 +81,35 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
 
 
+def test_layers_have_a_folder_for_each_sheet_of_light(tmp_path):
+    """What a project can have but once is written once, and what engines name after the model has the sheet's name."""
+    model, out = random_layers(), tmp_path / "out"
+    places = set()
+    for engine in ("unity", "three", "unreal", "godot"):
+        paths = export_lightmap(model, out, engine)
+        assert {path for path in out.rglob("*") if path.is_file()} == set(paths) and paths[-1] == out / "sheets.json"
+        index = json.loads(paths[-1].read_text())
+        assert [(each["folder"], each["atlas"]) for each in index["sheets"]] == [("sheet_00", "a"), ("sheet_03", "b")]
+        shared = [path.relative_to(out).as_posix() for path in paths if path.suffix == ".cs"]
+        assert shared == (["WlmLightmap.cs"] if engine == "unity" else [])
+        for each in index["sheets"]:
+            light = next(
+                own for sheet, own in model.sheets.items() if sheet.atlas == each["atlas"] and not sheet.linear
+            )
+            alone = {path.name: path for path in export_lightmap(light, tmp_path / f"alone-{engine}", engine)}
+            same = [name for name in alone if Path(name).suffix in (".bytes", ".dds", ".bin", ".tga", ".exr")]
+            for name in same:
+                assert (out / each["folder"] / name).read_bytes() == alone[name].read_bytes(), name
+            assert same
+            for name in ("WlmLightmap.shader", "wlm_lightmap.py"):
+                if name in alone:
+                    text = (out / each["folder"] / name).read_text()
+                    places.add(re.search(r'^(Shader|PLACE =) "(.*)"', text, re.MULTILINE)[0])
+    assert len(places) == 4
+    (finding,) = inspect(out)
+    assert "for one engine" in finding.what
+
+
 KEY = """
 import { readFile } from "node:fs/promises";
 globalThis.document = { baseURI: import.meta.url };
@@ -122,7 +153,9 @@ def test_a_file_that_three_cannot_load_is_named(tmp_path):
 
 def test_what_cannot_be_exported_for_an_engine(tmp_path):
     assert "engine: expected one of three" in error_of(export_lightmap, random_lightmap(), tmp_path / "a", "cry")
-    assert "found layers" in error_of(export_lightmap, random_layers(), tmp_path / "a", "three")
+    layers = random_layers()
+    layers.sheets = {sheet: model for sheet, model in layers.sheets.items() if sheet.linear}
+    assert "expected a layer of light, found dir" in error_of(export_lightmap, layers, tmp_path / "a", "three")
     _, output = atlas_folder(tmp_path / "made", "plain", "astc")
     assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
     assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
@@ -219,6 +252,49 @@ def test_unitys_passes_compile(kinds, tmp_path):
     for each in passes:
         compiled(shared + each, tmp_path, "-D", "-S", "frag", "-e", "frag", "--auto-map-bindings")
     compiled(shared + passes[0], tmp_path, "-D", "-S", "vert", "-e", "vert", "--auto-map-bindings")
+
+
+# Constants and functions of Unity, to run a pass as a function.
+RUN = """
+static const float4 _MainTex_ST = float4(1, 1, 0, 0), _Color = float4(1, 1, 1, 1);
+static const float _WlmShare = 0.25, _WlmDown = WLM_DOWN;
+float4 UnityObjectToClipPos(float4 p) { return p; }
+#define TRANSFORM_TEX(uv, name) (uv * name##_ST.xy + name##_ST.zw)
+#define tex2D(s, uv) float4(0.5, 0.5, 0.5, 1.0)
+"""
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_light_has_its_top_where_unity_has_it(down, tmp_path):
+    """The picture's top row at v = 1, the last row of a texture of Unity; or at v = 0."""
+    export_lightmap(random_lightmap(), tmp_path, "unity")
+    text = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmLightmap.shader").read_text(), re.DOTALL)[2]
+    named = "Texture2D<float4> _WlmEarly;\nTexture2D<float4> _WlmLate;\n"
+    text = f"#define WLM_DOWN {down}\n{named}{RUN}{text}"
+    early, late = np.random.default_rng(0).random((2, 5, 4, 4)).astype(np.float32)
+    maps = {"_WlmEarly": early, "_WlmLate": late}
+    found = run_hlsl(text, "frag(float4(float2(pixel) + 0.5, 0.0, 1.0))", (5, 4), maps, tmp_path)
+    expected = 0.75 * early + 0.25 * late
+    np.testing.assert_allclose(found, expected if down else expected[::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_surface_shows_its_light(down, tmp_path):
+    """At UVs whose v an importer turned round, and at glTF's own."""
+    model, output = atlas_folder(tmp_path / "made", "plain", mesh=charts())
+    export_atlas(output, tmp_path / "out", "unity")
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "out" / "WlmAtlas.shader").read_text(), re.DOTALL)[1]
+    text = re.sub(r"^ *(#pragma|#include \"UnityCG|sampler2D|float4 _MainTex_ST).*$", "", text, flags=re.MULTILINE)
+    text = text.replace('#include "WlmAtlas.hlsl"', "\n" + (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
+    head = "#define WLM_DOWN 0\n" + "#define WLM_V_DOWN\n" * down + "Texture2D<float4> u_points;\n"
+    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
+    given = uv if down else np.float32([0, 1]) + np.float32([1, -1]) * uv
+    colour = np.concatenate([model.texels, np.ones_like(model.texels[..., :1])], 2).astype(np.float16)
+    bound = {"u_points": np.pad(given, ((0, 0), (0, 2)))[None], "wlm_atlas_colour": colour}
+    place = "u_points.Load(int3(pixel, 0)).xy"
+    shown = f"frag(vert(float4(0, 0, 0, 1), float2(0.5, 0.5), {place}))"
+    found = run_hlsl(head + RUN + text, shown, (1, len(uv)), bound, tmp_path)[0, :, :3]
+    np.testing.assert_allclose(found, 0.5 * decode64(model, uv), atol=3.0 / 512)
 
 
 UNITY = """

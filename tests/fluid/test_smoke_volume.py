@@ -10,6 +10,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array, from_grid, load_volume, save_volume
+from wlm.inspection import inspect
 
 _GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
 
@@ -122,6 +123,20 @@ def test_nvdb(tmp_path: Path, device: str):
     np.testing.assert_array_equal(got[:9, :5, :3], density)
     # Warp's writer fills whole leaves.
     assert got.shape == (16, 8, 8) and got.sum() == pytest.approx(density.sum(), rel=1e-5)
+
+
+def test_smoke_that_may_lie_on_its_side(tmp_path: Path):
+    """What is longest along z is asked about, until it is said which axis is up."""
+    path = tmp_path / "a.nvdb"
+    _nvdb(path, np.ones((8, 8, 24), np.float32))
+    (warning,) = load_volume(path).warnings
+    assert "longest along z" in warning and "--up z" in warning
+    turned = load_volume(path, up="z")
+    assert not turned.warnings and turned.shape[1] == 24 and not load_volume(path, up="y").warnings
+    (finding,) = inspect(path)
+    assert " --up z -o" in finding.command and len(finding.problems) == 1
+    _nvdb(path, np.ones((8, 24, 8), np.float32))
+    assert not load_volume(path).warnings and "--up" not in inspect(path)[0].command
 
 
 def test_grid_on_its_device(device: str):

@@ -194,7 +194,7 @@ def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, t
     lightmaps = moving_light(hours=(6.0,))
     model = compress(lightmaps, tiny_profile(frames="auto"))
     assert count_kinds(model)["static"] == 1
-    assert len(model.warnings) == 1 and "1 tiles would be" in model.warnings[0]
+    assert len(model.warnings) == 1 and "1 tile would be" in model.warnings[0]
     assert "pip install 'wlm[frames]'" in model.warnings[0] and "\n" not in model.warnings[0]
     with pytest.raises(WlmError, match=r"^frames: ispc_texcomp is missing; needs the extra"):
         compress(lightmaps, "frames")

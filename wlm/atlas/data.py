@@ -11,6 +11,7 @@ several meshes that lie on each       the one that the lightmap fits best (`belo
 other in UV space                     Error where none fits clearly better: `node` says which
 a lightmap that fits its charts       warning: `flip` turns it
 better upside down
+six times as long as wide             warning: such are a cube's faces, of a reflection probe
 a primitive without the UV set        left out, and unchanged in what is written; warning
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
@@ -63,6 +64,7 @@ from wlm.ops.indoors import Indoors, indoors
 from wlm.texels import fill_gaps, repair
 
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't tell a triangle from one without area
+_FACES = 6  # of a cube
 _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
 
 
@@ -344,6 +346,8 @@ def checked_mesh(
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
 
     height, width = lightmap.shape[:2]
+    if max(height, width) == _FACES * min(height, width):
+        warnings.append(f"{lightmap_name}: {width} x {height}, as a cube's six faces: is it a reflection probe?")
     texels = _uv_area(uv, triangle[active]) * height * width
     if texels < 1.0:
         warnings.append(

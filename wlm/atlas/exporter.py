@@ -26,6 +26,7 @@ from wlm.atlas import codec
 from wlm.atlas.coverage import touched_texels
 from wlm.atlas.data import LightmappedMesh, from_arrays, load, write_mesh
 from wlm.atlas.model import BLOCKS, LUT_STEPS, TEXELS, AtlasModel, disk_ratio, tail_codec, tail_shapes
+from wlm.atlas.scene.exporter import FORMAT as SCENE_FORMAT
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
@@ -252,6 +253,10 @@ def _read_report(directory: str | os.PathLike[str]) -> dict[str, Any]:
     if not folder.is_dir():
         raise WlmError(f"{folder}: expected a folder that compress wrote")
     report = read_index(folder / REPORT_FILE)
+    if report.get("format") == SCENE_FORMAT:
+        raise WlmError(
+            f"{folder}: the lightmaps of a scene: expected a folder of one; evaluate, info and export take it"
+        )
     if report.get("format") != FORMAT:
         raise WlmError(f"{folder}: expected a folder that compress wrote, found no {REPORT_FILE} of it")
     if UNFINISHED in report:

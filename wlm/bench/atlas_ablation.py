@@ -101,7 +101,7 @@ def run_rows(
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Fits the variants of a profile, scored in so many views of so many pixels a side; the rest as for `run`."""
-    chosen = _chosen(profile, only)
+    chosen = choose(profile, only)
     of = f", ablation of {profile.name}"
     first = Bench("atlas", device, progress)
     first.note("compiling")
@@ -129,8 +129,16 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
     return rows
 
 
-def _chosen(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
-    """The rows that were asked for."""
+def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
+    """The `variants` that are asked for.
+
+    Args:
+        base: What each is with one change.
+        only: Names of rows; none: all.
+
+    Raises:
+        WlmError: The profile is of tiles, or no row has such a name.
+    """
     if base.method != "cascade":
         raise WlmError(f"bench: --profile: expected one of method cascade, found {base.name}, of {base.method}")
     rows = variants(base)

@@ -82,6 +82,7 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, no row has such a name, no tile is dynamic, or a fit diverged.
     """
+    _check(only)
     lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
     profile = Profile.load(_PROFILE).override(_QUICK if quick else {})
     if steps is not None:
@@ -99,10 +100,7 @@ def run_rows(
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Fits the variants of a profile, whose own sizes of maps don't count, to a set; the rest as for `run`."""
-    names = (*VARIANTS, KERNELS)
-    for name in only:
-        if name not in names:
-            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
+    names = _check(only)
     bench = _AblationBench(lightmaps, profile, device, progress)
     rows = []
     for name in names:
@@ -112,6 +110,15 @@ def run_rows(
             if done is not None:
                 done(rows)
     return rows
+
+
+def _check(only: Sequence[str]) -> tuple[str, ...]:
+    """Checks the names of rows that are asked for; returns all there are."""
+    names = (*VARIANTS, KERNELS)
+    for name in only:
+        if name not in names:
+            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
+    return names
 
 
 class _AblationBench(Bench):

@@ -43,7 +43,9 @@ class _Group(TyperGroup):
         except WlmError as error:
             line = str(error)
         except _UsageError as error:
-            line = f"{one_line(error.format_message())} ({_command_path(error)} --help tells more)"
+            # "Value error" is the checker's own word.
+            text = one_line(error.format_message()).replace("Value error, ", "")
+            line = f"{text} ({_command_path(error)} --help tells more)"
         except OSError as error:
             if error.errno == errno.EPIPE:
                 # What Python still holds for the closed pipe must not fail again when it ends.

@@ -21,7 +21,7 @@ from wlm.cli.console import (
 )
 from wlm.cli.options import (
     AsJson,
-    CheckpointEvery,
+    CheckpointEveryIfKept,
     Device,
     Engine,
     ExactShader,
@@ -32,6 +32,7 @@ from wlm.cli.options import (
     ShaderLanguage,
     Trust,
     output_option,
+    seconds_between,
     shader_of,
 )
 from wlm.errors import WlmError
@@ -86,7 +87,7 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
+    checkpoint_every: CheckpointEveryIfKept = None,
     trust: Trust = False,
 ) -> None:
     """Compress the lightmap of a mesh into a folder: the model, the mesh, textures for engines, a shader, a report.
@@ -106,8 +107,11 @@ def compress(
         for name, value in lone.items():
             if value:
                 raise WlmError(f"--{name}: expected with one lightmap alone; of a scene its list says it")
-        if resume:
-            raise WlmError("--resume: expected with one lightmap alone; a scene's compression isn't kept while it runs")
+        for name, value in {"resume": resume or None, "checkpoint-every": checkpoint_every}.items():
+            if value is not None:
+                raise WlmError(
+                    f"--{name}: expected with one lightmap alone; a scene's compression isn't kept while it runs"
+                )
         quiet_warp()
         from wlm.cli.atlas_scene import compress_scene
 
@@ -133,7 +137,8 @@ def compress(
     for warning in mesh.warnings:
         note(f"warning: {warning}")
     options = {"seed": seed, "device": device}
-    checkpoint = open_checkpoint(output, mesh, settings, resume=resume, every=checkpoint_every, **options)
+    every = seconds_between(checkpoint_every)
+    checkpoint = open_checkpoint(output, mesh, settings, resume=resume, every=every, **options)
     note_start(checkpoint, resume, "at the first stage")
     inputs = {"mesh": mesh_path, "lightmap": lightmap_path, "mask": mask}
     facts = {"inputs": {name: path and str(path.resolve()) for name, path in inputs.items()} | reading}

@@ -71,11 +71,9 @@ def show_scene(path: Path, as_json: bool) -> None:
     rows.add_row("states", escape(", ".join(facts["states"])))
     rows.add_row("sheets", f"{len(facts['sheets']):,}")
     rows.add_row("smaller levels", f"{facts['levels']:,}")
-    width, height, pages = facts["colour_size"]
-    rows.add_row("colour texture", f"{width}x{height}, {pages} pages")
+    rows.add_row("colour texture", _pages(*facts["colour_size"]))
     if facts["colour"] == "mixed":
-        width, height, pages = facts["block_size"]
-        rows.add_row("texture of blocks", f"{width}x{height}, {pages} pages")
+        rows.add_row("texture of blocks", _pages(*facts["block_size"]))
     rows.add_row("table", "x".join(map(str, facts["lut_size"])))
     rows.add_row("factors of a state", f"{facts['factors']:,}")
     rows.add_row("CR of all textures", f"{facts['cr']:.2%}")
@@ -86,6 +84,10 @@ def show_scene(path: Path, as_json: bool) -> None:
     for part, count in facts["parts"].items():
         rows.add_row(f"bytes of {part}", f"{count:,}")
     show(rows)
+
+
+def _pages(width: int, height: int, pages: int) -> str:
+    return f"{width}x{height}, {pages} page{'' if pages == 1 else 's'}"
 
 
 def evaluate_scene(folder: Path, views: int, resolution: int, json_path: Path | None, device: str, trust: bool) -> None:

@@ -219,9 +219,12 @@ def atlas_ablation(
 ) -> None:
     """Lightmaps of meshes: the cascade without its parts, and at other sizes of its textures."""
     device = _prepare(device, json_path, None, baseline)
-    from wlm.bench.atlas_ablation import run
+    from wlm.atlas.model import Profile
+    from wlm.bench.atlas_ablation import choose, run
     from wlm.bench.atlas_inputs import load
 
+    # Meshes take long to read, beside a slip in a name.
+    choose(Profile.load(profile), only or ())
     lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
     files = {"meshes": meshes_path, "mesh": mesh_path, "lightmap": lightmap_paths, "mask": mask_path}
     options = {"quick": quick, "profile": Path(profile).name, "device": device, **files, "steps": steps, "only": only}

@@ -368,7 +368,7 @@ def export(
     """Write the light for an engine: textures, floats, a decoder, and for an engine by name what puts them together.
 
     Of raw, frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet
-    of three channels has a folder of its own; sheets.json names them.
+    of three channels has a folder of its own, for an engine by name each sheet of light; sheets.json names them.
     """
     language = shader_of(engine, shader, exact)
     if engine != "raw" and device != "cpu":
@@ -383,6 +383,9 @@ def export(
         paths = export(model, output, device=device, shader=language, exact=exact)
     else:
         paths = export_lightmap(model, output, engine)
+        left = [] if model.SYSTEM != _LAYERED else [sheet.label for sheet in model.sheets if sheet.linear]
+        if left:
+            note(f"warning: left out, since --engine {engine} shows light alone: {', '.join(left)}")
     for path in paths:
         rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
     show(rows)

@@ -10,15 +10,15 @@ from wlm.errors import WlmError
 Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
-CheckpointEvery = Annotated[
-    float,
-    typer.Option(
-        "--checkpoint-every",
-        min=0.0,
-        metavar="SECONDS",
-        help="Between two saves of the running work, which --resume goes on from after a crash.",
-    ),
-]
+_EVERY = typer.Option(
+    "--checkpoint-every",
+    min=0.0,
+    metavar="SECONDS",
+    show_default=False,
+    help="Between two saves of the running work, which --resume goes on from after a crash; default 30.",
+)
+CheckpointEvery = Annotated[float, _EVERY]
+CheckpointEveryIfKept = Annotated[float | None, _EVERY]  # of commands some of whose work isn't kept: None: not given
 ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")]
 PageFile = Annotated[
     Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
@@ -50,7 +50,7 @@ ExactShader = Annotated[
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
 
 
-def shader_of(engine: str, shader: str | None, exact: bool) -> str:
+def shader_of(engine: str, shader: str | None, exact: bool = False) -> str:
     """The language of a raw export's shader.
 
     Raises:
@@ -60,6 +60,13 @@ def shader_of(engine: str, shader: str | None, exact: bool) -> str:
         if given and engine != "raw":
             raise WlmError(f"--{option}: means nothing with --engine {engine}, which has its own shaders")
     return shader or "glsl"
+
+
+def seconds_between(checkpoint_every: float | None) -> float:
+    """Seconds between two saves, where none may be given."""
+    from wlm.formats.checkpoint import EVERY
+
+    return EVERY if checkpoint_every is None else checkpoint_every
 
 
 def output_option(metavar: str, help_text: str) -> Any:

@@ -22,7 +22,7 @@ from wlm.cli.console import (
 )
 from wlm.cli.options import (
     AsJson,
-    CheckpointEvery,
+    CheckpointEveryIfKept,
     Device,
     ModelFile,
     PageFile,
@@ -30,6 +30,7 @@ from wlm.cli.options import (
     Resume,
     Seed,
     output_option,
+    seconds_between,
 )
 from wlm.cli.probe_day import (
     Time,
@@ -53,8 +54,9 @@ if TYPE_CHECKING:
     from wlm.baselines.rival import Rival
     from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
-app = typer.Typer(help="Light probes: quantised 3D Gaussians and a small network, read through a cascaded volume.")
-register(app)
+app = typer.Typer(
+    help="Light probes: a transform over their places, or 3D Gaussians and a small network; a cascaded volume of both."
+)
 
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _Convention = Annotated[
@@ -106,7 +108,7 @@ def compress(
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
+    checkpoint_every: CheckpointEveryIfKept = None,
     positions: Annotated[
         bool, typer.Option("--positions", help="Store the probes' positions too, 16 bits per axis.")
     ] = False,
@@ -133,6 +135,8 @@ def compress(
     overrides |= {"ratio": ratio, "bits": bits, "latent": latent, "steps": steps}
     settings = Profile.load(profile).override(overrides, "--")
     check_method(settings, overrides, "--")
+    if checkpoint_every is not None and (times is not None or settings.method == "transform"):
+        raise WlmError("--checkpoint-every: expected with Gaussians of one hour; a transform is made anew in seconds")
     device = check_device(device)
     sets, hours = [], None if times is None else read_times(times)
     if hours is None:
@@ -141,7 +145,8 @@ def compress(
         sets = read_hours(probes_paths, hours, key, convention)
         probes = joined(sets, hours)
     options = {"seed": seed, "device": device}
-    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=checkpoint_every, **options)
+    every = seconds_between(checkpoint_every)
+    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=every, **options)
     note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()
     with running("fit", checkpoint.path) as progress:
@@ -462,3 +467,4 @@ def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple
 
 
 register_export(app)
+register(app)

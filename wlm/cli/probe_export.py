@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from wlm.cli.console import escape, quiet_warp, show, table
-from wlm.cli.options import Device, ModelFile, output_option
+from wlm.cli.options import Device, ModelFile, ShaderLanguage, output_option, shader_of
 from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
@@ -25,12 +25,12 @@ def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
     engine: Annotated[
-        Literal["any", "three", "godot", "unity", "unreal"],
+        Literal["raw", "three", "godot", "unity", "unreal"],
         typer.Option(
-            help="For three.js, Godot and Unreal light on a lattice, for Godot and Unity the probes themselves too; "
-            "for any engine buffers and a shader that reads them."
+            help="Whose folder: for three.js, Godot and Unreal light on a lattice, for Godot and Unity the probes "
+            "themselves too; raw is buffers and a shader that reads them, for any."
         ),
-    ] = "any",
+    ] = "raw",
     original: Annotated[
         Path | None,
         typer.Option(
@@ -46,32 +46,28 @@ def export(
         Literal["x", "y", "z"] | None,
         typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
     ] = None,
-    shader: Annotated[
-        Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
-        typer.Option(help="For any engine, the shader's language; default glsl."),
-    ] = None,
+    shader: ShaderLanguage = None,
     time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the light for an engine, as files that it takes as they are.
 
-    For any engine, reference.json is the light at some positions: what the shader should make of the rest.
+    Of raw, reference.json is the light at some positions: what the shader should make of the rest.
     """
     if cells is not None and engine not in ("three", "godot", "unreal"):
         raise WlmError("--cells: means nothing without --engine three, godot or unreal")
     if mirror is not None and engine != "unity":
         raise WlmError("--mirror: means nothing without --engine unity")
-    if shader is not None and engine != "any":
-        raise WlmError("--shader: means nothing with --engine")
+    language = shader_of(engine, shader)
     quiet_warp()
     from wlm import probe
     from wlm.probe.three_grid import CELLS
     from wlm.system import load
 
     model = at_time(load(file, "probe"), time)
-    if engine == "any":
+    if engine == "raw":
         given = given_positions(model, original)
-        paths = probe.export(model, output, device=device, position=given, shader=shader or "glsl")
+        paths = probe.export(model, output, device=device, position=given, shader=language)
     elif engine in ("three", "unreal"):
         given, size = given_positions(model, original), CELLS if cells is None else cells
         write = probe.export_grid if engine == "three" else probe.export_unreal

@@ -1,7 +1,9 @@
 """A lightmap over the day for an engine: its decoder in the engine's own languages, and what it reads."""
 
 import os
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,35 +14,63 @@ from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
 from wlm.formats.folder import made_parents, read_index, staged, write_index
 from wlm.lightmap import exporter, packed
+from wlm.lightmap.layers.exporter import SheetFolders, export_sheets
 from wlm.lightmap.layers.model import LayeredModel
+from wlm.lightmap.layers.sheet import Sheet
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl, texture_names
 from wlm.shading import translate
 
 FORMAT = "wlm-lightmap-engine"
 MASK_FILE = "valid.dds"
+LAYERS_FORMAT = "wlm-lightmap-layers-engine"
+UNITY_SCRIPT = "WlmLightmap.cs"
+"""The component of Unity, which a project can have but once."""
+_ABOUT = "Each sheet is a folder whose README.md says how to use it: the light of an atlas."
 _UNREAL_KEYS = ("format", "version", "name", "source", "width", "height", "times", "period")
 
 
 def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.PathLike[str], engine: str) -> list[Path]:
     """Writes a model for an engine: textures, floats, a component that decodes them, and a page about it.
 
+    Of a model with layers each sheet of light has a folder of its own, and `sheets.json` says which is whose; the
+    components show light alone.
+
     Args:
-        model: The model, without layers.
+        model: The model.
         directory: The folder; made if it isn't there. A new export replaces an earlier one.
         engine: One of `wlm.engines.ENGINES`.
 
     Returns:
-        The files written, `weights.json` last.
+        The files written, `weights.json` last, or `sheets.json`.
 
     Raises:
-        WlmError: No such engine, a model with layers, or as `wlm.lightmap.export`.
+        WlmError: No such engine, no layer of light, or as `wlm.lightmap.export`.
     """
     if engine not in ENGINES:
         raise WlmError(f"engine: expected one of {', '.join(ENGINES)}, got {engine!r}")
     if isinstance(model, LayeredModel):
-        raise WlmError(f"{model.name}: cannot export for {engine}: expected one light, found layers; export it raw")
-    folder = Path(directory)
+        return _export_sheets(model, Path(directory), engine)
+    return _export(model, Path(directory), engine)
+
+
+def _export_sheets(model: LayeredModel, folder: Path, engine: str) -> list[Path]:
+    chosen = [sheet for sheet in model.sheets if not sheet.linear]
+    if not chosen:
+        found = ", ".join(dict.fromkeys(sheet.layer for sheet in model.sheets))
+        raise WlmError(f"{model.name}: cannot export for {engine}: expected a layer of light, found {found}")
+    script = None if engine != "unity" else _unity(model.sheets[chosen[0]])[UNITY_SCRIPT]
+
+    def write(sheet: Sheet, place: Path) -> list[Path]:
+        # Engines name materials and shaders after the model.
+        own = replace(model.sheets[sheet], name=f"{model.name} {sheet.label.replace('/', ' ')}")
+        return _export(own, place, engine, without=UNITY_SCRIPT)
+
+    kind = SheetFolders(LAYERS_FORMAT, _ABOUT, FORMAT, _is_exported, {UNITY_SCRIPT: script})
+    return export_sheets(model, folder, chosen, kind, write)
+
+
+def _export(model: LightmapModel, folder: Path, engine: str, without: str | None = None) -> list[Path]:
     with made_parents(folder), staged(folder, exporter.WEIGHTS_FILE, FORMAT, _is_exported) as staging:
         parts = exporter.write_parts(model, staging, form=FORMAT)
         (staging / exporter.VALID_FILE).unlink()
@@ -63,6 +93,8 @@ def export_lightmap(model: LightmapModel | LayeredModel, directory: str | os.Pat
             parts = [*sorted(path.name for path in staging.iterdir() if path.name != parts[-1]), parts[-1]]
         else:
             texts = _TEXTS[engine](model)
+        if without is not None:
+            texts.pop(without, None)
         for name, text in texts.items():
             (staging / name).write_bytes(text.encode())
     return [folder / name for name in (*texts, *parts)]
@@ -97,8 +129,8 @@ def _godot(model: LightmapModel) -> dict[str, str]:
 def _unity(model: LightmapModel) -> dict[str, str]:
     return {
         "WlmLightmap.hlsl": translate(decode_glsl(model), "hlsl"),
-        "WlmLightmap.shader": filled("unity_lightmap.shader"),
-        "WlmLightmap.cs": filled("unity_lightmap.cs", DDS=filled("unity_dds.cs")),
+        "WlmLightmap.shader": filled("unity_lightmap.shader", NAME=re.sub(r"[^\w .-]", "_", model.name)),
+        UNITY_SCRIPT: filled("unity_lightmap.cs", DDS=filled("unity_dds.cs")),
         README_FILE: filled("unity_lightmap.md", NAME=model.name),
     }
 

@@ -172,7 +172,7 @@ def load_volume(
     voxel: float | None = None,
     device: str = "cpu",
     trust: bool = False,
-    up: str = "y",
+    up: str | None = None,
     density: str | None = None,
     temperature: str | None = None,
 ) -> DensityVolume:
@@ -190,7 +190,8 @@ def load_volume(
         voxel: Edge of a voxel, in the world's unit; None: the file's, or 1.
         device: "cpu" or "cuda:N".
         trust: Whether the file is believed to hold as many voxels as it says (`wlm.formats.limits`).
-        up: "x", "y" or "z", the axis of the file's world that becomes +y.
+        up: "x", "y" or "z", the axis of the file's world that becomes +y. None: y, and a warning where a `.nvdb` or
+            `.vdb` is longest along z, which is up in Blender and Unreal.
         density: Name of the array or grid; None: `density`, else of a VDB file the first grid of floats.
         temperature: The same of the temperature; None: `temperature`, if there is one.
 
@@ -203,6 +204,7 @@ def load_volume(
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {path.suffix or 'none'}")
+    told, up = up is not None, up or "y"
     if up not in UPS:
         raise ValueError(f"up: expected one of {', '.join(UPS)}, got {up!r}")
     names, device = (density, temperature), check_device(device)
@@ -216,11 +218,20 @@ def load_volume(
         volume = _from_parts(read(path, names, trust), up, trust, **factors)
         heat = None if volume.temperature is None else volume.temperature.to(device)
         volume = replace(volume, density=volume.density.to(device), temperature=heat)
+        if not told and is_long_along_z(volume):
+            warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--up z)"
+            volume = replace(volume, warnings=(*volume.warnings, warning))
     if voxel is None:
         return volume
     if not _TINY <= voxel <= _HUGE:
         raise WlmError(f"{path}: voxel: expected a length above 0 that float32 holds, found {voxel}")
     return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
+
+
+def is_long_along_z(volume: DensityVolume) -> bool:
+    """Whether a volume has more voxels along z than along x and along y, as smoke has that rises along z."""
+    x, y, z = volume.shape
+    return z > max(x, y)
 
 
 def _turned(volume: DensityVolume, up: str) -> DensityVolume:

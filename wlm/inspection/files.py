@@ -38,6 +38,7 @@ _EXPORTS = {
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
     "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
     "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
+    "wlm-lightmap-layers-engine": "layered lightmaps over time for one engine: a folder for each sheet of light",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",
@@ -134,19 +135,20 @@ def _lmbake(path: Path) -> Finding:
 
 
 def _volume(path: Path) -> Finding:
-    from wlm.fluid.volume import load_volume
+    from wlm.fluid.volume import is_long_along_z, load_volume
 
-    volume = load_volume(path)
+    volume = load_volume(path, up="y")
     size = "x".join(map(str, volume.shape))
     hot = ", with temperature" if volume.temperature is not None else ""
     what = f"a volume of smoke, {size} voxels of {volume.voxel:.3g}{hot}"
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("no smoke in it")
-    x, y, z = volume.shape
-    if path.suffix.lower() != ".npz" and z > max(x, y):
-        problems.append("longest along z: if z is up in it, as in Blender and Unreal, add --up z")
-    return Finding(path, what, f"wlm smoke bake {quoted(path)} -o OUT.exr", tuple(problems))
+    up = ""
+    if path.suffix.lower() != ".npz" and is_long_along_z(volume):
+        up = " --up z"
+        problems.append("longest along z, which is taken for up, as in Blender and Unreal: without --up z if y is")
+    return Finding(path, what, f"wlm smoke bake {quoted(path)}{up} -o OUT.exr", tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:

@@ -53,7 +53,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.light import EXPECTED, read_light
+from wlm.formats.light import EXPECTED, SUFFIXES, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
@@ -151,9 +151,9 @@ def load(
         listing = list_folder(path, times)
     elif path.is_file():
         if path.suffix.lower() != ".json":
-            raise WlmError(
-                f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found a file of another kind"
-            )
+            lone = path.suffix.lower() in SUFFIXES
+            found = "one lightmap, which wlm atlas compress takes with its mesh" if lone else "a file of another kind"
+            raise WlmError(f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found {found}")
         listing = parse_set(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")

@@ -34,8 +34,9 @@ def missing_encoder(count: int) -> str | None:
     """What to tell of `count` tiles that would be stored as frames; None where the encoder is there."""
     if importlib.util.find_spec(_ENCODER) is not None:
         return None
+    tiles = "1 tile" if count == 1 else f"{count} tiles"
     return (
-        f"{count} tiles would be smaller and better as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
+        f"{tiles} would be smaller and better as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
         f"to them; needs the extra: pip install 'wlm[{EXTRA}]'"
     )
 

@@ -1,5 +1,4 @@
 # Light over the day, decoded by a compute shader on the rendering device. See README.md.
-class_name WlmLightmap
 extends Node
 
 @export_dir var folder := "res://lightmap"
@@ -31,7 +30,7 @@ func _ready() -> void:
 	_content = JSON.parse_string(FileAccess.get_file_as_string(folder.path_join("weights.json")))
 	_device = RenderingServer.get_rendering_device()
 	if _device == null:
-		push_error("WlmLightmap: expected the Forward+ or Mobile renderer")
+		push_error("wlm_lightmap.gd: expected the Forward+ or Mobile renderer")
 		set_process(false)
 		return
 	var state := RDSamplerState.new()

@@ -1,6 +1,5 @@
 ## Gives the meshes below this node their parts of the compressed lightmaps of a scene. See README.md.
 @tool
-class_name WlmScene
 extends Node
 
 ## The folder of the export.

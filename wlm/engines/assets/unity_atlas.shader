@@ -6,6 +6,7 @@ Shader "Wlm/Atlas"
         _MainTex ("Albedo", 2D) = "white" {}
         _Color ("Colour", Color) = (1, 1, 1, 1)
         [Toggle(WLM_FIRST_UV)] _First ("Light at the first UVs", Float) = 0
+        [Toggle(WLM_V_DOWN)] _Down ("UVs are v down, as glTF's", Float) = 0
     }
     SubShader
     {
@@ -17,6 +18,7 @@ Shader "Wlm/Atlas"
             #pragma vertex vert
             #pragma fragment frag
             #pragma shader_feature WLM_FIRST_UV
+            #pragma shader_feature WLM_V_DOWN
             #include "UnityCG.cginc"
             #include "WlmAtlas.hlsl"
 
@@ -39,6 +41,10 @@ Shader "Wlm/Atlas"
                 made.place = first;
             #else
                 made.place = second;
+            #endif
+            #ifndef WLM_V_DOWN
+                // Importers turn glTF's v round.
+                made.place.y = 1.0 - made.place.y;
             #endif
                 return made;
             }

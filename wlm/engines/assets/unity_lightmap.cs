@@ -15,8 +15,10 @@ public class WlmLightmap : MonoBehaviour
     public int lightmapIndex;
     [Tooltip("In the unit of the set's times, hours as a rule.")]
     public float time = 12f;
+    [Tooltip("For meshes whose UVs are as glTF has them, v down. Importers turn v round, and Unity's own lightmaps are v up.")]
+    public bool vDown;
 
-    /// Linear light at the time.
+    /// Linear light at the time, its picture's top at v = 1, or with vDown at v = 0.
     public RenderTexture Light { get; private set; }
 
     [Serializable]
@@ -36,6 +38,7 @@ public class WlmLightmap : MonoBehaviour
     readonly System.Collections.Generic.List<UnityEngine.Object> made = new();
     Texture2D table, shown;
     float drawn;
+    bool drawnDown;
 
     void OnEnable()
     {
@@ -77,15 +80,16 @@ public class WlmLightmap : MonoBehaviour
 
     void Update()
     {
-        if (content == null || time == drawn)
+        if (content == null || (time == drawn && vDown == drawnDown))
             return;
-        drawn = time;
+        (drawn, drawnDown) = (time, vDown);
         (int before, int after, float share) = Around(time);
         // The map that is wanted least makes room.
         int first = MapOf(before, after), second = share > 0f ? MapOf(after, before) : first;
         material.SetTexture("_WlmEarly", maps[first]);
         material.SetTexture("_WlmLate", maps[second]);
         material.SetFloat("_WlmShare", share);
+        material.SetFloat("_WlmDown", vDown ? 1f : 0f);
         Draw(2, Light);
         if (lightmapIndex < 0)
             return;

@@ -1,5 +1,5 @@
 // Passes of WlmLightmap.cs: decode, fill the gaps, mix two hours.
-Shader "Hidden/Wlm/Lightmap"
+Shader "Hidden/Wlm/Lightmap/@NAME@"
 {
     SubShader
     {
@@ -11,7 +11,7 @@ Shader "Hidden/Wlm/Lightmap"
         #include "WlmLightmap.hlsl"
 
         Texture2D<float4> _WlmMap, _WlmEarly, _WlmLate;
-        float _WlmShare;
+        float _WlmShare, _WlmDown;
 
         float4 vert(uint id : SV_VertexID) : SV_Position
         {
@@ -35,7 +35,12 @@ Shader "Hidden/Wlm/Lightmap"
             HLSLPROGRAM
             float4 frag(float4 at : SV_Position) : SV_Target
             {
+                uint width, height;
+                _WlmEarly.GetDimensions(width, height);
                 int3 texel = int3(at.xy, 0);
+                // The light's first row is its picture's top, which is v = 1 in Unity; a texture's first row is v = 0.
+                if (_WlmDown < 0.5)
+                    texel.y = int(height) - 1 - texel.y;
                 return lerp(_WlmEarly.Load(texel), _WlmLate.Load(texel), _WlmShare);
             }
             ENDHLSL

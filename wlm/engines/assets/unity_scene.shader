@@ -5,6 +5,7 @@ Shader "Wlm/Scene"
     {
         _MainTex ("Albedo", 2D) = "white" {}
         _Color ("Colour", Color) = (1, 1, 1, 1)
+        [Toggle(WLM_V_DOWN)] _Down ("UVs are v down, as glTF's", Float) = 0
     }
     SubShader
     {
@@ -15,6 +16,7 @@ Shader "Wlm/Scene"
             #pragma target 4.5
             #pragma vertex vert
             #pragma fragment frag
+            #pragma shader_feature WLM_V_DOWN
             #include "UnityCG.cginc"
             #include "WlmScene.hlsl"
 
@@ -36,6 +38,10 @@ Shader "Wlm/Scene"
                 made.position = UnityObjectToClipPos(position);
                 made.uv = TRANSFORM_TEX(first, _MainTex);
                 made.place = second;
+            #ifndef WLM_V_DOWN
+                // Importers turn glTF's v round.
+                made.place.y = 1.0 - made.place.y;
+            #endif
                 return made;
             }
 
