@@ -20,7 +20,7 @@ For each set these kinds of rows, but where another is named:
   ("ours") and the transform of 5% have them, whose figures are means and 95th percentiles of a frame. Its PSNR is that
   of what is read at probes near the viewer against the input, beside it that of the same probes as they were decoded,
   and of what is read farther away. It starts with an empty volume: what its first frame takes, and the frames until
-  nothing waits. The light's RMS is that of the probes that the volume was made from, which the volume's RMSE is against.
+  nothing waits. The light's RMS is that of the probes that the volume was made from, its RMSE is against these.
 - method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
