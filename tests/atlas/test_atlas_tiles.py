@@ -243,7 +243,7 @@ def test_curves_and_solved():
     # A curve is of what the file holds.
     coarse = grid.curves(tiles, [Size(4, 4, "bc6h"), Size(4, 4, "rgb9e5"), Size(4, 4, "half")])
     samples = grid.solve(tiles, 4, 4, grid._MEDIUM).clamp(min=0.0)
-    weight = torch.from_numpy(np.stack([grid._Grid(tiles, 4, 4).weights(tiles.weight).numpy()])[0])
+    weight = torch.from_numpy(np.stack([grid.sample_weights(tiles, 4, 4).numpy()])[0])
     of_blocks = grid.errors(tiles, stored(samples, weight, "bc6h")).numpy()
     np.testing.assert_allclose(coarse[0], of_blocks, rtol=1e-6)
     lit = coarse[2] > 0

@@ -115,6 +115,30 @@ class Decoder:
             uv = (self._corner[triangle.long()] * barycentric[:, :, None]).sum(1)
         return self.read(uv)
 
+    def texels(self, mesh: LightmappedMesh) -> torch.Tensor:
+        """Decodes the texels of the mask, as `lightmap`.
+
+        Args:
+            mesh: The mesh that was compressed.
+
+        Returns:
+            float32 [K, 3], row by row, on the decoder's device.
+
+        Raises:
+            WlmError: The model is of another mesh.
+        """
+        if len(self._corner):
+            return torch.from_numpy(self.lightmap(mesh)[mesh.mask]).to(self.device)
+        self._check(mesh)
+        height, width = mesh.mask.shape
+        step, parts = max(1, _TEXELS_AT_ONCE // width), []
+        for first in range(0, height, step):
+            inside = torch.from_numpy(mesh.mask[first : first + step]).to(self.device)
+            row, column = torch.nonzero(inside, as_tuple=True)
+            uv = torch.stack([(column.double() + 0.5) / width, (row.double() + first + 0.5) / height], 1)
+            parts.append(self.read(uv.float()))
+        return torch.cat(parts)
+
     def lightmap(self, mesh: LightmappedMesh) -> np.ndarray:
         """Decodes the lightmap in its original layout.
 
@@ -129,20 +153,18 @@ class Decoder:
             WlmError: The model is of another mesh.
         """
         height, width = mesh.mask.shape
-        if (height, width) != (self.model.height, self.model.width) or mesh.source != self.model.source:
-            raise WlmError(f"{mesh.name}: expected the mesh and lightmap that the model was made of")
         result = np.zeros((height, width, 3), np.float32)
         if not len(self._corner):
-            step = max(1, _TEXELS_AT_ONCE // width)
-            for first in range(0, height, step):
-                inside = mesh.mask[first : first + step]
-                row, column = torch.nonzero(torch.from_numpy(inside).to(self.device), as_tuple=True)
-                uv = torch.stack([(column.double() + 0.5) / width, (row.double() + first + 0.5) / height], 1)
-                result[first : first + step][inside] = self.read(uv.float()).cpu().numpy()
+            result[mesh.mask] = self.texels(mesh).cpu().numpy()
             return result
+        self._check(mesh)
         triangle, barycentric = texel_triangles(mesh, height, width, self.device)
         hit = triangle >= 0
         covered = hit.cpu().numpy()
         # A model with new UVs ignores the first argument.
         result[covered] = self(barycentric[hit], triangle[hit], corner_weights(barycentric[hit])).cpu().numpy()
         return fill_gaps(result, covered) * mesh.mask[..., None] if covered.any() else result
+
+    def _check(self, mesh: LightmappedMesh) -> None:
+        if mesh.mask.shape != (self.model.height, self.model.width) or mesh.source != self.model.source:
+            raise WlmError(f"{mesh.name}: expected the mesh and lightmap that the model was made of")

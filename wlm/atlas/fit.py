@@ -103,7 +103,8 @@ def compress(
             model = replace(model, tail=make_tail(mesh, tail_codec(model.colour), device))
     check_area(mesh.mask.shape, model.texels.shape[:2], model.lut.shape[:2])
     lost = LostLight()
-    lost.add(mesh.lightmap[mesh.mask], Decoder(model, device).lightmap(mesh)[mesh.mask])
+    inside = torch.from_numpy(mesh.mask).to(device)
+    lost.add(torch.from_numpy(mesh.lightmap).to(device)[inside], Decoder(model, device).texels(mesh))
     if warnings := lost.warnings(mesh.name, "texel", "the lightmap"):
         model = replace(model, report=model.report | {"lost light": warnings})
     return replace(model, report=model.report | {"seconds": stages.seconds})

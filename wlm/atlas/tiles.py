@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wlm import interop
 from wlm.atlas import colour
 from wlm.atlas.layout import Size, composed, layout, sizes_of
 from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tail_bits, tile_counts
@@ -23,7 +24,9 @@ from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part, check_parts
+from wlm.ops.tensors import on_stream
 from wlm.system import Meter, OnProgress
+from wlm_kernels.atlas import solve as kernels
 
 SUPERSAMPLING = 2
 """Points per texel and axis that a tile is fitted to."""
@@ -192,8 +195,7 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Solves for the samples of least weighted squared error, at one size for all tiles.
 
-    Conjugate gradients on the normal equations, all tiles at once, from the solution with equal weights, which is a
-    product of two pseudoinverses.
+    Conjugate gradients on the normal equations from the solution with equal weights, each channel of a tile for itself.
 
     Args:
         tiles: T of them.
@@ -203,69 +205,65 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     Returns:
         float [T, ny, nx, 3].
     """
-    grid, weight = _Grid(tiles, nx, ny), tiles.weight[:, None] / tiles.weight.mean(1)[:, None, None]
-    weight, light = grid.turned(weight), grid.turned(tiles.light)
-    ridge = _RIDGE * weight.shape[-1] ** 2 / (nx * ny)
-    diagonal = grid.gathered(weight) + ridge
-    start = grid.gathered(light, inverse=True)
-    # In terms of the difference to the start, towards which the ridge pulls.
-    change = torch.zeros_like(start)
-    residual = grid.gathered((light - grid.spread(start)) * weight)
-    preconditioned = residual / diagonal
-    direction, energy = preconditioned, (residual * preconditioned).sum((2, 3), keepdim=True)
-    # In exact arithmetic as many rounds as samples are enough.
-    for _ in range(min(rounds, 2 * nx * ny)):
-        image = grid.gathered(grid.spread(direction) * weight) + ridge * direction
-        step = energy / (direction * image).sum((2, 3), keepdim=True).clamp(min=1e-30)
-        change = change + step * direction
-        residual = residual - step * image
-        preconditioned = residual / diagonal
-        before, energy = energy, (residual * preconditioned).sum((2, 3), keepdim=True)
-        direction = preconditioned + energy / before.clamp(min=1e-30) * direction
-    return (start + change).permute(0, 2, 3, 1)
+    with on_stream(tiles.light.device):
+        grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
+        light, weight = (interop.to_warp(_laid_out(each)) for each in (tiles.light, tiles.weight))
+        scale = interop.to_warp(1.0 / tiles.weight.mean(1))
+        system = kernels.System()
+        system.own, system.right, system.down, system.cross, system.diagonal = (
+            interop.to_warp(space(nx * ny)) for _ in range(5)
+        )
+        kernels.gather_system(weight, scale, grid, system)
+        start = space(3, nx * ny)
+        kernels.gather(light, grid, interop.to_warp(start))
+        # Of equal weights the equations fall apart into those of the axes.
+        across, down = (_axis(samples, grid.points, str(start.device))[2] for samples in (nx, ny))
+        start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
+        *work, out = (space(3, nx * ny) for _ in range(4))
+        ridge = _RIDGE * grid.points**2 / (nx * ny)
+        arrays = [interop.to_warp(each) for each in (start, *work, out)]
+        # In exact arithmetic as many rounds as samples are enough.
+        rounds = min(rounds, 2 * nx * ny)
+        kernels.solve(light, weight, scale, grid, system, ridge, rounds, arrays[0], arrays[1:4], arrays[4])
+    return out.unflatten(2, (ny, nx)).permute(0, 2, 3, 1)
+
+
+def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
+    """nx x ny samples of tiles, for kernels."""
+    grid = kernels.Grid()
+    grid.points, grid.nx, grid.ny = SUPERSAMPLING * tiles.size, nx, ny
+    axes = [_axis(samples, grid.points, str(tiles.light.device)) for samples in (nx, ny)]
+    (grid.first_x, grid.share_x), (grid.first_y, grid.share_y) = (
+        [interop.to_warp(part) for part in axis[:2]] for axis in axes
+    )
+    return grid
+
+
+def _laid_out(values: torch.Tensor) -> torch.Tensor:
+    """Values [T, ...] with tiles last in the memory of a GPU, whose threads read one place of many tiles at once."""
+    if values.device.type == "cpu":
+        return values.contiguous()
+    return values.movedim(0, -1).contiguous().movedim(-1, 0)
+
+
+def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
+    """float [T, ...], `_laid_out`."""
+    count, device = len(tiles.index), tiles.light.device
+    if device.type == "cpu":
+        return torch.empty((count, *shape))
+    return torch.empty((*shape, count), device=device).movedim(-1, 0)
 
 
 @functools.cache
-def _maps(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """`linear`, and the transpose of its pseudoinverse; on GPUs that would take longer than all else."""
+def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Along an axis: the sample before each point, the share of the next one, and the inverse of the products of
+    interpolation's columns; on GPUs that would take longer than all else."""
     matrix = linear(samples, points)
-    return matrix.to(device), torch.linalg.pinv(matrix).T.contiguous().to(device)
-
-
-class _Grid:
-    """Interpolation from nx x ny samples to the points of tiles, axis by axis; images of points are turned: x, then y.
-
-    Args:
-        tiles: T of them.
-        nx, ny: Samples along x and y.
-    """
-
-    def __init__(self, tiles: Tiles, nx: int, ny: int) -> None:
-        self.points = SUPERSAMPLING * tiles.size
-        device = str(tiles.light.device)
-        (self.across, self._left), (self.down, self._right) = (
-            _maps(samples, self.points, device) for samples in (nx, ny)
-        )
-
-    def turned(self, values: torch.Tensor) -> torch.Tensor:
-        """Values [T, C, m * m], row by row, as [T, C, m, m], column by column."""
-        return values.unflatten(2, (self.points, self.points)).transpose(2, 3).contiguous()
-
-    def spread(self, samples: torch.Tensor) -> torch.Tensor:
-        """Samples [T, C, ny, nx] at the points."""
-        return (samples @ self.across.T).transpose(2, 3) @ self.down.T
-
-    def gathered(self, values: torch.Tensor, inverse: bool = False) -> torch.Tensor:
-        """Values at the points, taken back to the samples [T, C, ny, nx] by the transpose, or the pseudoinverse."""
-        across, down = self.across, self.down
-        if inverse:
-            across, down = self._left, self._right
-        return (values @ down).transpose(2, 3) @ across
-
-    def weights(self, weight: torch.Tensor) -> torch.Tensor:
-        """How much each sample's own squared error counts [T, ny, nx], of the points' weights [T, m * m]."""
-        values = self.turned(weight[:, None])
-        return ((values @ self.down.square()).transpose(2, 3) @ self.across.square())[:, 0]
+    place = (torch.arange(points) + 0.5) / points * (samples - 1)
+    first = place.floor().clamp(max=max(samples - 2, 0))
+    share = place - first
+    inverse = torch.linalg.inv(matrix.double().T @ matrix.double())
+    return first.int().to(device), share.float().to(device), inverse.float().to(device)
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
@@ -275,22 +273,27 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
         tiles: T of them.
         samples: float [T, ny, nx, 3].
     """
-    grid = _Grid(tiles, samples.shape[2], samples.shape[1])
-    interpolated = grid.spread(samples.permute(0, 3, 1, 2))
-    squared = (interpolated - grid.turned(tiles.light)).square().mean(1, keepdim=True)
-    return (squared * grid.turned(tiles.weight[:, None])).double().sum((1, 2, 3))
+    result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
+    flat = samples.permute(0, 3, 1, 2).flatten(2)
+    with on_stream(samples.device):
+        light, weight, stored = (interop.to_warp(_laid_out(each)) for each in (tiles.light, tiles.weight, flat))
+        grid = _grid(tiles, samples.shape[2], samples.shape[1])
+        kernels.errors(light, weight, grid, stored, interop.to_warp(result))
+    return result.mean(1)
 
 
 def remainder(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
     """What samples [T, ny, nx, 3] have above the light at the points, float [T, 3, m * m]."""
-    grid = _Grid(tiles, samples.shape[2], samples.shape[1])
-    rest = grid.spread(samples.permute(0, 3, 1, 2)) - grid.turned(tiles.light)
-    return rest.transpose(2, 3).flatten(2)
+    points, device = SUPERSAMPLING * tiles.size, str(samples.device)
+    down, across = (linear(count, points, device) for count in samples.shape[1:3])
+    return (down @ samples.permute(0, 3, 1, 2) @ across.T).flatten(2) - tiles.light
 
 
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
     """How much each sample's own squared error counts, float [T, ny, nx]."""
-    return _Grid(tiles, nx, ny).weights(tiles.weight)
+    points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
+    down, across = (linear(count, points, device).square() for count in (ny, nx))
+    return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
 
 
 def curves(
@@ -318,6 +321,7 @@ def curves(
 
     if checkpoint is not None:
         checkpoint.restore(0, load)
+    pieces = list(_pieces(tiles))
     for i, size in enumerate(sizes[begin:], begin):
         if meter.due(i):
             try:
@@ -327,9 +331,9 @@ def curves(
                     checkpoint.save_running(0, {"error": result[:i]})
                 raise
         rounds = _ROUGH if size.step == 1 else _MEDIUM
-        for part, piece in _pieces(tiles):
+        for part, piece in pieces:
             samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
-            weight = _Grid(piece, size.nx, size.ny).weights(piece.weight)
+            weight = sample_weights(piece, size.nx, size.ny)
             result[i, part] = errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy()
         if checkpoint is not None and checkpoint.due():
             checkpoint.save_running(0, {"error": result[: i + 1]})
@@ -355,7 +359,7 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
         group = Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
         for part, piece in _pieces(group):
             values = solve(piece, size.nx, size.ny).clamp(min=0.0).cpu().numpy()
-            weight = _Grid(piece, size.nx, size.ny).weights(piece.weight).cpu().numpy()
+            weight = sample_weights(piece, size.nx, size.ny).cpu().numpy()
             result.append((members[part], values, weight))
     return result
 
@@ -364,4 +368,4 @@ def _pieces(tiles: Tiles) -> Iterator[tuple[slice, Tiles]]:
     step = _AT_ONCE if tiles.light.device.type == "cpu" else _AT_ONCE_CUDA
     for first in range(0, len(tiles.index), step):
         part = slice(first, first + step)
-        yield part, Tiles(tiles.index[part], tiles.light[part], tiles.weight[part], tiles.size)
+        yield part, Tiles(tiles.index[part], _laid_out(tiles.light[part]), _laid_out(tiles.weight[part]), tiles.size)

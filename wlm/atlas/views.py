@@ -84,12 +84,14 @@ def visibility(
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1, got {height} and {width}")
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
+    # Pixels without a triangle count as nothing, each in a cell of its own: choosing the others would wait for the GPU.
+    own = torch.arange(resolution**2, device=count.device) % count.numel()
     for visible, _, uv in visible_uv(mesh, views, resolution, device):
-        u, v = uv[visible >= 0].double().T
+        u, v = uv.reshape(-1, 2).double().T
         column = (u * width).long().clamp(0, width - 1)
         row = (v * height).long().clamp(0, height - 1)
-        cell = row * width + column
-        count.index_add_(0, cell, torch.ones_like(cell))
+        seen = visible.reshape(-1) >= 0
+        count.index_add_(0, torch.where(seen, row * width + column, own), seen.long())
     return count.reshape(height, width).double()
 
 

@@ -1,15 +1,21 @@
 """BC6H and ASTC blocks of 16 bytes, by the packages of an extra: half-float RGB in and out.
 
-Blocks follow each other row by row. All runs on the CPU with one thread. The packages are imported when they are used.
+Blocks follow each other row by row. All runs on the CPU, ASTC's encoder in threads. The packages are imported when they
+are used.
 """
 
 import functools
 import importlib
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.workers import cores, each
 
 BC6H_PROFILES = ("veryfast", "fast", "basic", "slow", "veryslow")
 ASTC_BLOCKS = (
@@ -22,6 +28,7 @@ ASTC_MEDIUM = 60.0
 ASTC_THOROUGH = 98.0
 # Beyond any block's PSNR: in the LDR profile the presets stop a block's search at 29 to 32 dB.
 _NO_LIMIT_DB = 999.0
+_TEXELS_A_THREAD = 4096  # at least: some 20 ms of work
 
 
 def need(package: str, extra: str) -> ModuleType:
@@ -71,20 +78,42 @@ class Astc:
         config = codec.ASTCConfig(profile, *block, 1, quality)
         if ldr:
             config.tune_db_limit = _NO_LIMIT_DB  # HDR has no such stop
-        self._codec, self._context = codec, codec.ASTCContext(config, 1)
+        self._codec, self._config, self._rows = codec, config, block[1]
+        self._idle: list[Any] = []  # contexts, each for one thread at a time
 
     def encode(self, texels: np.ndarray) -> bytes:
-        """Encodes half [H, W, 3], finite, not negative, in LDR up to 1; astcenc repeats the border to whole blocks."""
+        """Encodes half [H, W, 3], finite, not negative, in LDR up to 1; astcenc repeats the border to whole blocks.
+
+        Threads take some rows of blocks each; the bytes are the same for any number of them.
+        """
         codec, (height, width) = self._codec, texels.shape[:2]
-        source = codec.ASTCImage(codec.ASTCType.F16, width, height, 1, _with_alpha(texels).tobytes())
-        return self._context.compress(source, codec.ASTCSwizzle.from_str("RGB1"))
+        least = self._rows * math.ceil(_TEXELS_A_THREAD / (self._rows * width))
+        step = max(least, self._rows * math.ceil(height / (self._rows * cores())))
+
+        def strip(first: int) -> bytes:
+            part = texels[first : first + step]
+            source = codec.ASTCImage(codec.ASTCType.F16, width, len(part), 1, _with_alpha(part).tobytes())
+            with self._context() as context:
+                return context.compress(source, codec.ASTCSwizzle.from_str("RGB1"))
+
+        return b"".join(each(strip, range(0, height, step)))
 
     def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
         """Decodes to half [H, W, 3]; blocks that break the format are NaN in HDR, magenta in LDR."""
         codec = self._codec
         target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
-        self._context.decompress(blocks, target, codec.ASTCSwizzle.from_str("RGBA"))
+        with self._context() as context:
+            context.decompress(blocks, target, codec.ASTCSwizzle.from_str("RGBA"))
         return np.frombuffer(target.data, np.float16).reshape(height, width, 4)[..., :3]
+
+    @contextmanager
+    def _context(self) -> Iterator[Any]:
+        try:
+            context = self._idle.pop()
+        except IndexError:
+            context = self._codec.ASTCContext(self._config, 1)
+        yield context
+        self._idle.append(context)
 
 
 def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:

@@ -5,6 +5,7 @@ stays, and the others vanish.
 """
 
 import numpy as np
+import torch
 
 _BRIGHT = 0.5  # of the largest: what counts as among the brightest
 _KEPT = 0.5  # of its own: what is left of light that isn't lost; and by how much of its own light a point is off
@@ -25,29 +26,30 @@ class LostLight:
         self.count = self.hidden = 0
         self.worst: tuple[float, float, str] | None = None
 
-    def add(self, reference: np.ndarray, decoded: np.ndarray, where: str = "") -> None:
+    def add(self, reference: np.ndarray | torch.Tensor, decoded: np.ndarray | torch.Tensor, where: str = "") -> None:
         """Looks at a group: a tile at one time, or a whole set.
 
         Args:
-            reference, decoded: [K, C]; a point's light is the largest magnitude of its channels.
+            reference, decoded: [K, C], on one device; a point's light is the largest magnitude of its channels.
             where: Words for the group in the warning.
         """
         if not len(reference):
             return
+        reference, decoded = torch.as_tensor(reference), torch.as_tensor(decoded)
         light, kept = _largest(reference), _largest(decoded)
         if not (largest := light.max()) > 0:
             return
         lost = (light >= _BRIGHT * largest) & (kept < _KEPT * light)
-        if lost.any():
-            self.count += int(np.count_nonzero(lost))
-            worst = int(np.argmax(np.where(lost, light, 0.0)))
+        if count := int(lost.count_nonzero()):
+            self.count += count
+            worst = int(torch.where(lost, light, 0.0).argmax())
             if self.worst is None or light[worst] > self.worst[0]:
                 self.worst = float(light[worst]), float(kept[worst]), where
-        if largest > _BRIGHTER * np.median(light):
+        if largest > _BRIGHTER * light.median():
             lit = light > 0
-            off = _largest(decoded - reference)[lit] > _KEPT * light[lit]
-            if 2 * np.count_nonzero(off) > len(off):
-                self.hidden += int(np.count_nonzero(off))
+            off = int(((_largest(decoded - reference) > _KEPT * light) & lit).count_nonzero())
+            if 2 * off > int(lit.count_nonzero()):
+                self.hidden += off
 
     def warnings(self, name: str, point: str, group: str) -> list[str]:
         """A line for each kind of loss that there was.
@@ -71,11 +73,11 @@ class LostLight:
         return lines
 
 
-def _largest(values: np.ndarray) -> np.ndarray:
+def _largest(values: torch.Tensor) -> torch.Tensor:
     """The largest magnitude of each row's channels [K]; column by column, which is faster than row by row."""
-    result = np.abs(values[:, 0])
+    result = values[:, 0].abs()
     for channel in range(1, values.shape[1]):
-        np.maximum(result, np.abs(values[:, channel]), out=result)
+        torch.maximum(result, values[:, channel].abs(), out=result)
     return result
 
 

@@ -15,9 +15,12 @@ from typing import Self
 
 import numpy as np
 import torch
+import warp as wp
 
-from wlm.interop import check_device
-from wlm.ops import raster as ops_raster
+from wlm.interop import StepGraph, check_device, to_warp, torch_memory
+from wlm.ops.tensors import check_index
+from wlm_kernels.raster import gradient, rasterize
+from wlm_kernels.raster.rasterize import MOST_PIXELS
 
 DISTANCE = 3.0
 """Distance of a camera from the origin."""
@@ -191,14 +194,37 @@ def visible_points(
         ValueError: The resolution is out of range.
     """
     device = check_device(device)
+    if not 1 <= resolution <= MOST_PIXELS:
+        raise ValueError(f"resolution: expected 1 to {MOST_PIXELS}, got {resolution}")
     scaled = normalised(position, triangle)
-    corner = torch.tensor(triangle.astype(np.int32), device=device)
-    coordinate = torch.tensor(uv, dtype=torch.float32, device=device)
+    draw = _Drawing(triangle, uv, resolution, cull, device)
     for view in views:
-        with torch.no_grad():
-            inside = isinstance(view, Viewpoint)
-            clip = clip_from(position, view.eye, view.forward) if inside else clip_positions(scaled, view)
-            clip = torch.tensor(clip, device=device)
-            raster = ops_raster.rasterize(clip, corner, resolution, resolution, cull=cull)
-            seen = ops_raster.interpolate(coordinate, corner, raster)
-        yield raster.triangle, raster.barycentric, seen
+        inside = isinstance(view, Viewpoint)
+        yield draw(clip_from(position, view.eye, view.forward) if inside else clip_positions(scaled, view))
+
+
+class _Drawing:
+    """A mesh that is drawn many times: checked and allocated for once, on CUDA one graph."""
+
+    def __init__(self, triangle: np.ndarray, uv: np.ndarray, resolution: int, cull: bool, device: str) -> None:
+        corner = torch.tensor(triangle.astype(np.int32), device=device)
+        check_index("triangle", corner, len(uv), (None, 3), corner.device)
+        coordinate = torch.tensor(uv, dtype=torch.float32, device=device)
+        self._clip = torch.empty((len(uv), 4), dtype=torch.float32, device=device)
+        self._seen = torch.empty((resolution, resolution, 2), dtype=torch.float32, device=device)
+        empty = torch_memory(corner.device)
+        self._rasterizer = rasterize.Rasterizer(to_warp(corner), resolution, resolution, cull=cull, empty=empty)
+        self._arrays = to_warp(self._clip), to_warp(coordinate), to_warp(corner), to_warp(self._seen)
+        raster = self._rasterizer.raster
+        self._pictures = wp.to_torch(raster.triangle), wp.to_torch(raster.barycentric), self._seen
+        self._step = StepGraph(self._draw, device)
+
+    def __call__(self, clip: np.ndarray) -> tuple[torch.Tensor, ...]:
+        self._clip.copy_(torch.from_numpy(clip))
+        self._step()
+        return tuple(picture.clone() for picture in self._pictures)
+
+    def _draw(self) -> None:
+        clip, coordinate, corner, seen = self._arrays
+        raster = self._rasterizer.run(clip)
+        gradient.interpolate(coordinate, corner, raster.triangle, raster.barycentric, seen)

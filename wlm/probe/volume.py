@@ -219,8 +219,13 @@ class Volume:
         work.chosen, work.taken = full(budget, int, -1), full(budget, int, -1)
         work.begin = full((budget, frame_kernels.HALVES), int, 0)
         work.count = full((budget, frame_kernels.HALVES), int, 0)
-        work.numbers, work.weights = reader.numbers, full((budget, frame_kernels.PROBES), float, 0.0)
+        work.picked, work.noise = full(budget, int, 0), full(budget, float, 0.0)
+        block = (budget, frame_kernels.PROBES)
+        work.places, work.hats = full(block, wp.vec4, wp.vec4()), full(block, float, 0.0)
+        work.rows = full(block, frame_kernels.Row, frame_kernels.Row())
+        work.numbers, work.weights = reader.numbers, full(block, float, 0.0)
         self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        self._look = frame_kernels.Look(windows, work)
         self._nowhere = full(0, wp.vec3, wp.vec3())
         self._pool = full((rows, self.channels), float, 0.0)
 
@@ -294,12 +299,9 @@ class Volume:
         kept = np.maximum(self.side - np.abs(base - self._base), 0).prod(1).sum() if self._viewpoint is not None else 0
         self._viewpoint, self._base = viewpoint, base
         self._frame += 1
-        bases, views = frame_kernels.Bases(), frame_kernels.Views()
-        for level, (first, place) in enumerate(zip(base.tolist(), at.tolist(), strict=True)):
-            middle = [p - (b + self.side // 2) - 0.5 for p, b in zip(place, first, strict=True)]
-            bases[level], views[level] = wp.vec3i(*first), wp.vec4(*middle, 1.0 / self.sizes[level])
+        views = np.column_stack([at - (base + self.side // 2) - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            frame_kernels.look(bases, views, wp.vec3(*ahead.tolist()), self._frame, self._windows, self._frame_work)
+            self._look(base, views, ahead, self._frame)
             self._step()
         return len(self.sizes) * self.side**3 - int(kept)
 

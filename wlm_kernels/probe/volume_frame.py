@@ -13,6 +13,7 @@ The launches of a frame, whose sizes never change, so that a graph can hold them
 5. `combine` makes the block's light of theirs, at most half of their range beyond them.
 """
 
+import numpy as np
 import warp as wp
 
 from wlm_kernels.probe.volume import wrap
@@ -41,6 +42,8 @@ _M0, _M1, _M2, _M3, _M4 = (
 )
 
 vec16i = wp.types.vector(length=16, dtype=int)
+
+Row = wp.types.vector(length=PROBES, dtype=float)
 
 LEVELS = 8
 Bases = wp.types.matrix(shape=(LEVELS, 3), dtype=int)
@@ -124,6 +127,11 @@ class Work:
         chosen: [B], slots, or -1.
         taken: [B], rows of the pool, or -1.
         begin, count: [B, 64], ranges of the index.
+        picked: [B], how many probes decide a block, 16 at most.
+        noise: [B], variance of what each of them says.
+        places: [B, 16], of the probes, in sides from the block's centre, and the noise that each has beyond that.
+        rows: [B, 16], covariance of each with those before it and itself, then 0.
+        hats: [B, 16], its covariance with the block.
         numbers: [B * 16], probes.
         weights: [B, 16].
     """
@@ -138,6 +146,11 @@ class Work:
     taken: wp.array1d[int]
     begin: wp.array2d[int]
     count: wp.array2d[int]
+    picked: wp.array1d[int]
+    noise: wp.array1d[float]
+    places: wp.array2d[wp.vec4]
+    rows: wp.array2d[Row]
+    hats: wp.array2d[float]
     numbers: wp.array1d[int]
     weights: wp.array2d[float]
 
@@ -401,18 +414,37 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
     out[i] = points[numbers[i]]
 
 
-def look(bases: Bases, views: Views, forward, frame: int, windows: Windows, work: Work) -> None:
+class Look:
     """Takes a frame's windows and number; what changes from frame to frame is in the arguments of this launch alone.
 
+    Made once for a volume, since packing all arguments anew takes longer than the launch.
+
     Args:
-        bases: First block of each window, in the index's numbers.
-        views: See `Windows`.
-        forward: vec3, where the viewer looks, of unit length; 0: nowhere.
-        frame: The frame's number, rising.
-        windows, work: Written.
+        windows, work: Written by every launch.
     """
-    count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
-    wp.launch(_look, count, inputs=[bases, views, forward, frame, windows, work], device=work.clock.device)
+
+    def __init__(self, windows: Windows, work: Work) -> None:
+        count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
+        self._bases, self._views = np.zeros((LEVELS, 3), np.int32), np.zeros((LEVELS, 4), np.float32)
+        # The launch's arguments are these arrays' memory: making them of 56 numbers would take 20 microseconds a frame.
+        first = [Bases.from_buffer(self._bases), Views.from_buffer(self._views), wp.vec3(), 0]
+        self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
+
+    def __call__(self, bases: np.ndarray, views: np.ndarray, forward: np.ndarray, frame: int) -> None:
+        """Launches it on the current stream.
+
+        Args:
+            bases: Whole numbers [L, 3], first block of each window, in the index's numbers.
+            views: [L, 4], see `Windows`.
+            forward: [3], where the viewer looks, of unit length; 0: nowhere.
+            frame: The frame's number, rising.
+        """
+        self._bases[: len(bases)], self._views[: len(views)] = bases, views
+        self._launch.set_param_at_index(0, Bases.from_buffer(self._bases))
+        self._launch.set_param_at_index(1, Views.from_buffer(self._views))
+        self._launch.set_param_at_index(2, wp.vec3(*forward.tolist()))
+        self._launch.set_param_at_index(3, frame)
+        self._launch.launch()
 
 
 def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:

@@ -16,7 +16,7 @@ its noise is 3 d^2 more. So a block takes the probes on its own side of a wall, 
 
 import warp as wp
 
-from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Windows, Work
+from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Row, Windows, Work
 
 wp.set_module_options({"max_unroll": 1})  # a system of 16 unrolled would take minutes to compile
 
@@ -30,8 +30,6 @@ _NOISE = wp.constant(0.03)
 _MOST_NOISE = wp.constant(10.0)  # times as much
 
 _Square = wp.types.matrix(shape=(PROBES, PROBES), dtype=float)
-_Places = wp.types.matrix(shape=(PROBES, 3), dtype=float)
-_Vector = wp.types.vector(length=PROBES, dtype=float)
 
 
 @wp.func
@@ -51,87 +49,107 @@ def _overlap(x: float, y: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def _weigh(index: Index, windows: Windows, side: int, work: Work):
-    k = wp.tid()
+def _pick(index: Index, windows: Windows, side: int, work: Work):
+    """One probe of a block a thread."""
+    k, i = wp.tid()
     total = int(0)
     for j in range(_HALVES):
         total += work.count[k, j]
     count = wp.min(total, _PROBES)
-    wp.atomic_add(work.counters, _DECODED, count)
-    x = _Places()
-    doubt = _Vector()
-    if count > 0:
-        slot = work.chosen[k]
-        ratio = index.ratios[slot // (side * side * side)]
-        middle = ratio * (2 * windows.held[slot] + wp.vec3i(1, 1, 1))
-        scale = 0.5 / float(ratio)
-        i = int(0)
+    if i == 0:
+        wp.atomic_add(work.counters, _DECODED, count)
+        work.picked[k] = count
+        work.noise[k] = _NOISE * wp.clamp(float(total) / float(_PROBES), 1.0, _MOST_NOISE)
+    number = int(0)
+    if i < count:
+        # Every n-th of all, so that a block with many is decided by some from all over it.
+        at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))
+        p = int(-1)
         passed = int(0)
-        at = int(0)
         for j in range(_HALVES):
             here = work.count[k, j]
-            # Every n-th of all, so that a block with many is decided by some from all over it.
-            at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))
-            while i < count and at < passed + here:
+            if p < 0 and at < passed + here:
                 p = work.begin[k, j] + at - passed
-                cell = index.cell[p] - middle
-                place = index.place[p]
-                behind = float(0.0)
-                for a in range(3):
-                    x[i, a] = scale * (float(cell[a]) + place[a])
-                    behind += index.normal[p][a] * x[i, a]
-                doubt[i] = _DOUBT * wp.max(behind, 0.0) * wp.max(behind, 0.0)
-                work.numbers[k * _PROBES + i] = index.number[p]
-                i += 1
-                at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))
             passed += here
-    # Two systems: for the covariance with the block, and for ones.
-    noise = _NOISE * wp.clamp(float(total) / float(_PROBES), 1.0, _MOST_NOISE)
-    lower = _Square()
-    u = _Vector()
-    v = _Vector()
-    for i in range(count):
-        u[i] = (1.0 - wp.abs(x[i, 0])) * (1.0 - wp.abs(x[i, 1])) * (1.0 - wp.abs(x[i, 2]))
-        distance = wp.sqrt(x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1] + x[i, 2] * x[i, 2])
-        u[i] = u[i] + _SMOOTH * wp.exp(-distance / _LENGTH)
-        v[i] = 1.0
+        slot = work.chosen[k]
+        ratio = index.ratios[slot // (side * side * side)]
+        cell = index.cell[p] - ratio * (2 * windows.held[slot] + wp.vec3i(1, 1, 1))
+        place = index.place[p]
+        x = wp.vec3(float(cell[0]) + place[0], float(cell[1]) + place[1], float(cell[2]) + place[2]) * (
+            0.5 / float(ratio)
+        )
+        behind = wp.max(wp.dot(index.normal[p], x), 0.0)
+        work.places[k, i] = wp.vec4(x[0], x[1], x[2], _DOUBT * behind * behind)
+        number = index.number[p]
+    work.numbers[k * _PROBES + i] = number
+
+
+@wp.kernel(enable_backward=False)
+def _relate(work: Work):
+    """The covariance of one probe with those before it, itself and the block, a thread."""
+    k, i = wp.tid()
+    if i < work.picked[k]:
+        x = work.places[k, i]
+        hat = (1.0 - wp.abs(x[0])) * (1.0 - wp.abs(x[1])) * (1.0 - wp.abs(x[2]))
+        work.hats[k, i] = hat + _SMOOTH * wp.exp(-wp.length(wp.vec3(x[0], x[1], x[2])) / _LENGTH)
+        row = Row()
         for j in range(i + 1):
-            d = wp.vec3(x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2])
-            s = _overlap(x[i, 0], x[j, 0]) * _overlap(x[i, 1], x[j, 1]) * _overlap(x[i, 2], x[j, 2])
+            y = work.places[k, j]
+            d = wp.vec3(x[0] - y[0], x[1] - y[1], x[2] - y[2])
+            s = _overlap(x[0], y[0]) * _overlap(x[1], y[1]) * _overlap(x[2], y[2])
             s += _SMOOTH * wp.exp(-wp.length(d) / _LENGTH)
             if i == j:
-                s += noise + doubt[i]
-            for m in range(j):
-                s -= lower[i, m] * lower[j, m]
-            if i == j:
-                lower[i, i] = wp.sqrt(s)
-            else:
-                lower[i, j] = s / lower[j, j]
-        for m in range(i):
-            u[i] = u[i] - lower[i, m] * u[m]
-            v[i] = v[i] - lower[i, m] * v[m]
-        u[i] = u[i] / lower[i, i]
-        v[i] = v[i] / lower[i, i]
+                s += work.noise[k] + x[3]
+            row[j] = s
+        work.rows[k, i] = row
+
+
+@wp.kernel(enable_backward=False)
+def _weigh(work: Work):
+    """The weights of one block a thread, by Cholesky's decomposition; entries of rows that aren't known yet are 0."""
+    k = wp.tid()
+    count = work.picked[k]
+    lower = _Square()
+    # Two systems: for the covariance with the block, and for ones.
+    u = Row()
+    v = Row()
+    for i in range(count):
+        related = work.rows[k, i]
+        row = Row()
+        for j in range(i):
+            before = lower[j]
+            row[j] = (related[j] - wp.dot(before, row)) / before[j]
+        diagonal = wp.sqrt(related[i] - wp.dot(row, row))
+        u[i] = (work.hats[k, i] - wp.dot(row, u)) / diagonal
+        v[i] = (1.0 - wp.dot(row, v)) / diagonal
+        row[i] = diagonal
+        lower[i] = row
     sum_u = float(0.0)
     sum_v = float(0.0)
     for r in range(count):
         i = count - 1 - r
-        for m in range(i + 1, count):
-            u[i] = u[i] - lower[m, i] * u[m]
-            v[i] = v[i] - lower[m, i] * v[m]
-        u[i] = u[i] / lower[i, i]
-        v[i] = v[i] / lower[i, i]
-        sum_u += u[i]
-        sum_v += v[i]
+        row = lower[i]
+        a = u[i] / row[i]
+        b = v[i] / row[i]
+        u -= a * row
+        v -= b * row
+        u[i] = a
+        v[i] = b
+        sum_u += a
+        sum_v += b
     for i in range(_PROBES):
+        weight = float(0.0)
         if i < count:
-            work.weights[k, i] = u[i] + (1.0 - sum_u) / sum_v * v[i]
-        else:
-            work.weights[k, i] = 0.0
-            work.numbers[k * _PROBES + i] = 0
+            weight = u[i] + (1.0 - sum_u) / sum_v * v[i]
+        work.weights[k, i] = weight
 
 
 def weigh(index: Index, windows: Windows, side: int, work: Work) -> None:
-    """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found."""
-    inputs = [index, windows, side, work]
-    wp.launch(_weigh, work.chosen.shape, inputs=inputs, block_dim=32, device=work.clock.device)
+    """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found.
+
+    In three launches, of which only the last has one thread a block: it is what the frame waits for.
+    """
+    device = work.clock.device
+    wp.launch(_pick, work.weights.shape, inputs=[index, windows, side, work], block_dim=32, device=device)
+    wp.launch(_relate, work.weights.shape, inputs=[work], block_dim=32, device=device)
+    wp.launch(_weigh, work.chosen.shape, inputs=[work], block_dim=32, device=device)

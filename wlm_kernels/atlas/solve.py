@@ -1,0 +1,291 @@
+"""Samples of tiles by weighted least squares: a thread for each tile, or for each channel of one.
+
+A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample with its eight
+neighbours alone, so that they are gathered from the points once, and a round of conjugate gradients is over samples.
+
+Arrays may have any strides: on CUDA those along the tiles should be 1.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+MOST = 16  # samples along an axis
+_BLOCK = 64  # threads: few tiles should reach all of a GPU
+
+_Row = wp.types.vector(length=MOST, dtype=float)
+_TINY = wp.constant(1e-30)
+
+
+@wp.struct
+class Grid:
+    """Samples and points of a tile.
+
+    Attributes:
+        points: m.
+        nx, ny: Samples, `MOST` at most.
+        first_x, first_y: [m], the sample before each point; 0 where there is one alone.
+        share_x, share_y: [m], the share of the next sample; 0 where there is one alone.
+    """
+
+    points: int
+    nx: int
+    ny: int
+    first_x: wp.array1d[int]
+    share_x: wp.array1d[float]
+    first_y: wp.array1d[int]
+    share_y: wp.array1d[float]
+
+
+@wp.struct
+class System:
+    """The normal equations of T tiles; S = nx * ny, row by row.
+
+    Attributes:
+        own: [T, S], of a sample with itself.
+        right, down: [T, S], with the next one along x and y; 0 beyond the last.
+        cross: [T, S], with the one right of that below, and of the next one with that below.
+        diagonal: [T, S], how much the points weigh in which a sample has a share, times that: the sum of a row.
+    """
+
+    own: wp.array2d[float]
+    right: wp.array2d[float]
+    down: wp.array2d[float]
+    cross: wp.array2d[float]
+    diagonal: wp.array2d[float]
+
+
+@wp.kernel
+def _system(
+    weight: wp.array2d[float],
+    scale: wp.array1d[float],
+    grid: Grid,
+    system: System,
+):
+    t = wp.tid()
+    for s in range(grid.nx * grid.ny):
+        system.own[t, s] = 0.0
+        system.right[t, s] = 0.0
+        system.down[t, s] = 0.0
+        system.cross[t, s] = 0.0
+        system.diagonal[t, s] = 0.0
+    for r in range(grid.points):
+        squares = _Row()
+        products = _Row()
+        sums = _Row()
+        for c in range(grid.points):
+            w = scale[t] * weight[t, r * grid.points + c]
+            j = grid.first_x[c]
+            k = wp.min(j + 1, grid.nx - 1)
+            a = grid.share_x[c]
+            b = 1.0 - a
+            squares[j] += w * b * b
+            squares[k] += w * a * a
+            products[j] += w * a * b
+            sums[j] += w * b
+            sums[k] += w * a
+        i = grid.first_y[r] * grid.nx
+        k = wp.min(grid.first_y[r] + 1, grid.ny - 1) * grid.nx
+        a = grid.share_y[r]
+        b = 1.0 - a
+        for j in range(grid.nx):
+            system.own[t, i + j] += b * b * squares[j]
+            system.own[t, k + j] += a * a * squares[j]
+            system.right[t, i + j] += b * b * products[j]
+            system.right[t, k + j] += a * a * products[j]
+            system.down[t, i + j] += a * b * squares[j]
+            system.cross[t, i + j] += a * b * products[j]
+            system.diagonal[t, i + j] += b * sums[j]
+            system.diagonal[t, k + j] += a * sums[j]
+
+
+@wp.kernel
+def _gather(
+    light: wp.array3d[float],
+    grid: Grid,
+    out: wp.array3d[float],
+):
+    t, channel = wp.tid()
+    for s in range(grid.nx * grid.ny):
+        out[t, channel, s] = 0.0
+    for r in range(grid.points):
+        sums = _Row()
+        for c in range(grid.points):
+            value = light[t, channel, r * grid.points + c]
+            j = grid.first_x[c]
+            k = wp.min(j + 1, grid.nx - 1)
+            a = grid.share_x[c]
+            sums[j] += (1.0 - a) * value
+            sums[k] += a * value
+        i = grid.first_y[r] * grid.nx
+        k = wp.min(grid.first_y[r] + 1, grid.ny - 1) * grid.nx
+        a = grid.share_y[r]
+        for j in range(grid.nx):
+            out[t, channel, i + j] += (1.0 - a) * sums[j]
+            out[t, channel, k + j] += a * sums[j]
+
+
+@wp.kernel
+def _solve(
+    light: wp.array3d[float],
+    weight: wp.array2d[float],
+    scale: wp.array1d[float],
+    grid: Grid,
+    system: System,
+    ridge: float,
+    rounds: int,
+    start: wp.array3d[float],
+    residual: wp.array3d[float],
+    direction: wp.array3d[float],
+    image: wp.array3d[float],
+    out: wp.array3d[float],
+):
+    t, channel = wp.tid()
+    count = grid.nx * grid.ny
+    # What the start leaves, taken back to the samples; the points' own values are subtracted, since sums of large ones
+    # would lose it.
+    for s in range(count):
+        residual[t, channel, s] = 0.0
+        out[t, channel, s] = start[t, channel, s]
+    for r in range(grid.points):
+        i = grid.first_y[r] * grid.nx
+        below = wp.min(grid.first_y[r] + 1, grid.ny - 1) * grid.nx
+        share = grid.share_y[r]
+        row = _Row()
+        sums = _Row()
+        for j in range(grid.nx):
+            row[j] = (1.0 - share) * start[t, channel, i + j] + share * start[t, channel, below + j]
+        for c in range(grid.points):
+            j = grid.first_x[c]
+            after = wp.min(j + 1, grid.nx - 1)
+            a = grid.share_x[c]
+            b = 1.0 - a
+            p = r * grid.points + c
+            rest = scale[t] * weight[t, p] * (light[t, channel, p] - (b * row[j] + a * row[after]))
+            sums[j] += b * rest
+            sums[after] += a * rest
+        for j in range(grid.nx):
+            residual[t, channel, i + j] += (1.0 - share) * sums[j]
+            residual[t, channel, below + j] += share * sums[j]
+    # In terms of the difference to the start, towards which the ridge pulls.
+    energy = float(0.0)
+    for s in range(count):
+        value = residual[t, channel, s]
+        step = value / (system.diagonal[t, s] + ridge)
+        direction[t, channel, s] = step
+        energy += value * step
+    for _round in range(rounds):
+        power = float(0.0)
+        for i in range(grid.ny):
+            for j in range(grid.nx):
+                s = i * grid.nx + j
+                here = direction[t, channel, s]
+                value = (system.own[t, s] + ridge) * here
+                if j + 1 < grid.nx:
+                    value += system.right[t, s] * direction[t, channel, s + 1]
+                if j > 0:
+                    value += system.right[t, s - 1] * direction[t, channel, s - 1]
+                if i + 1 < grid.ny:
+                    value += system.down[t, s] * direction[t, channel, s + grid.nx]
+                    if j + 1 < grid.nx:
+                        value += system.cross[t, s] * direction[t, channel, s + grid.nx + 1]
+                    if j > 0:
+                        value += system.cross[t, s - 1] * direction[t, channel, s + grid.nx - 1]
+                if i > 0:
+                    value += system.down[t, s - grid.nx] * direction[t, channel, s - grid.nx]
+                    if j + 1 < grid.nx:
+                        value += system.cross[t, s - grid.nx] * direction[t, channel, s - grid.nx + 1]
+                    if j > 0:
+                        value += system.cross[t, s - grid.nx - 1] * direction[t, channel, s - grid.nx - 1]
+                image[t, channel, s] = value
+                power += here * value
+        length = energy / wp.max(power, _TINY)
+        before = energy
+        energy = float(0.0)
+        for s in range(count):
+            out[t, channel, s] += length * direction[t, channel, s]
+            value = residual[t, channel, s] - length * image[t, channel, s]
+            residual[t, channel, s] = value
+            energy += value * value / (system.diagonal[t, s] + ridge)
+        onward = energy / wp.max(before, _TINY)
+        for s in range(count):
+            direction[t, channel, s] = (
+                residual[t, channel, s] / (system.diagonal[t, s] + ridge) + onward * direction[t, channel, s]
+            )
+
+
+@wp.kernel
+def _errors(
+    light: wp.array3d[float],
+    weight: wp.array2d[float],
+    grid: Grid,
+    samples: wp.array3d[float],
+    out: wp.array2d[wp.float64],
+):
+    t, channel = wp.tid()
+    total = wp.float64(0.0)
+    for r in range(grid.points):
+        i = grid.first_y[r] * grid.nx
+        k = wp.min(grid.first_y[r] + 1, grid.ny - 1) * grid.nx
+        share = grid.share_y[r]
+        row = _Row()
+        for j in range(grid.nx):
+            row[j] = (1.0 - share) * samples[t, channel, i + j] + share * samples[t, channel, k + j]
+        sums = float(0.0)
+        for c in range(grid.points):
+            j = grid.first_x[c]
+            a = grid.share_x[c]
+            p = r * grid.points + c
+            rest = (1.0 - a) * row[j] + a * row[wp.min(j + 1, grid.nx - 1)] - light[t, channel, p]
+            sums += weight[t, p] * rest * rest
+        total += wp.float64(sums)
+    out[t, channel] = total
+
+
+def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System) -> None:
+    """Gathers the normal equations.
+
+    Args:
+        weight: float [T, m * m], of the points' squared errors.
+        scale: float [T], that a tile's weights are multiplied by.
+        grid: The samples.
+        system: Written.
+    """
+    wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
+
+
+def gather(light: wp.array, grid: Grid, out: wp.array) -> None:
+    """Takes light at the points [T, 3, m * m] back to the samples [T, 3, S], by the transpose of interpolation."""
+    wp.launch(_gather, light.shape[:2], inputs=[light, grid, out], device=light.device, block_dim=_BLOCK)
+
+
+def solve(
+    light: wp.array,
+    weight: wp.array,
+    scale: wp.array,
+    grid: Grid,
+    system: System,
+    ridge: float,
+    rounds: int,
+    start: wp.array,
+    work: list[wp.array],
+    out: wp.array,
+) -> None:
+    """Solves the equations from a start, to which a ridge pulls.
+
+    Args:
+        light, weight, scale, grid, system: As above.
+        ridge: Added to a sample's own weight.
+        rounds: Of conjugate gradients.
+        start: float [T, 3, S].
+        work: Three arrays as `start`.
+        out: As `start`, written.
+    """
+    inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
+    wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
+
+
+def errors(light: wp.array, weight: wp.array, grid: Grid, samples: wp.array, out: wp.array) -> None:
+    """Weighted squared errors of samples [T, 3, S], float64 [T, 3]."""
+    inputs = [light, weight, grid, samples, out]
+    wp.launch(_errors, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
