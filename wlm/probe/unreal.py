@@ -16,6 +16,7 @@ from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
 from wlm.formats.dds_reader import read_word_volume
 from wlm.formats.folder import made_parents, staged, write_index
+from wlm.formats.reading import named_file
 from wlm.probe.conventions import UNREAL_LIGHT as FORMAT
 from wlm.probe.conventions import from_canonical
 from wlm.probe.lattice import CELLS, grid_places, lattice_of, read_cells
@@ -30,6 +31,7 @@ SHADER_FILE = "WlmProbes.usf"
 _FILES = {INFO_FILE, AMBIENT_FILE, SHADER_FILE, *SH_FILES}
 _MOST_CELLS = 128
 _BANDS = 3
+_ROWS = 65536  # of probes unpacked at a time
 _AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
 
 # Range of coefficients 1 to 8 over the ambient one, as the engine sets it: sqrt(3) for L1, which light reaches but
@@ -184,11 +186,15 @@ def read_unreal(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.nd
     box, cells = read_cells(path, document, _MOST_CELLS)
     size = tuple(int(count) for count in cells)
     ambient, *ratios = (
-        read_word_volume(path.with_name(name), fmt, size).ravel()
+        read_word_volume(named_file(path, name, f"{path}: {name}"), fmt, size).ravel()
         for name, fmt in ((AMBIENT_FILE, _AMBIENT), *((name, _RATIOS) for name in SH_FILES))
     )
-    level = np.stack(ratios, 1).view(np.uint8).reshape(-1, 3, _BANDS**2 - 1)
-    return grid_places(box, cells), _unpacked(ambient, level).astype(np.float32)
+    values = np.empty((len(ambient), _BANDS**2, 3), np.float32)
+    for start in range(0, len(ambient), _ROWS):
+        rows = slice(start, start + _ROWS)
+        level = np.stack([ratio[rows] for ratio in ratios], 1).view(np.uint8).reshape(-1, 3, _BANDS**2 - 1)
+        values[rows] = _unpacked(ambient[rows], level)
+    return grid_places(box, cells), values
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
