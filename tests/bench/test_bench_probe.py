@@ -47,7 +47,7 @@ def test_every_row_has_its_figures(rows):
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
     rivals = [(name, size) for size in ("5%", "10%") for name in RIVALS] + [("Unreal packing", "")]
     held = [("held out", "standard"), ("held out", "5%")]
-    volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours")]
+    volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours", "5%")]
     views = [("views", f"balls, {light}") for light in KINDS]
     for scene, speed in (("room", fits), ("hall", [])):
         assert keys(row for row in rows if row.scene == scene) == [

@@ -189,6 +189,9 @@ def test_info_says_what_is_in_the_file(fitted):
     assert facts["profile"]["name"] == "tiny"
     text = call("lightmap", "info", fitted)
     assert f"{facts['bytes']:,}" in text and facts["source"] in text and "24x40" in text
+    (tile,) = json.loads(call("lightmap", "info", fitted, "--tiles", "--json"))["each_tile"]
+    assert tile["kind"] == "dynamic" and 0 < tile["bytes"] < facts["bytes"] and "each_tile" not in facts
+    assert tile["why"].split(",")[0] in " ".join(call("lightmap", "info", fitted, "--tiles").split())
     # The maps as stored, the network in float32.
     model = wlm.load(fitted)
     stored = sum(getattr(model, part).nbytes for part in ("uv", "uvt", "ut", "vt")) + 2 * model.net.nbytes

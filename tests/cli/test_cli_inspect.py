@@ -11,6 +11,7 @@ import pytest
 from builders import atlas_meshes, small_sets
 from builders.contract import FILES
 from builders.godot_bakes import Writer, bake, probes
+from builders.probe_models import random_model
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -21,6 +22,7 @@ from wlm.engines import export_atlas
 from wlm.formats.exr import write_exr
 from wlm.inspection import files, inspect
 from wlm.inspection.folders import MOST
+from wlm.probe import export_grid, export_unity, export_unreal
 
 
 def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> np.ndarray:
@@ -95,8 +97,22 @@ def test_all_folders_that_are_written_are_known():
     """Else their textures would be taken for lightmaps that can be compressed."""
     package = Path(wlm.__file__).parent
     texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
-    formats = {name for text in texts for name in re.findall(r'^FORMAT = "([^"]+)"$', text, re.MULTILINE)}
+    formats = {name for text in texts for name in re.findall(r'^[A-Z][A-Z_]+ = "(wlm-[^"]+)"$', text, re.MULTILINE)}
     assert len(formats) > 10 and formats <= set(files._EXPORTS)
+
+
+def test_probes_of_exports_can_be_read_back(tmp_path):
+    model = random_model(count=3, probes=20, positions=True)
+    for export, name, what in (
+        (export_grid, "grid.json", "a grid of light for three.js: 4 light probes"),
+        (export_unreal, "light.json", "light probes for Unreal, volume textures and a shader: 4 light probes"),
+        (export_unity, "probes.json", "light probes for Unity: 20 light probes"),
+    ):
+        folder = tmp_path / name.removesuffix(".json")
+        export(model, folder, **({} if export is export_unity else {"cells": 2}))
+        (finding,) = inspect(folder / name)
+        assert finding.what.startswith(f"{what} of 9 RGB coefficients")
+        assert finding.command == f"wlm probe compress {folder / name} -o OUT.wlm"
 
 
 def test_pictures_of_several_atlases_are_no_times(tmp_path):

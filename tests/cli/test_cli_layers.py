@@ -33,6 +33,7 @@ def test_compress_and_info_tell_every_sheet(made):
         assert sheet.label in text and sheet.label in call("lightmap", "info", folder / "a.wlm")
     assert len(model.sheets) == 6 and model.period == 24 and not list(folder.glob("*.partial"))
     facts = json.loads(call("lightmap", "info", folder / "a.wlm", "--json"))
+    assert "--tiles is of files of one lightmap" in fails("lightmap", "info", folder / "a.wlm", "--tiles")
     assert facts["bytes"] == (folder / "a.wlm").stat().st_size > sum(sheet["bytes"] for sheet in facts["sheets"])
     assert facts["sheets"][3]["atlas"] == "Lightmap-1" and facts["sheets"][3]["height"] == 24
 

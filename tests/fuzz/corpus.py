@@ -22,6 +22,7 @@ from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.three_grid import export_grid
+from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
 from wlm.smoke.baking import bake as bake_smoke
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.learn.pool import Pool, save_pool
@@ -175,6 +176,9 @@ def _probe_files(folder: Path) -> None:
         export_grid(probe_models.random_model(count=3), Path(grid) / "out", cells=2)
         for name in ("grid.json", "grid.ktx2"):
             (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
+        export_unreal(probe_models.random_model(count=3), Path(grid) / "unreal", cells=2)
+        for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
+            (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 

@@ -33,6 +33,7 @@ from wlm.formats.mask import read_mask
 from wlm.formats.obj import read_obj
 from wlm.inspection import inspect
 from wlm.probe.data import load_positions
+from wlm.probe.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.learn.settings import DatasetSettings
@@ -161,6 +162,12 @@ def _probes(path: Path) -> None:
 
 def _texture() -> dict[str, bytes]:
     return {"grid.ktx2": corpus("grid.ktx2")()[0]}
+
+
+def _unreal() -> dict[str, bytes]:
+    return {name: corpus(f"unreal-{SH_FILES[0]}")()[0] for name in SH_FILES} | {
+        AMBIENT_FILE: corpus("unreal-ambient.dds")()[0]
+    }
 
 
 def _positions(path: Path) -> None:
@@ -408,6 +415,18 @@ _ALL = (
         vary_ktx2,
         lambda path: _probes(path.with_name("grid.json")),
         lambda: {"grid.json": corpus("grid.json")()[0]},
+    ),
+    Reader("probes-unreal", "light.json", corpus("unreal-light.json"), _json, _probes, _unreal),
+    Reader(
+        "probes-unreal-texture",
+        AMBIENT_FILE,
+        corpus("unreal-ambient.dds"),
+        vary_dds,
+        lambda path: _probes(path.with_name("light.json")),
+        lambda: (
+            {name: data for name, data in _unreal().items() if name != AMBIENT_FILE}
+            | {"light.json": corpus("unreal-light.json")()[0]}
+        ),
     ),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),

@@ -8,8 +8,8 @@ import pytest
 from builders.probe_models import random_model
 
 from wlm.errors import WlmError
-from wlm.probe import export_grid, load
-from wlm.probe.three_grid import grid_places
+from wlm.probe import export_grid, load, load_positions
+from wlm.probe.lattice import grid_places
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +46,7 @@ def test_a_grid_is_read_as_probes(grid):
     probes = load(folder / "grid.json")
     info = json.loads((folder / "grid.json").read_text())
     np.testing.assert_array_equal(probes.position, grid_places(np.array(info["box"]), np.array(info["resolution"])))
+    np.testing.assert_array_equal(load_positions(folder / "grid.json"), probes.position)
     np.testing.assert_allclose(probes.values, model.decoder().decode(probes.position), rtol=1e-3, atol=1e-6)
     with pytest.raises(WlmError, match="noon"):
         load(folder / "grid.json", key="noon")

@@ -17,10 +17,10 @@ For each set these kinds of rows, but where another is named:
 - method "held out", the first profile and the transform of 5%: the light at every fifth probe, of a file of the others,
   beside that of the uncompressed others by plain rules, and the light half-way between probes.
 - method "volume": a walk with the cascaded volume, over the probes as they were ("lossless") and as the first profile
-  has them ("ours"), whose figures are means and 95th percentiles of a frame. Its PSNR is that of what is read at probes
-  near the viewer against the input, beside it that of the same probes as they were decoded, and of what is read
-  farther away. It starts with an empty volume: what its first frame takes, and the frames until nothing waits. The
-  light's RMS is that of the probes that the volume was made from, which the volume's RMSE is against.
+  ("ours") and the transform of 5% have them, whose figures are means and 95th percentiles of a frame. Its PSNR is that
+  of what is read at probes near the viewer against the input, beside it that of the same probes as they were decoded,
+  and of what is read farther away. It starts with an empty volume: what its first frame takes, and the frames until
+  nothing waits. The light's RMS is that of the probes that the volume was made from, its RMSE is against these.
 - method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
@@ -49,7 +49,7 @@ from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fields import pack_dead
 from wlm.probe.fit import compress
-from wlm.probe.light import StoredLight, light_of
+from wlm.probe.light import Light, StoredLight, light_of
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.seen import VIEWS, score_views
 from wlm.probe.walk import score_volume
@@ -80,7 +80,7 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     "moving basis": ("moving_basis", WEIGHT_BITS),
 }
 _TRANSFORM = "transform"
-_HELD_OUT = 5  # per cent, of the transform that is scored between probes too
+_BESIDE = 5  # per cent, of the transform that is scored between probes and through the volume too
 
 PANELS = (Panel("bpp", "psnr", ("transform", "ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
 """What a plot of the rows shows: quality against size, and a decode's error against its time."""
@@ -124,7 +124,7 @@ def run(
         profiles,
         device=device,
         ratios=() if quick else RATIOS,
-        shares=(_HELD_OUT,) if quick else SHARES,
+        shares=(_BESIDE,) if quick else SHARES,
         rivals=rivals,
         frames=_QUICK_FRAMES if quick else None,
         progress=progress,
@@ -214,8 +214,9 @@ def run_rows(
             rows += bench.fit_rows(first)
         if rivals:
             rows += bench.rival_rows({fit.option: fit.bytes for fit in transforms.values()})
-        rows += [bench.held_out_row(fit) for fit in (first, transforms.get(_HELD_OUT)) if fit is not None]
-        rows += bench.volume_rows(first.model, frames)
+        both = [fit for fit in (first, transforms.get(_BESIDE)) if fit is not None]
+        rows += [bench.held_out_row(fit) for fit in both]
+        rows += bench.volume_rows(both, frames)
         rows += bench.view_rows(first.model, VIEWS if frames is None else min(frames, VIEWS))
     return rows
 
@@ -404,13 +405,13 @@ class _ProbeBench(Bench):
             **_size_and_psnr(report),
         )
 
-    def volume_rows(self, model: ProbeModel, frames: int | None) -> list[Row]:
-        """A walk with the probes as they were and one with the model's, each from an empty volume."""
+    def volume_rows(self, fits: Sequence[Fit], frames: int | None) -> list[Row]:
+        """A walk with the probes as they were and one with each model's, each from an empty volume."""
         rows = []
-        lights = {
-            "lossless": StoredLight(self.probes.values, self.device),
-            "ours": light_of(model.decoder(self.device), self.probes.position),
-        }
+        lights: dict[str, Light] = {"lossless": StoredLight(self.probes.values, self.device)}
+        for fit in fits:
+            light = light_of(fit.model.decoder(self.device), self.probes.position)
+            lights["ours" if fit is fits[0] else fit.option] = light
         for name, light in lights.items():
             self.note(f"the volume, {name}")
             walked = score_volume(self.probes, light, frames=frames)

@@ -21,7 +21,7 @@ from wlm.cli.console import (
     write_json,
 )
 from wlm.cli.lightmap_layers import refuse_layers, show_layered, show_layered_info, show_layered_report, write_layer
-from wlm.cli.lightmap_tables import show_contest, show_report
+from wlm.cli.lightmap_tables import show_contest, show_report, show_tiles
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
@@ -304,14 +304,18 @@ def evaluate(
 @app.command()
 def info(
     file: ModelFile,
+    tiles: Annotated[bool, typer.Option("--tiles", help="List each tile: its kind, its bytes, and why.")] = False,
     as_json: AsJson = False,
     device: Annotated[str, typer.Option(help="Where to load it, to say what memory its maps take there.")] = "cpu",
 ) -> None:
     """Say what a file holds, without decoding it."""
     quiet_warp()
     from wlm.lightmap.evaluation import count_kinds, part_bytes
+    from wlm.lightmap.held import held_tiles
 
     model = _model(file)
+    if tiles and model.SYSTEM == _LAYERED:
+        raise WlmError(f"{file}: --tiles is of files of one lightmap, not of layers")
     if model.SYSTEM == _LAYERED:
         show_layered_info(file, model, model.decoder(device), as_json)
         return
@@ -331,6 +335,9 @@ def info(
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
     }
+    held = held_tiles(model) if tiles else []
+    if tiles:
+        facts["each_tile"] = [vars(tile) for tile in held]
     if as_json:
         show_json(facts)
         return
@@ -354,6 +361,8 @@ def info(
             rows.add_row(*row)
         rows.add_section()
     show(rows)
+    if tiles:
+        show_tiles(held)
 
 
 @app.command()

@@ -9,6 +9,7 @@ from wlm.cli.console import escape, note, number, show, table
 if TYPE_CHECKING:
     from wlm.baselines.lightmap import Score
     from wlm.lightmap import Report
+    from wlm.lightmap.held import HeldTile
     from wlm.metrics.contest import ContestScore
 
 
@@ -108,3 +109,12 @@ def show_contest(score: "ContestScore") -> None:
     each = 1000.0 * score.seconds / score.times
     note(f"hprc: decoded in {score.seconds:.4f} s on {score.device}, {each:.3f} ms a lightmap; its bounds are unknown")
     note("hprc: without points of 100: decode time (30), LPIPS (10), which needs a trained network")
+
+
+def show_tiles(tiles: "list[HeldTile]") -> None:
+    """Shows what each tile of a file got."""
+    rows = table("tiles", ["tile", "row", "column", "kind", "valid texels", "bytes", "why"], ("kind", "why"))
+    for tile in tiles:
+        place = (f"{tile.number}", f"{tile.row}", f"{tile.column}")
+        rows.add_row(*place, tile.kind, f"{tile.valid:,}", f"{tile.bytes:,}", tile.why)
+    show(rows)

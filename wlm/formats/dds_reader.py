@@ -1,5 +1,7 @@
 """Reading light from DDS files: 2D textures of floats, the largest mip level alone; the top row is the first.
 
+Volumes of four bytes a texel, as `wlm.formats.dds` writes them, come as they are.
+
 Layout: Microsoft's DDS_HEADER and DDS_HEADER_DXT10, and the FourCC of Direct3D 9's float formats.
 """
 
@@ -10,18 +12,21 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats import float_texels as texels
+from wlm.formats.dds import DXGI_FORMATS
 from wlm.formats.float_texels import Layout, check_picture, decode_texels
-from wlm.formats.reading import open_file
+from wlm.formats.reading import open_file, read_file
 
 MAGIC = b"DDS "
 
 # Size, flags, height, width; pixel format: size, flags, code; caps 2.
 _HEADER = struct.Struct("<4s 4I 56x 2I 4s 24x I 12x")
 _DX10 = struct.Struct("<5I")  # format, dimension, flags, array size, alpha mode
+_DEPTH, _DEPTH_AT = struct.Struct("<I"), 24
+_MOST_BYTES = 1 << 26  # of a volume
 _HEADER_SIZE, _PIXEL_FORMAT_SIZE = 124, 32
 _FOUR_CC = 0x4
 _CAPS2_CUBE, _CAPS2_VOLUME = 0x200, 0x200000
-_DIMENSION_2D = 3
+_DIMENSION_2D, _DIMENSION_3D = 3, 4
 _FLAG_CUBE = 0x4
 
 _LAYOUTS: dict[int, tuple[str, Layout]] = {
@@ -103,6 +108,39 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     if len(data) != expected:
         raise WlmError(f"{path}: expected {expected} bytes of texels, found another number: does it change?")
     return decode_texels(path, layout, data, width, height), layout.names
+
+
+def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, int, int]) -> np.ndarray:
+    """Reads a volume texture of four bytes a texel.
+
+    Args:
+        path: The file.
+        fmt: A key of `wlm.formats.dds.DXGI_FORMATS`.
+        size: Width, height and depth.
+
+    Returns:
+        uint32 [depth, height, width], little-endian, the first channel in the lowest bits.
+
+    Raises:
+        WlmError: The file can't be read, is another kind of texture or of another size, or is cut short.
+    """
+    width, height, depth = size
+    head = _HEADER.size + _DX10.size
+    data = read_file(path, _MOST_BYTES, "the texture")
+    if len(data) < head or not data.startswith(MAGIC):
+        raise WlmError(f"{path}: expected a DDS file of {width} x {height} x {depth} texels, found other content")
+    _, _, _, rows, columns, _, _, code, caps2 = _HEADER.unpack_from(data)
+    number, dimension, *_ = _DX10.unpack_from(data, _HEADER.size)
+    expected = (b"DX10", DXGI_FORMATS[fmt], _DIMENSION_3D)
+    if (code, number, dimension) != expected or not caps2 & _CAPS2_VOLUME:
+        raise WlmError(f"{path}: expected a volume texture of {fmt}, found another kind")
+    found = (columns, rows, *_DEPTH.unpack_from(data, _DEPTH_AT))
+    if found != size or len(data) != head + 4 * width * height * depth:
+        raise WlmError(
+            f"{path}: expected {width} x {height} x {depth} texels, found {' x '.join(map(str, found))} "
+            f"in {len(data) - head} bytes"
+        )
+    return np.frombuffer(data, "<u4", offset=head).reshape(depth, height, width)
 
 
 def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:

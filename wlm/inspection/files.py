@@ -29,8 +29,14 @@ BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
 ATLAS = "a compressed lightmap of a mesh"
 """What is said of the folder of an atlas."""
 
+# Exports that can be read back.
+_PROBE_EXPORTS = {
+    "wlm-light-probe-grid": "a grid of light for three.js",
+    "wlm-unity-probes": "light probes for Unity",
+    "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
+}
 # What says of itself in JSON that it is ours, and what to do with it.
-_EXPORTS = {
+_EXPORTS = _PROBE_EXPORTS | {
     "wlm-atlas": ATLAS,
     "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
@@ -42,10 +48,7 @@ _EXPORTS = {
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",
-    "wlm-light-probe-grid": "a grid of light for three.js",
     "wlm-godot-light": "light probes for Godot",
-    "wlm-unity-probes": "light probes for Unity",
-    "wlm-unreal-light": "light probes for Unreal: volume textures and a shader",
     "wlm-smoke-frames": "frames of smoke that wlm smoke simulate wrote",
 }
 
@@ -205,9 +208,12 @@ def _model(path: Path) -> Finding:
 
 def _json(path: Path) -> Finding:
     content: Any = read_json_file(path, "the file", JSON_BYTES)
-    stated = _EXPORTS.get(str(content.get("format"))) if isinstance(content, dict) else None
-    if stated is not None:
-        return Finding(path, stated)
+    form = str(content.get("format")) if isinstance(content, dict) else ""
+    if form in _PROBE_EXPORTS:
+        found = _probes(path)
+        return replace(found, what=f"{_PROBE_EXPORTS[form]}: {found.what}")
+    if form in _EXPORTS:
+        return Finding(path, _EXPORTS[form])
     if isinstance(content, dict) and "lightmaps" in content:
         return inspect_set(path)
     if isinstance(content, dict) and ("probes" in content or "position" in content):

@@ -42,6 +42,12 @@ CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 THREE_GRID = "wlm-light-probe-grid"
 """What a `.json` says its format is that is a grid for three.js, see `wlm.probe.three_grid`."""
 
+UNREAL_LIGHT = "wlm-unreal-light"
+"""Likewise of volume textures for Unreal, see `wlm.probe.unreal`."""
+
+UNITY_PROBES = "wlm-unity-probes"
+"""Likewise of probes for Unity, see `wlm.probe.unity`."""
+
 _LAST_BAND = {"unreal": 2, "unity": 2}
 
 # Constants in front of the basis' polynomials, and the clamped cosine's factors over pi; bands 0 to 2.

@@ -41,6 +41,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,15 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
-from wlm.probe.conventions import CANONICAL, CONVENTIONS, THREE_GRID, from_canonical, to_canonical
+from wlm.probe.conventions import (
+    CANONICAL,
+    CONVENTIONS,
+    THREE_GRID,
+    UNITY_PROBES,
+    UNREAL_LIGHT,
+    from_canonical,
+    to_canonical,
+)
 from wlm.probe.json_fields import fields_of, numbers_of, read_json, text_of
 from wlm.probe.sphere import sh_count
 from wlm.probe.surroundings import check_normal, check_valid
@@ -125,6 +134,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they aren't
       canonical; where they are known `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `grid.json` beside `grid.ktx2`: what `wlm.probe.export_grid` writes for three.js.
+    - `light.json` beside its textures, `probes.json`: what `wlm.probe.export_unreal` and `export_unity` write.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and the others likewise.
     - `.lmbake`: a lightmap bake of Godot 4.
@@ -135,7 +145,8 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         key: Name of the array of values, or that name without "sh_" in front of it ("12.00" for "sh_12.00"). None
             takes the only one whose name begins with "sh".
         convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the file's numbers are. None takes what the
-            file states: "godot" for `.lmbake`, "unity" for `.asset`, else its `convention`, else the canonical one.
+            file states: "godot" for `.lmbake`, "unity" for `.asset`, "unreal" for its textures, else its `convention`,
+            else the canonical one.
 
     Returns:
         The set, repaired as the module's table says.
@@ -156,8 +167,8 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     """Reads the positions of a probe file, whatever else is in it, or a list of points.
 
     Args:
-        path: A file as for `load`, which needs to hold no values, or JSON, `[[x, y, z], ...]`. What ends neither in
-            .npz nor in .lmbake is taken for JSON.
+        path: A file as for `load`, of which `.npz` and `.json` need to hold no values, or JSON, `[[x, y, z], ...]`.
+            What ends otherwise than a file of probes is taken for JSON.
 
     Returns:
         float64 [M, 3], finite, M at least 1.
@@ -169,12 +180,15 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     kind = path.suffix.lower()
     if kind == ".npz":
         position = read_npz(path, lambda _: [_POSITION], numbers=3 * PROBES)[_POSITION]
-    elif kind == ".lmbake":
-        position = read_lmbake(path)[0]
+    elif kind in (".lmbake", ".asset"):
+        position = _READERS[kind](path, None).position
     else:
         content = read_json(path)
+        export = _read_export(path, content)
         if isinstance(content, list):
             position = numbers_of(path, _POSITION, content)
+        elif export is not None:
+            position = export[0]
         else:
             position = fields_of(path, content)[1](_POSITION)
     return _check_positions(str(path), position)
@@ -279,17 +293,34 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 def _read_json(path: Path, key: str | None) -> _Raw:
     content = read_json(path)
-    if isinstance(content, dict) and content.get("format") == THREE_GRID:
-        from wlm.probe.three_grid import read_grid
-
-        position, values = read_grid(path, content)
-        return _Raw(position, values, _choose(path, (_POSITION, _SH), key), CANONICAL)
+    export = _read_export(path, content)
+    if export is not None:
+        position, values, convention = export
+        return _Raw(position, values, _choose(path, (_POSITION, _SH), key), convention)
     names, read = fields_of(path, content)
     name = _choose(path, names, key)
     beside = {field: read(field) for field in _BESIDE if field in names}
     return _Raw(
         read(_POSITION), read(name), name, text_of(path, _CONVENTION, content.get(_CONVENTION, CANONICAL)), beside
     )
+
+
+def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """Positions, values and convention of what was exported for an engine; None of other content."""
+    form = content.get("format") if isinstance(content, dict) else None
+    if form == THREE_GRID:
+        from wlm.probe.three_grid import read_grid
+
+        return *read_grid(path, content), CANONICAL
+    if form == UNREAL_LIGHT:
+        from wlm.probe.unreal import read_unreal
+
+        return *read_unreal(path, content), "unreal"
+    if form == UNITY_PROBES:
+        from wlm.probe.unity import read_unity
+
+        return *read_unity(path, content), "unity"
+    return None
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:

@@ -19,7 +19,7 @@ from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.ktx2 import read_half_volume, write_ktx2
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
-from wlm.probe.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.lattice import CELLS, NUMBERS, grid_places, lattice_of, read_cells
 from wlm.probe.model import ProbeModel
 from wlm.probe.transform import Transform
 
@@ -30,7 +30,6 @@ LOADER_FILE = "grid.js"
 _FILES = {INFO_FILE, TEXTURE_FILE, LOADER_FILE}
 _PARTS = 7
 _MOST_CELLS = 256
-_FARTHEST = 1e100
 _ABOUT = (
     "Light for three.js: grid.js loads grid.ktx2 with its KTX2Loader into its LightProbeGrid. box is that of the "
     "cells, with a probe at the centre of each (r187 and later), corners that of the probes themselves (up to r186). "
@@ -132,15 +131,8 @@ def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndar
     Raises:
         WlmError: A field is missing or wrong, or the texture can't be read or has another size.
     """
-    box, count, name = (document.get(field) for field in ("box", "resolution", "texture"))
-    try:
-        corners, cells = np.array(box, np.float64), np.array(count)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise WlmError(f"{path}: box, resolution: expected numbers, got others") from error
-    if corners.shape != (2, 3) or not (np.abs(corners) < _FARTHEST).all() or not (corners[1] > corners[0]).all():
-        raise WlmError(f"{path}: box: expected two corners, the lower first")
-    if cells.shape != (3,) or cells.dtype.kind != "i" or not ((cells >= 1) & (cells <= _MOST_CELLS)).all():
-        raise WlmError(f"{path}: resolution: expected three numbers of 1 to {_MOST_CELLS}")
+    name = document.get("texture")
+    corners, cells = read_cells(path, document, _MOST_CELLS)
     if not isinstance(name, str):
         raise WlmError(f"{path}: texture: expected the name of a file")
     texels = read_half_volume(named_file(path, name, f"{path}: texture"))
@@ -148,18 +140,6 @@ def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndar
     if texels.shape[:3] != expected:
         raise WlmError(f"{path}: texture: expected {expected} slices, rows and texels, got {texels.shape[:3]}")
     return grid_places(corners, cells), unpack(texels).reshape(-1, 9, 3)
-
-
-def grid_places(box: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Centres of the cells, float64 [nz * ny * nx, 3], x fastest.
-
-    Args:
-        box: [2, 3], lowest and highest corner.
-        count: [3], cells along x, y and z.
-    """
-    axes = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(*box, count, strict=True)]
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.stack([x, y, z], -1).reshape(-1, 3)
 
 
 def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -7,17 +7,19 @@ light of ours at its place. `sh[channel, coefficient]` has the numbers of the co
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.folder import compact_json, made_parents, rounded, staged
+from wlm.probe.conventions import UNITY_PROBES as FORMAT
 from wlm.probe.conventions import from_canonical
+from wlm.probe.json_fields import fields_of
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import Transform
 
-FORMAT = "wlm-unity-probes"
 _VERSION = 1
 INFO_FILE = "probes.json"
 SCRIPT_FILE = "WlmLightProbes.cs"
@@ -219,3 +221,25 @@ def export_unity(
         (temporary / SCRIPT_FILE).write_text(_SCRIPT, encoding="utf-8")
         (temporary / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
     return [folder / SCRIPT_FILE, folder / INFO_FILE]
+
+
+def read_unity(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads what `export_unity` wrote.
+
+    Args:
+        path: `probes.json`.
+        document: What it says.
+
+    Returns:
+        Places [N, 3], in Unity's axes; [N, 9, 3], in the convention "unity".
+
+    Raises:
+        WlmError: A field is missing, has something other than numbers, or another number of them.
+    """
+    position, sh = (fields_of(path, document)[1](field) for field in ("position", "sh"))
+    if position.ndim != 1 or len(position) % 3 or sh.shape != (3 * _L2 * (len(position) // 3),):
+        raise WlmError(
+            f"{path}: position, sh: expected 3 and {3 * _L2} numbers of each probe in two lists, "
+            f"got {position.shape} and {sh.shape}"
+        )
+    return position.reshape(-1, 3), sh.reshape(-1, 3, _L2).swapaxes(1, 2)

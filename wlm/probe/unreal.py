@@ -8,18 +8,21 @@ so light is written as seven volume textures over a lattice, with functions for 
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
+from wlm.formats.dds_reader import read_word_volume
 from wlm.formats.folder import made_parents, staged, write_index
+from wlm.formats.reading import named_file
+from wlm.probe.conventions import UNREAL_LIGHT as FORMAT
 from wlm.probe.conventions import from_canonical
-from wlm.probe.lattice import CELLS, lattice_of
+from wlm.probe.lattice import CELLS, grid_places, lattice_of, read_cells
 from wlm.probe.model import ProbeModel
 from wlm.probe.transform import Transform
 
-FORMAT = "wlm-unreal-light"
 _VERSION = 1
 INFO_FILE = "light.json"
 AMBIENT_FILE = "ambient.dds"
@@ -28,6 +31,8 @@ SHADER_FILE = "WlmProbes.usf"
 _FILES = {INFO_FILE, AMBIENT_FILE, SHADER_FILE, *SH_FILES}
 _MOST_CELLS = 128
 _BANDS = 3
+_ROWS = 65536  # of probes unpacked at a time
+_AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
 
 # Range of coefficients 1 to 8 over the ambient one, as the engine sets it: sqrt(3) for L1, which light reaches but
 # never passes, and twice what light can reach for L2.
@@ -42,7 +47,7 @@ _ABOUT = (
     "ambient.dds and sh0.dds to sh5.dds are volume textures of one size, a probe at the centre of each texel, x along "
     "rows, then y, then z: of the coefficients of radiance the first, and the others over it and over their ranges, 1 "
     "to 4 and 5 to 8 of red, of green and of blue. Unreal's signs, the scene's own axes and unit. WlmProbes.usf says "
-    "how to read them; corner and size are those of the box in it."
+    "how to read them; box is that of the cells, the corner and the size in it."
 )
 
 _SHADER = """\
@@ -140,9 +145,9 @@ def export_unreal(
         raise WlmError(f"{model.name}: expected light within {_PACKED_MAX.min():g}, got {np.abs(sh[:, 0]).max():.3g}")
     width, height, depth = (int(count) for count in lattice.count)
     ambient, level = _packed(sh, _BANDS)
-    textures = {AMBIENT_FILE: ("R11G11B10_FLOAT", ambient)}
+    textures = {AMBIENT_FILE: (_AMBIENT, ambient)}
     textures |= {
-        name: ("R8G8B8A8_UNORM", np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
+        name: (_RATIOS, np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
         for number, name in enumerate(SH_FILES)
     }
     text = _SHADER
@@ -153,8 +158,7 @@ def export_unreal(
         "version": _VERSION,
         "about": _ABOUT,
         "name": model.name,
-        "corner": corner.tolist(),
-        "size": size.tolist(),
+        "box": [corner.tolist(), (corner + size).tolist()],
         "resolution": lattice.count.tolist(),
     }
     folder = Path(directory)
@@ -164,6 +168,33 @@ def export_unreal(
         (temporary / SHADER_FILE).write_text(text, encoding="utf-8")
         write_index(temporary / INFO_FILE, document)
     return [folder / name for name in (*textures, SHADER_FILE, INFO_FILE)]
+
+
+def read_unreal(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads what `export_unreal` wrote: the textures beside `light.json`, as probes at the cells' centres.
+
+    Args:
+        path: `light.json`.
+        document: What it says.
+
+    Returns:
+        float64 [N, 3], places; float32 [N, 9, 3], with Unreal's signs.
+
+    Raises:
+        WlmError: A field is missing or wrong, or a texture can't be read, or is of another kind or size.
+    """
+    box, cells = read_cells(path, document, _MOST_CELLS)
+    size = tuple(int(count) for count in cells)
+    ambient, *ratios = (
+        read_word_volume(named_file(path, name, f"{path}: {name}"), fmt, size).ravel()
+        for name, fmt in ((AMBIENT_FILE, _AMBIENT), *((name, _RATIOS) for name in SH_FILES))
+    )
+    values = np.empty((len(ambient), _BANDS**2, 3), np.float32)
+    for start in range(0, len(ambient), _ROWS):
+        rows = slice(start, start + _ROWS)
+        level = np.stack([ratio[rows] for ratio in ratios], 1).view(np.uint8).reshape(-1, 3, _BANDS**2 - 1)
+        values[rows] = _unpacked(ambient[rows], level)
+    return grid_places(box, cells), values
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
@@ -180,13 +211,10 @@ def pack_unreal(values: np.ndarray, bands: int) -> bytes:
 def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
     """Reads what `pack_unreal` wrote, float32 [N, D], D = `width`; zero beyond the bands."""
     probes = len(payload) // (4 + 3 * (bands**2 - 1))
-    ambient = _ambient(np.frombuffer(payload, "<u4", probes))
     level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
-    sh = np.zeros((probes, width // 3, 3))
-    sh[:, 0] = ambient
-    others = (level / 127.5 - 1.0) * ambient[:, :, None] * _RANGE[: bands**2 - 1]
-    sh[:, 1 : bands**2] = others.transpose(0, 2, 1)
-    return sh.reshape(probes, width).astype(np.float32)
+    sh = np.zeros((probes, width // 3, 3), np.float32)
+    sh[:, : bands**2] = _unpacked(np.frombuffer(payload, "<u4", probes), level)
+    return sh.reshape(probes, width)
 
 
 def _packed(sh: np.ndarray, bands: int) -> tuple[np.ndarray, np.ndarray]:
@@ -200,6 +228,14 @@ def _packed(sh: np.ndarray, bands: int) -> tuple[np.ndarray, np.ndarray]:
     unit = _ambient(ambient)[:, :, None] * _RANGE[: bands**2 - 1]
     ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
     return ambient, np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
+
+
+def _unpacked(ambient: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Coefficients float64 [N, C, 3] of ambient colours uint32 [N] and ratios uint8 [N, 3, C - 1]."""
+    colour = _ambient(ambient)
+    with np.errstate(invalid="ignore"):  # a file may hold infinity
+        others = (level / 127.5 - 1.0) * colour[:, :, None] * _RANGE[: level.shape[2]]
+    return np.concatenate([colour[:, :, None], others], 2).transpose(0, 2, 1)
 
 
 def _ambient(code: np.ndarray) -> np.ndarray:
