@@ -27,9 +27,10 @@ from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Ramp
+from wlm.smoke.transport.diffusion import scattered_again, share_of
 from wlm.smoke.transport.features import FEATURES, Inputs, aim, ambient, input_maker, orders_march
-from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.lights import AnyLight, checked_albedo
+from wlm.smoke.transport.lighting import LitSmoke, light_smoke, marching
+from wlm.smoke.transport.lights import AnyLight, PointLight, checked_albedo
 from wlm.smoke.transport.samples import ALBEDOS
 from wlm_kernels.smoke.settings import March
 
@@ -265,15 +266,30 @@ def scatter(
             even = light_smoke(alike, camera, lights, march)
         planes = torch.empty((*lit.planes.shape, 3), device=volume.device)
         make = input_maker(alike, even, ambient(alike, camera, march))
-        for n in range(len(lights)):
-            planes[n] = model.light(make(n), thinner, network=network)
-            if (factor := aim(lights[n], volume)[1]) != 1.0:
-                planes[n] /= factor
+        for n, light in enumerate(lights):
+            near = share_of(light, alike)
+            if near < 1.0:
+                planes[n] = model.light(make(n), thinner, network=network) / aim(light, volume)[1]
+            if near > 0.0:
+                diffused = _diffused(alike, even, light, n, thinner)
+                planes[n] = diffused if near == 1.0 else torch.lerp(planes[n], diffused, near)
             if even is not lit:
                 for channel in range(3):
                     once = colour[channel] * lit.planes[n] - thinner[channel] * even.planes[n]
                     planes[n, ..., channel] = (planes[n, ..., channel] + once).clamp(min=0.0)
     return ScatteredSmoke(lit, planes)
+
+
+def _diffused(
+    volume: DensityVolume, lit: LitSmoke, light: PointLight, number: int, albedo: Sequence[float]
+) -> torch.Tensor:
+    """All light of a point light by diffusion, [H, W, 3]."""
+    colours = [float(value) for value in albedo]
+    values = sorted(set(colours))
+    with marching(volume, lit.camera, lit.march) as scene:
+        more = scattered_again(scene, volume, light, values)
+    once = lit.planes[number]
+    return torch.stack([value * once + more[values.index(value)] for value in colours], -1)
 
 
 @functools.cache

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from wlm.smoke.planes import to_srgb
-from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, ambient, blur, make_inputs
+from wlm.smoke.transport.features import FEATURES, Inputs, ambient, blur, make_inputs, orders_march
 from wlm.smoke.transport.filtering import (
     ANGLES,
     CONDITIONS,
@@ -48,8 +48,8 @@ class Lesson:
 
 def make_lessons(sample: Sample) -> list[Lesson]:
     """The lights of a sample, marched."""
-    lit = light_smoke(sample.volume, sample.camera, sample.lights, COARSE)
-    made = make_inputs(sample.volume, lit, ambient(sample.volume, sample.camera, COARSE))
+    lit = light_smoke(sample.volume, sample.camera, sample.lights, orders_march(sample.volume))
+    made = make_inputs(sample.volume, lit, ambient(sample.volume, sample.camera))
     return [Lesson(inputs, light) for inputs, light in zip(made, sample.light, strict=True)]
 
 

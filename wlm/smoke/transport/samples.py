@@ -7,7 +7,7 @@ import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.learn.synthetic import make_billows, make_plume
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.tracing import trace
 
@@ -17,6 +17,9 @@ ALBEDOS = (0.5, 0.8, 0.9, 0.95, 1.0)
 _ORDERS = 40
 _THIN, _THICK = 5.0, 60.0  # extinction over the box's edge
 _SIZES = (40, 48, 56, 64)
+_THINNEST, _THICKEST = 2.0, 100.0
+_ALL_SIZES = (24, 32, 48, 64, 96)
+_PIXELS = (32, 48, 64, 96)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,24 @@ def draw_view(
     drawn = int(random.choice(_SIZES))
     n = drawn if cells is None else cells
     volume = make_plume(n, seed=int(random.integers(2**31)), hot=False, extinction=extinction)
+    return _seen(volume, random, pixels, lights)
+
+
+def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolume, Camera, tuple]:
+    """Draws a view to learn from: of smoke of every kind, thinner and thicker than `draw_view`'s, in cells coarse and
+    fine; arguments as there."""
+    random = np.random.default_rng([seed, number])
+    extinction = float(np.exp(random.uniform(np.log(_THINNEST), np.log(_THICKEST))))
+    n, pixels = int(random.choice(_ALL_SIZES)), int(random.choice(_PIXELS))
+    smoke = {"seed": int(random.integers(2**31)), "extinction": extinction}
+    volume = make_billows(n, **smoke) if number % 2 else make_plume(n, hot=False, **smoke)
+    return _seen(volume, random, pixels, lights)
+
+
+def _seen(
+    volume: DensityVolume, random: np.random.Generator, pixels: int, lights: int
+) -> tuple[DensityVolume, Camera, tuple]:
+    """The smoke, of a power of its density, turned, from a random side under random lights."""
     density = volume.density ** float(random.uniform(0.5, 2.0))
     density = density.permute(tuple(int(i) for i in random.permutation(3)))
     density = density.flip([axis for axis in range(3) if random.random() < 0.5]).contiguous()

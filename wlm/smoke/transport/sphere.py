@@ -13,6 +13,7 @@ from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
+from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
 from wlm_kernels.smoke.settings import March
@@ -34,7 +35,7 @@ def bake_sphere(
         volume: The smoke.
         camera: Orthographic.
         lights: Directions that they are fitted to, an even number of at least 12.
-        march: To each light; None: in steps of a voxel, without jitter.
+        march: To each light; None: in steps of a voxel, without jitter, for light of all orders `orders_march`.
         albedo: None: light scattered once, of albedo 1, as in all lightmaps. A number of 0 to 1: light of all orders at
             this albedo, which `scatter` predicts.
 
@@ -48,7 +49,8 @@ def bake_sphere(
         raise ValueError("camera: expected an orthographic one for six-way lightmaps")
     if lights < 12 or lights % 2:
         raise ValueError(f"lights: expected an even number of at least 12, got {lights}")
-    march = March(step=1.0, jitter=0.0) if march is None else march
+    if march is None:
+        march = March(step=1.0, jitter=0.0) if albedo is None else orders_march(volume)
     ways = half_sphere(lights // 2)
     lamps = [Light(tuple(map(float, way @ camera.axes))) for way in ways]
     both = torch.tensor(np.stack([weights(ways), weights(-ways)]), dtype=torch.float32, device=volume.device)
