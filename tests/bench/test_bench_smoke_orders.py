@@ -77,6 +77,9 @@ def test_flicker_is_what_the_smokes_motion_leaves():
     brighter = bench._flicker(shots, [light, 1.5 * light], halves, opacity)
     # The references' noise isn't counted as their change.
     assert brighter["flicker"] > 20 and brighter["flicker_ratio"] == pytest.approx(1.0, abs=0.06)
+    # Those that stay have nothing that a picture's flicker could be compared with.
+    still = [(0.0 * light, 0.0 * light)] * 2
+    assert set(bench._flicker(shots, [light, 1.5 * light], still, opacity)) == {"flicker"}
 
 
 def test_plumes_of_finer_voxels_are_the_same_smoke():

@@ -298,7 +298,10 @@ def _flicker(
     halves: Sequence[tuple[torch.Tensor, torch.Tensor]],
     opacity: Sequence[torch.Tensor],
 ) -> dict[str, float]:
-    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'."""
+    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'.
+
+    References that change by no more than their noise, whose product isn't above 0, have nothing to be compared with.
+    """
     power, wanted, count = 0.0, 0.0, 0
     for n, shot in enumerate(shots):
         if shot.motion is None:
@@ -309,14 +312,15 @@ def _flicker(
             warped, inside = warp(before, moved[None])
             return 255.0 * (after - warped)[0][:, (opacity[n] > _VISIBLE) & (inside[0, 0] > 0)]
 
-        own = change(pictures[n - 1], pictures[n])
+        changed = change(pictures[n - 1], pictures[n])
         one, other = (change(halves[n - 1][half], halves[n][half]) for half in (0, 1))
-        power += float(own.square().sum())
+        power += float(changed.square().sum())
         wanted += float((one * other).sum())
-        count += own.numel()
+        count += changed.numel()
     if not count:
         return {}
-    return {"flicker": (power / count) ** 0.5, "flicker_ratio": (power / wanted) ** 0.5 if wanted > 0 else math.nan}
+    own = {"flicker": (power / count) ** 0.5}
+    return own | {"flicker_ratio": (power / wanted) ** 0.5} if wanted > 0 else own
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
