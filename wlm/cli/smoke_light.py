@@ -55,9 +55,7 @@ def light(
     ] = None,
     step: Annotated[
         float | None,
-        typer.Option(
-            min=0.01, max=1000.0, help="In voxels; default 1/130 of the longest edge, or 1/4."
-        ),
+        typer.Option(min=0.01, max=1000.0, help="In voxels; default 1/130 of the longest edge, or 1/4."),
     ] = None,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
     background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,

@@ -52,6 +52,14 @@ def scattered_again(
     return torch.stack([albedo * plane for albedo, plane in zip(albedos, seen, strict=True)]) / volume.voxel**2
 
 
+def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:
+    """What hot smoke scatters to a camera of the light that it gives off, [A, H, W]; arguments as above."""
+    coarse = CoarseSmoke(volume)
+    source = coarse.mean(volume.temperature).mul_(4.0 * math.pi * volume.emission * volume.voxel)
+    # Light that is given off was scattered by nothing yet: `spread` takes an albedo's share of it, as the camera would.
+    return coarse.seen(scene, coarse.spread(source[None], albedos))
+
+
 class CoarseSmoke:
     """Smoke in cells, in which light spreads.
 
@@ -70,13 +78,17 @@ class CoarseSmoke:
         """
         self.medium = medium_of(volume)
         longest = max(volume.shape)
-        counts = [max(1, round(cells * n / longest)) for n in volume.shape]
-        self.edges = tuple(n / count for n, count in zip(volume.shape, counts, strict=True))
-        mean = volume.density.float()
-        for count in counts:
+        self._counts = [max(1, round(cells * n / longest)) for n in volume.shape]
+        self.edges = tuple(n / count for n, count in zip(volume.shape, self._counts, strict=True))
+        self.extinction = self.mean(volume.density).mul_(volume.extinction * volume.voxel)
+
+    def mean(self, voxels: torch.Tensor) -> torch.Tensor:
+        """Means over the cells of a grid of the smoke's voxels, float32 [X, Y, Z]."""
+        mean = voxels.float()
+        for count in self._counts:
             # Over one axis, which then is the last: after three the first is the first again.
             mean = torch.tensordot(mean, _shares(mean.shape[0], count, mean.device), ([0], [0]))
-        self.extinction = mean.mul_(volume.extinction * volume.voxel).contiguous()
+        return mean.contiguous()
 
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
         """The fluence of light that was scattered at least once.

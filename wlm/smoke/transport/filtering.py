@@ -27,7 +27,7 @@ from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Ramp
-from wlm.smoke.transport.diffusion import scattered_again, share_of
+from wlm.smoke.transport.diffusion import scattered_again, share_of, thrown_by_fire
 from wlm.smoke.transport.features import FEATURES, Inputs, aim, ambient, input_maker, orders_march
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke, marching
 from wlm.smoke.transport.lights import AnyLight, PointLight, checked_albedo
@@ -277,6 +277,11 @@ def scatter(
                 for channel in range(3):
                     once = colour[channel] * lit.planes[n] - thinner[channel] * even.planes[n]
                     planes[n, ..., channel] = (planes[n, ..., channel] + once).clamp(min=0.0)
+        if volume.temperature is not None:
+            values, places = _apart(thinner)
+            with marching(alike, camera, march) as scene:
+                thrown = thrown_by_fire(scene, alike, values)
+            lit = replace(lit, thrown=torch.stack([thrown[place] for place in places], -1))
     return ScatteredSmoke(lit, planes)
 
 
@@ -284,12 +289,17 @@ def _diffused(
     volume: DensityVolume, lit: LitSmoke, light: PointLight, number: int, albedo: Sequence[float]
 ) -> torch.Tensor:
     """All light of a point light by diffusion, [H, W, 3]."""
-    colours = [float(value) for value in albedo]
-    values = sorted(set(colours))
+    values, places = _apart(albedo)
     with marching(volume, lit.camera, lit.march) as scene:
         more = scattered_again(scene, volume, light, values)
     once = lit.planes[number]
-    return torch.stack([value * once + more[values.index(value)] for value in colours], -1)
+    return torch.stack([value * once + more[place] for value, place in zip(albedo, places, strict=True)], -1)
+
+
+def _apart(albedo: Sequence[float]) -> tuple[list[float], list[int]]:
+    """The albedos of the channels, each once, and which of them each channel has."""
+    values = sorted(set(map(float, albedo)))
+    return values, [values.index(float(value)) for value in albedo]
 
 
 @functools.cache
