@@ -17,8 +17,7 @@ from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.learning import psnr
 from wlm.smoke.transport.lighting import light_smoke, marching
-from wlm.smoke.transport.lights import PointLight
-from wlm.smoke.transport.sphere import half_sphere
+from wlm.smoke.transport.lights import PointLight, half_sphere
 from wlm.smoke.transport.tracing import trace
 
 

@@ -16,6 +16,7 @@ from wlm.smoke.shading import Light
 from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.lights import half_sphere
 from wlm_kernels.smoke.settings import March
 
 _ROUNDS = 100  # of the descent to maps that aren't negative: one is then within 1e-4 of the least squares
@@ -65,14 +66,6 @@ def bake_sphere(
             lit, sums = made.lit, _sums(both[0], made.planes[..., 0]) + _sums(both[1], back.planes[..., 0])
         maps = _not_negative(both.flatten(0, 1).T @ both.flatten(0, 1), sums)
     return SixWay(maps, lit.transparency, lit.emission, camera, lit.depth)
-
-
-def half_sphere(count: int) -> np.ndarray:
-    """Directions on one half of the sphere that are evenly spread with their opposites, float64 [count, 3]."""
-    k = np.arange(count) + 0.5
-    height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), height, across * np.sin(turn)], -1)
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
