@@ -106,6 +106,7 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
         (("light", "--point", "0,0,0:-1"), "--point"),
         (("trace", "--light", "1,0,0:1,1"), "--light"),
         (("trace", "--sky", "1,-1,1"), "--sky"),
+        (("light", "--sky", "1,-1,1"), "--sky"),
         (("trace", "--white", "0"), "--white"),
         (("trace", "--extinction", "1e9"), "optical depth"),
     ],

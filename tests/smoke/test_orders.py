@@ -15,9 +15,10 @@ from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import COARSE, FEATURES, ambient, blur, make_inputs
+from wlm.smoke.transport.features import FEATURES, ambient, blur, make_inputs, orders_march
 from wlm.smoke.transport.filtering import OrdersModel, load_orders, scatter
-from wlm.smoke.transport.learning import Lesson, fit_filter, make_lessons, psnr, train_network, with_gates
+from wlm.smoke.transport.gating import FACTS, fit_gate, gate
+from wlm.smoke.transport.learning import Lesson, fit_filter, make_lessons, psnr, train_network, with_gate
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.samples import ALBEDOS, Sample, draw_view, make_sample
@@ -56,30 +57,39 @@ def test_the_network_is_worth_its_name_and_never_worse(lessons):
     assert holds(model)
     random = torch.Generator().manual_seed(1)
     last = 0.3 * torch.randn(model.arrays["last"].shape, generator=random)
-    untrained = OrdersModel(model.arrays | {"last": last, "gates": torch.ones(len(ALBEDOS))})
+    untrained = OrdersModel(model.arrays | {"last": last, "gate_bias": torch.full((1,), 50.0)})
     assert not holds(untrained)
-    # The gates shut it out, and a network that adds nothing adds nothing.
-    shut = with_gates(untrained, lessons)
-    assert not shut.arrays["gates"].any() and not holds(shut) and max(map(abs, gains(shut))) == 0.0
+    # A gate that is fitted to it shuts it out, and a network that adds nothing adds nothing.
+    shut = with_gate(untrained, lessons)
+    assert min(gains(shut)) > -0.02 and not holds(shut)
+
+
+def test_a_gate_tells_lights_that_gain_from_those_that_lose():
+    """By a fact that differs between them; where there is none to tell them by, nothing is taken."""
+    random = torch.Generator().manual_seed(2)
+    told = torch.randn(400, FACTS, generator=random)
+    good = told[:, 4] > 0
+    told[:, 4] += 2.0 * told[:, 4].sign()
+    gains = torch.where(good[:, None], torch.tensor([0.0, 0.3, 0.5, 0.6]), torch.tensor([0.0, -0.1, -0.3, -0.5]))
+    share = gate(fit_gate(told, gains), told)
+    assert share[good].mean() > 0.08 and share[~good].max() < 0.01 and share.max() <= 0.75
+    mixed = gains[torch.randperm(400, generator=random)]
+    assert gate(fit_gate(told, mixed), told).max() < 0.05
+    # What isn't a number counts as usual, and the picture has numbers.
+    told[0, 3] = math.nan
+    assert torch.isfinite(gate(fit_gate(told[1:], gains[1:]), told)).all()
 
 
 def test_far_from_what_it_was_trained_on_the_network_is_left_out(lessons):
+    """Smoke as deep as none that was learned, and lights behind the camera and before it."""
     model = load_orders()
-    inputs = lessons[0].inputs
-    high = float(model.arrays["range"][1])
-    beyond = replace(inputs, depth=high + 1.0)
-    assert model.trust(replace(inputs, depth=high)) == 1.0 and 0 < model.trust(replace(inputs, depth=high + 0.2)) < 1
-    assert torch.equal(model.multiple(beyond), model.filtered(beyond))
-
-
-def test_a_correction_too_small_to_matter_is_left_out(lessons):
-    """What the network adds is all taken where it is large, and nothing where it is a twentieth of the light."""
-    model, inputs = load_orders(), lessons[0].inputs
-    filtered = model.filtered(inputs)
-    shares = [float(model.worth(inputs, filtered, share * filtered)[0]) for share in (0.0, 0.05, 0.08, 0.11)]
-    assert shares == pytest.approx([0.0, 0.0, 0.5, 1.0], abs=1e-4)
-    small = OrdersModel(model.arrays | {"last": 0.01 * model.arrays["last"]})
-    assert torch.equal(small.multiple(inputs), filtered) and not torch.equal(model.multiple(inputs), filtered)
+    low, high = model.arrays["range"]
+    inputs = replace(lessons[0].inputs, cosine=0.3, depth=0.5 * (low + high))
+    assert model.trust(inputs) == 1.0 and model.trust(replace(inputs, depth=high)) == 1.0
+    assert 0 < model.trust(replace(inputs, depth=high + 0.2)) < 1 and 0 < model.trust(replace(inputs, cosine=-0.8)) < 1
+    for other in ({"depth": high + 1.0}, {"depth": low - 1.0}, {"cosine": 0.95}, {"cosine": -0.95}):
+        beyond = replace(inputs, **other)
+        assert torch.equal(model.multiple(beyond), model.filtered(beyond))
 
 
 @pytest.mark.parametrize("cells", [32, 64])
@@ -92,11 +102,11 @@ def test_on_no_grid_is_the_network_worse_than_its_input(cells: int):
         camera = Camera.around(volume, toward=random.normal(size=3), pixels=20)
         lights = [Light(tuple(map(float, random.normal(size=3)))) for _ in range(2)]
         traced = trace(volume, camera, lights, samples=192, seed=number).planes.sum(1)[..., 0]
-        made = make_inputs(volume, light_smoke(volume, camera, lights, COARSE), ambient(volume, camera))
+        made = make_inputs(volume, light_smoke(volume, camera, lights, orders_march(volume)), ambient(volume, camera))
         for inputs, light in zip(made, traced, strict=True):
             both = (psnr(model.light(inputs, (1.0,) * 3, network=n)[..., 0], light) for n in (True, False))
             gains.append(next(both) - next(both))
-    assert min(gains) > -0.1 and np.mean(gains) > 0.1
+    assert min(gains) > -0.01 and np.mean(gains) > 0.1
 
 
 @pytest.mark.parametrize("kind", ["directional", "point", "perspective"])
@@ -170,7 +180,7 @@ def test_features_are_blurred_and_shifted_planes(device: str):
     volume = plume(device=device)
     camera = Camera.around(volume, toward=(0.1, 0.2, 1.0), pixels=44)
     camera = replace(camera, width=52)
-    lit = LitSmoke((light,), planes[:1, 0], planes[:1, 1], clear, None, clear, camera, COARSE)
+    lit = LitSmoke((light,), planes[:1, 0], planes[:1, 1], clear, None, clear, camera, orders_march(volume))
     inputs = make_inputs(volume, lit, planes[1, 1])[0]
     single, opposite, opacity = planes[0, 0], planes[0, 1], 1 - clear
     bases = [single, opposite, planes[1, 1], opacity, opacity**2, -clear.log() / 9, single**2, single * opacity]
@@ -227,7 +237,7 @@ def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
     once, picture = made.lit.shade(albedo=(1.0, 1.0, 0.0)), made.shade()
     assert torch.isfinite(picture).all() and (picture >= 0.999 * once).all() and not picture[..., 2].any()
     share = float(picture[..., 0].mean() / wanted[..., 0].mean())
-    assert share == pytest.approx(1.0, abs=0.2) if within == "camera" else 0.15 < share < 1.2
+    assert share == pytest.approx(1.0, abs=0.2)
 
 
 def test_files_of_models(tmp_path):
@@ -241,7 +251,8 @@ def test_files_of_models(tmp_path):
     wrong = {
         "weights": torch.zeros(3, 3),
         "spread": torch.zeros_like(model.arrays["spread"]),
-        "gates": torch.full((len(ALBEDOS),), 2.0),
+        "gate_spread": torch.zeros(FACTS),
+        "range": torch.tensor([2.0, 1.0]),
         "first": model.arrays["first"] * math.inf,
     }
     for name, array in wrong.items():
@@ -262,7 +273,7 @@ def test_inputs_hold_for_any_image(device: str):
     made = []
     for pixels in (24, 48, 96):
         camera = Camera.around(volume, pixels=pixels)
-        lit = light_smoke(volume, camera, [Light((1.0, 0.5, 0.6))], COARSE)
+        lit = light_smoke(volume, camera, [Light((1.0, 0.5, 0.6))], orders_march(volume))
         inputs = make_inputs(volume, lit, ambient(volume, camera))[0]
         made.append(torch.nn.functional.avg_pool2d(model.filtered(inputs), pixels // 24))
     for finer in made[1:]:

@@ -11,10 +11,11 @@ from wlm.smoke.baking import bake
 from wlm.smoke.camera import weights
 from wlm.smoke.data import read_six_way
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import COARSE
 from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.sphere import bake_sphere, half_sphere
+from wlm.smoke.transport.lights import half_sphere
+from wlm.smoke.transport.sphere import bake_sphere
+from wlm_kernels.smoke.settings import March
 
 
 def lights(count: int = 12) -> list[Light]:
@@ -39,7 +40,7 @@ def test_random_lights_are_nearer_than_by_the_axes(device: str):
     ways = half_sphere(16)
     weigh = torch.tensor(np.concatenate([weights(ways), weights(-ways)]), dtype=torch.float32, device=device)
     fitted = [Light(tuple(map(float, way @ camera.axes))) for way in ways]
-    lit = light_smoke(volume, camera, fitted, COARSE)
+    lit = light_smoke(volume, camera, fitted, March(step=1.0, jitter=0.0))
     planes = torch.cat([lit.planes, lit.opposite])
 
     def error(maps: torch.Tensor) -> torch.Tensor:

@@ -51,6 +51,8 @@ TABLES: dict[str, dict[str, Figure]] = {
         "psnr": Figure("PSNR", "dB", ".2f"),
         "psnr_min": Figure("least", "dB", ".2f"),
         "psnr_max": Figure("most", "dB", ".2f"),
+        "gain": Figure("gain", "dB", "+.3f"),  # of a PSNR over another method's
+        "gain_min": Figure("least gain", "dB", "+.3f"),
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "texel_psnr_min": Figure("least", "dB", ".2f"),

@@ -18,6 +18,8 @@ smoke would give no better ones. A reference is the mean of two traced apart: "p
 their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible, after
 the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
 
+Rows of what the network adds, light by light on grids of every size, are those of `smoke_grids`.
+
 A time is of a whole picture, from the smoke to the shaded image: on CUDA one graph, but for the path tracer and the
 denoiser, which are calls.
 """
@@ -34,6 +36,7 @@ from wlm.baselines.smoke_orders import CELLS, FITTED, diffused, octaves, three_o
 from wlm.bench.path_tracer import denoised_picture, denoiser_device, has_denoiser
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
+from wlm.bench.smoke_grids import GridSizes, grid_rows
 from wlm.bench.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.flip import flip_display
@@ -82,6 +85,7 @@ class OrdersSizes:
         sides: From which it is seen.
         diffusion: Cells along the longest edge of the grid of diffusion.
         repeats: Samples of a time.
+        single: Of the rows of `smoke_grids`.
     """
 
     plumes: int
@@ -94,6 +98,7 @@ class OrdersSizes:
     sides: int
     diffusion: int
     repeats: int
+    single: GridSizes
 
 
 FULL = OrdersSizes(
@@ -107,6 +112,7 @@ FULL = OrdersSizes(
     sides=4,
     diffusion=CELLS,
     repeats=10,
+    single=GridSizes((32, 64, 128, 256, 400, 512), extinctions=(2.5, 8.0, 25.0, 80.0), pixels=192, samples=512),
 )
 """For a GPU."""
 
@@ -121,6 +127,7 @@ QUICK = OrdersSizes(
     sides=2,
     diffusion=CELLS,
     repeats=2,
+    single=GridSizes((32, 64, 128), extinctions=(8.0, 25.0), pixels=24, samples=256),
 )
 """For a CPU."""
 
@@ -170,7 +177,7 @@ def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -
     rows = []
     for name, shots in (("plumes", plumes), ("jet", jet)):
         rows += _scored(bench, name, shots, sizes)
-    return rows
+    return rows + grid_rows(bench, sizes.single)
 
 
 def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
@@ -298,7 +305,10 @@ def _flicker(
     halves: Sequence[tuple[torch.Tensor, torch.Tensor]],
     opacity: Sequence[torch.Tensor],
 ) -> dict[str, float]:
-    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'."""
+    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'.
+
+    References that change by no more than their noise, whose product isn't above 0, have nothing to be compared with.
+    """
     power, wanted, count = 0.0, 0.0, 0
     for n, shot in enumerate(shots):
         if shot.motion is None:
@@ -309,14 +319,15 @@ def _flicker(
             warped, inside = warp(before, moved[None])
             return 255.0 * (after - warped)[0][:, (opacity[n] > _VISIBLE) & (inside[0, 0] > 0)]
 
-        own = change(pictures[n - 1], pictures[n])
+        changed = change(pictures[n - 1], pictures[n])
         one, other = (change(halves[n - 1][half], halves[n][half]) for half in (0, 1))
-        power += float(own.square().sum())
+        power += float(changed.square().sum())
         wanted += float((one * other).sum())
-        count += own.numel()
+        count += changed.numel()
     if not count:
         return {}
-    return {"flicker": (power / count) ** 0.5, "flicker_ratio": (power / wanted) ** 0.5 if wanted > 0 else math.nan}
+    own = {"flicker": (power / count) ** 0.5}
+    return own | {"flicker_ratio": (power / wanted) ** 0.5} if wanted > 0 else own
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
     from wlm.smoke.data import Frames
     from wlm.smoke.scene import Scene
-    from wlm.smoke.transport.lights import AnyLight
+    from wlm.smoke.transport.lights import AnyLight, Environment
     from wlm.smoke.transport.tracing import Transport
 
 _Lights = Annotated[
@@ -26,6 +26,7 @@ _Points = Annotated[
     list[str] | None,
     typer.Option("--point", metavar="X,Y,Z[:R,G,B]", help="A light's place and its intensity; repeat for more."),
 ]
+_Sky = Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")]
 _Albedo = Annotated[
     str, typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, one number or three.")
 ]
@@ -47,6 +48,7 @@ def light(
     options: SmokeOptions,
     lights: _Lights = None,
     points: _Points = None,
+    sky: _Sky = None,
     albedo: _Albedo = "1",
     g: _G = 0.0,
     orders: Annotated[str, typer.Option(help="all: light that is scattered again too; single: once alone.")] = "all",
@@ -55,7 +57,7 @@ def light(
     ] = None,
     step: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1000.0, help="In voxels; default 1, or 1/130 of the longest edge if that is more."),
+        typer.Option(min=0.01, max=1000.0, help="In voxels; default 1/130 of the longest edge, or 1/4."),
     ] = None,
     perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
     background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
@@ -63,17 +65,17 @@ def light(
 ) -> None:
     """Light the smoke into PNGs by a march to each light itself, and predict light that is scattered more than once.
 
-    Without --light and --point the lights are the scene's, or one from 1,1,1. Obstacles of a scene are drawn and cast
-    their shadows.
+    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. A sky is twelve lights. Obstacles
+    of a scene are drawn and cast their shadows.
     """
     if orders not in ("all", "single"):
         raise WlmError(f"--orders: expected all or single, got {orders!r}")
     if model is not None and orders == "single":
         raise WlmError("--model: expected --orders all beside it")
-    colour = _albedo(albedo)
-    behind = None if background is None else vector("--background", background)
+    colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
+    behind = around if background is None else vector("--background", background)
     _check_white(white)
-    own = _lights(lights, points)
+    own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
     quiet_warp()
     from wlm.smoke.transport.features import orders_march
     from wlm.smoke.transport.filtering import load_orders, scatter
@@ -127,7 +129,7 @@ def trace(
     options: SmokeOptions,
     lights: _Lights = None,
     points: _Points = None,
-    sky: Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")] = None,
+    sky: _Sky = None,
     albedo: _Albedo = "1",
     g: _G = 0.0,
     samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths a pixel.")] = 64,
@@ -150,14 +152,11 @@ def trace(
     own = _lights(lights, points)
     quiet_warp()
     from wlm.smoke.scene import obstacle_mesh
-    from wlm.smoke.transport.lights import Environment
     from wlm.smoke.transport.tracing import HIGHEST, trace
     from wlm.view.atlas import save_png
     from wlm.view.smoke import to_bytes
 
-    environment = None
-    if around is not None:
-        environment = _checked("--sky", lambda: Environment.even(around))
+    environment = None if around is None else _even(around)
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     scene = frames.scene
@@ -236,6 +235,13 @@ def _checked(option: str, make: Callable[[], Any]) -> Any:
         return make()
     except ValueError as error:
         raise WlmError(f"{option}: {error}") from error
+
+
+def _even(colour: tuple[float, float, float]) -> "Environment":
+    """The sky of `--sky`."""
+    from wlm.smoke.transport.lights import Environment
+
+    return _checked("--sky", lambda: Environment.even(colour))
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":

@@ -17,9 +17,6 @@ from wlm.smoke.transport.lights import AnyLight, PointLight
 from wlm_kernels.smoke import scales
 from wlm_kernels.smoke.settings import March
 
-COARSE = March(step=1.0, jitter=0.0)
-"""The march whose planes the filter was fitted to, on smoke of 40 to 64 voxels."""
-
 SCALES = (1 / 64, 1 / 32, 1 / 16, 1 / 8)
 """Standard deviations of blurs, in edges of the smoke's box."""
 
@@ -27,7 +24,8 @@ BASES, SHIFTED = 9, 3
 FEATURES = 2 * (BASES + (BASES + SHIFTED) * len(SCALES))
 
 _THINNEST = 1e-4  # transparency below which depths count the same
-_STEPS = 130  # through the box, at most, of a march for light of all orders
+_STEPS = 130  # through the box, of a march for light of all orders
+_SHORTEST = 0.25  # voxels: of a march in shorter steps nothing is left to gain
 _AROUND = 64  # steps through the box that light from all around is marched in, at most
 
 
@@ -51,9 +49,9 @@ class Inputs:
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """A march whose steps are a 130th of the smoke's longest edge, or a voxel where those are longer: as `COARSE`, or
-    finer than that was on the smoke of the fit."""
-    return replace(COARSE, step=max(COARSE.step, max(volume.shape) / _STEPS), g=g)
+    """The march whose planes the filter is fitted to: in steps of a 130th of the smoke's longest edge, whatever the
+    voxels are, but of no less than a quarter of one."""
+    return March(step=max(_SHORTEST, max(volume.shape) / _STEPS), jitter=0.0, g=g)
 
 
 def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:
@@ -69,11 +67,12 @@ def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:
     return small
 
 
-def ambient(volume: DensityVolume, camera: Camera, march: March = COARSE) -> torch.Tensor:
+def ambient(volume: DensityVolume, camera: Camera, march: March | None = None) -> torch.Tensor:
     """Light from all around, scattered once: the mean under lights along the camera's six axes, [H, W].
 
-    It is smooth: steps are as long as a 64th of the box, if those of the march are shorter.
+    It is smooth: steps are as long as a 64th of the box, if those of the march (None: `orders_march`) are shorter.
     """
+    march = orders_march(volume) if march is None else march
     march = replace(march, step=max(march.step, max(volume.shape) / _AROUND))
     with marching(volume, camera, march) as scene:
         planes = torch.empty(len(camera.axes), 2, camera.height, camera.width, device=volume.device)

@@ -3,8 +3,9 @@
 Light that is scattered on spreads through the smoke and comes out blurred. So the planes that a march makes anyway say
 most of it: light of the light itself, of the opposite one, from all around, and opacity. They are blurred at scales of
 the smoke's box (never of pixels: a filter holds for any image), shifted along the light, and mixed linearly, with
-weights that depend on the angle between light and camera and were found by least squares against path tracing. What is
-left a small network predicts from the same planes, pixel by pixel; gates say how much of its correction is taken.
+weights that depend on the angle between light and camera and on the smoke's mean depth, and were found by least squares
+against path tracing. What is
+left a small network predicts from the same planes, pixel by pixel; a gate says how much of its correction is taken.
 
 Of an albedo a all light is a S + a^2 R(a), where S was scattered once and R more often. The filter predicts R at the
 albedos of `samples.ALBEDOS`, between which it is linear.
@@ -27,35 +28,58 @@ from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Ramp
+from wlm.smoke.transport import gating
+from wlm.smoke.transport.diffusion import scattered_again, share_of, thrown_by_fire
 from wlm.smoke.transport.features import FEATURES, Inputs, aim, ambient, input_maker, orders_march
-from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.lights import AnyLight, checked_albedo
+from wlm.smoke.transport.gating import FAINT
+from wlm.smoke.transport.lighting import LitSmoke, light_smoke, marching
+from wlm.smoke.transport.lights import AnyLight, PointLight, checked_albedo
 from wlm.smoke.transport.samples import ALBEDOS
 from wlm_kernels.smoke.settings import March
 
 HIDDEN = 48
-ANGLES = 3  # powers of the cosine between light and camera
+MIXES = 6  # products of powers of the cosine between light and camera and of the depth, which weights are for
 CONDITIONS = 3  # that the network has besides the features: that cosine, the albedo, the optical depth
-FAINT = 0.03
-"""Light below which an error counts the same."""
-
 _BRIGHTEST = 6.0  # light of all orders over opacity: a white surface under irradiance 4 pi has 4
 _SHIPPED = Path(__file__).resolve().parents[2] / "data" / "smoke-orders.npz"
-_LEAST, _WORTH = 0.06, 0.1  # RMS of a correction over the light's: none is taken up to the first, all from the second
+_LEAST, _WORTH = 0.13, 0.195  # RMS of a correction over the light's: none is taken up to the first, all from the second
+_ASIDE, _ALONG = (
+    0.75,
+    0.9,
+)  # cosines between light and camera, up or down: all is taken up to the first, none from the second
 _BEYOND = 0.5  # of the logarithm of optical depth beyond training over which a correction fades
 _SHAPES = {
-    "weights": (len(ALBEDOS), FEATURES * ANGLES),
+    "weights": (len(ALBEDOS), FEATURES * MIXES),
     "mean": (FEATURES,),
     "spread": (FEATURES,),
-    "gates": (len(ALBEDOS),),
     "range": (2,),
     "first": (HIDDEN, FEATURES + CONDITIONS),
     "first_bias": (HIDDEN,),
     "second": (HIDDEN, HIDDEN),
     "second_bias": (HIDDEN,),
     "last": (HIDDEN,),
+    **gating.FIT,
 }
 _MOST_NUMBERS = 1 << 20
+
+
+def all_light(inputs: Inputs, albedo: float, multiple: torch.Tensor) -> torch.Tensor:
+    """All light of an albedo, [H, W], of R: no more than a white surface's, and no less than was scattered once."""
+    total = albedo * inputs.single + albedo**2 * multiple
+    return torch.minimum(total, _BRIGHTEST * inputs.opacity).maximum(albedo * inputs.single)
+
+
+def mixes(inputs: Inputs, known: torch.Tensor) -> torch.Tensor:
+    """What the filter's weights are mixed by, [MIXES].
+
+    Args:
+        inputs: Of a light.
+        known: The least and the greatest depth that were learned, as in `Inputs`; beyond them it is as there.
+    """
+    low, high = known
+    depth = ((2.0 * inputs.depth - low - high) / (high - low)).clamp(-1.0, 1.0)
+    one, cosine = torch.ones_like(depth), inputs.cosine
+    return torch.stack([one, cosine * one, cosine**2 * one, depth, depth.square(), cosine * depth])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +88,7 @@ class OrdersModel:
 
     Attributes:
         arrays: By name float32 tensors: "weights" of the filter, "first" and so on of the network, "mean" and "spread"
-            of its inputs, the "range" of the depths that it was trained on, and its "gates", 0 to 1 for each albedo.
+            of its inputs, the "range" of the depths that it was trained on, and "gate_weights" and so on of its gate.
     """
 
     arrays: dict[str, torch.Tensor]
@@ -82,16 +106,12 @@ class OrdersModel:
     def _elsewhere(self) -> dict[torch.device, "OrdersModel"]:
         return {}
 
-    @functools.cached_property
-    def gates(self) -> tuple[float, ...]:
-        """Share of the correction that is taken at each of `ALBEDOS`."""
-        return tuple(self.arrays["gates"].tolist())
-
     def filtered(self, inputs: Inputs, nodes: Sequence[int] = range(len(ALBEDOS))) -> torch.Tensor:
         """R by the filter alone, [N, H, W], at some of `ALBEDOS` by number."""
-        weights = self.arrays["weights"].reshape(len(ALBEDOS), ANGLES, FEATURES)
+        weights = self.arrays["weights"].reshape(len(ALBEDOS), MIXES, FEATURES)
+        mix = mixes(inputs, self.arrays["range"])
         # An index in a list would be copied to the device, which a graph can't capture.
-        mixed = torch.stack([sum(inputs.cosine**n * weights[node, n] for n in range(ANGLES)) for node in nodes])
+        mixed = torch.stack([mix @ weights[node] for node in nodes])
         return (mixed @ inputs.features.flatten(1)).unflatten(1, inputs.features.shape[1:]).clamp(min=0.0)
 
     def correction(self, inputs: Inputs, filtered: torch.Tensor, nodes: Sequence[int]) -> torch.Tensor:
@@ -116,30 +136,31 @@ class OrdersModel:
         return torch.nan_to_num(added, 0.0, 0.0, 0.0)
 
     def trust(self, inputs: Inputs) -> torch.Tensor:
-        """Share of the correction that is taken for smoke of a depth: 1 in the range of the training, 0 far from it."""
+        """Share of the correction that is taken of a light: 1 for smoke of a depth in the range of the training under a
+        light from aside; 0 far from that range, and of a light that is behind the camera or before it, under which
+        what is seen says least of how deep the smoke is."""
         low, high = self.arrays["range"]
         beyond = torch.maximum(low - inputs.depth, inputs.depth - high).clamp(min=0.0)
-        return (1.0 - beyond / _BEYOND).clamp(min=0.0)
+        aside = min(max((_ALONG - abs(inputs.cosine)) / (_ALONG - _ASIDE), 0.0), 1.0)
+        return aside * (1.0 - beyond / _BEYOND).clamp(min=0.0)
 
-    def worth(self, inputs: Inputs, filtered: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
-        """Share of each correction that is taken for its size, [N, 1, 1]: where little is to be corrected, the network
-        errs by about as much."""
-        parts = [(inputs.opacity * light.square()).sum((1, 2), keepdim=True) for light in (correction, filtered)]
-        size = (parts[0] / parts[1].clamp(min=1e-12)).sqrt()
-        return ((size - _LEAST) / (_WORTH - _LEAST)).clamp(0.0, 1.0)
+    def share(
+        self, inputs: Inputs, filtered: torch.Tensor, correction: torch.Tensor, nodes: Sequence[int]
+    ) -> torch.Tensor:
+        """What is taken of a correction at each albedo, [N]."""
+        told = gating.facts(inputs, filtered, correction, [ALBEDOS[node] for node in nodes])
+        return self.trust(inputs) * gating.gate(self.arrays, told)
 
     def multiple(
         self, inputs: Inputs, nodes: Sequence[int] = range(len(ALBEDOS)), *, network: bool = True
     ) -> torch.Tensor:
         """R at some of `ALBEDOS` by number, [N, H, W]."""
         filtered = self.filtered(inputs, nodes)
-        gates = [self.gates[node] for node in nodes]
-        if not network or not any(gates):
+        if not network:
             return filtered
         correction = self.correction(inputs, filtered, nodes)
-        correction = self.trust(inputs) * self.worth(inputs, filtered, correction) * correction
-        planes = [plane + gate * more for plane, more, gate in zip(filtered, correction, gates, strict=True)]
-        return torch.stack(planes).clamp(min=0.0)
+        share = self.share(inputs, filtered, correction, nodes)
+        return (filtered + share[:, None, None] * correction).clamp(min=0.0)
 
     def light(self, inputs: Inputs, albedo: Sequence[float], *, network: bool = True) -> torch.Tensor:
         """All light of one light of irradiance 4 pi, [H, W, 3].
@@ -154,10 +175,7 @@ class OrdersModel:
         multiple = dict(zip(nodes, self.multiple(inputs, nodes, network=network), strict=True))
         colours = {}
         for value, share in shares.items():
-            more = sum(part * multiple[node] for node, part in share.items())
-            total = value * inputs.single + value**2 * more
-            # Beside a light within the smoke light scattered once alone may be brighter, and is exact.
-            colours[value] = torch.minimum(total, _BRIGHTEST * inputs.opacity).maximum(value * inputs.single)
+            colours[value] = all_light(inputs, value, sum(part * multiple[node] for node, part in share.items()))
         return torch.stack([colours[float(value)] for value in albedo], -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -197,8 +215,10 @@ def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
             raise WlmError(f"{path}: {name}: expected finite float32 {shape}, found {array.dtype} {array.shape}")
     if not (arrays["spread"] > 0).all():
         raise WlmError(f"{path}: spread: expected numbers above 0")
-    if not ((arrays["gates"] >= 0) & (arrays["gates"] <= 1)).all():
-        raise WlmError(f"{path}: gates: expected numbers of 0 to 1")
+    if not (arrays["gate_spread"] > 0).all():
+        raise WlmError(f"{path}: gate_spread: expected numbers above 0")
+    if not arrays["range"][0] < arrays["range"][1]:
+        raise WlmError(f"{path}: range: expected the least depth before the greatest, found {arrays['range'].tolist()}")
     return OrdersModel({name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
@@ -265,15 +285,40 @@ def scatter(
             even = light_smoke(alike, camera, lights, march)
         planes = torch.empty((*lit.planes.shape, 3), device=volume.device)
         make = input_maker(alike, even, ambient(alike, camera, march))
-        for n in range(len(lights)):
-            planes[n] = model.light(make(n), thinner, network=network)
-            if (factor := aim(lights[n], volume)[1]) != 1.0:
-                planes[n] /= factor
+        for n, light in enumerate(lights):
+            near = share_of(light, alike)
+            if near < 1.0:
+                planes[n] = model.light(make(n), thinner, network=network) / aim(light, volume)[1]
+            if near > 0.0:
+                diffused = _diffused(alike, even, light, n, thinner)
+                planes[n] = diffused if near == 1.0 else torch.lerp(planes[n], diffused, near)
             if even is not lit:
                 for channel in range(3):
                     once = colour[channel] * lit.planes[n] - thinner[channel] * even.planes[n]
                     planes[n, ..., channel] = (planes[n, ..., channel] + once).clamp(min=0.0)
+        if volume.temperature is not None:
+            values, places = _apart(thinner)
+            with marching(alike, camera, march) as scene:
+                thrown = thrown_by_fire(scene, alike, values)
+            lit = replace(lit, thrown=torch.stack([thrown[place] for place in places], -1))
     return ScatteredSmoke(lit, planes)
+
+
+def _diffused(
+    volume: DensityVolume, lit: LitSmoke, light: PointLight, number: int, albedo: Sequence[float]
+) -> torch.Tensor:
+    """All light of a point light by diffusion, [H, W, 3]."""
+    values, places = _apart(albedo)
+    with marching(volume, lit.camera, lit.march) as scene:
+        more = scattered_again(scene, volume, light, values)
+    once = lit.planes[number]
+    return torch.stack([value * once + more[place] for value, place in zip(albedo, places, strict=True)], -1)
+
+
+def _apart(albedo: Sequence[float]) -> tuple[list[float], list[int]]:
+    """The albedos of the channels, each once, and which of them each channel has."""
+    values = sorted(set(map(float, albedo)))
+    return values, [values.index(float(value)) for value in albedo]
 
 
 @functools.cache

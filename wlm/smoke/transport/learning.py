@@ -10,22 +10,24 @@ from dataclasses import dataclass
 import torch
 
 from wlm.smoke.planes import to_srgb
-from wlm.smoke.transport.features import COARSE, FEATURES, Inputs, ambient, blur, make_inputs
+from wlm.smoke.transport.features import FEATURES, Inputs, ambient, blur, make_inputs, orders_march
 from wlm.smoke.transport.filtering import (
-    ANGLES,
     CONDITIONS,
-    FAINT,
     HIDDEN,
+    MIXES,
     OrdersModel,
+    all_light,
+    mixes,
 )
+from wlm.smoke.transport.gating import FAINT, FIT, GAINS, facts, fit_gate
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.samples import ALBEDOS, Sample
 
 _RIDGE = 1e-5
+_RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end that aren't known, and the least range
+_CLEAR = 1e-3  # opacity below which there is nothing to be learned: light is bounded by it
 _CURVE = 1.16  # twice the power of light that sRGB's slope falls with
 _DECAY = 0.02  # of weights
-_LOSS = 0.1  # dB that a gate may cost a picture, of those that it is set on
-_GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +45,14 @@ class Lesson:
     def weights(self) -> torch.Tensor:
         """Of square errors of R, such that they are about those of pictures in sRGB, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
-        return albedo**4 / (blur(self.light, 1.0).clamp(min=0.0) + FAINT) ** _CURVE
+        seen = self.inputs.opacity > _CLEAR
+        return seen * albedo**4 / (blur(self.light, 1.0).clamp(min=0.0) + FAINT) ** _CURVE
 
 
 def make_lessons(sample: Sample) -> list[Lesson]:
     """The lights of a sample, marched."""
-    lit = light_smoke(sample.volume, sample.camera, sample.lights, COARSE)
-    made = make_inputs(sample.volume, lit, ambient(sample.volume, sample.camera, COARSE))
+    lit = light_smoke(sample.volume, sample.camera, sample.lights, orders_march(sample.volume))
+    made = make_inputs(sample.volume, lit, ambient(sample.volume, sample.camera))
     return [Lesson(inputs, light) for inputs, light in zip(made, sample.light, strict=True)]
 
 
@@ -62,23 +65,26 @@ def fit_filter(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
         seed: Of these, and of the network's first weights.
     """
     device = lessons[0].light.device
-    size = FEATURES * ANGLES
-    left = torch.zeros(len(ALBEDOS), size, size, dtype=torch.float64, device=device)
-    right = torch.zeros(len(ALBEDOS), size, dtype=torch.float64, device=device)
+    size, nodes = FEATURES * MIXES, range(len(ALBEDOS))
+    depths = torch.tensor([float(lesson.inputs.depth) for lesson in lessons], dtype=torch.float64)
+    low, high = (float(torch.quantile(depths, share)) for share in (_RARE, 1.0 - _RARE))
+    known = torch.tensor([low, max(high, low + _NARROWEST)], device=device)
+    left = torch.zeros(len(ALBEDOS), MIXES, FEATURES, MIXES, FEATURES, dtype=torch.float64, device=device)
+    right = torch.zeros(len(ALBEDOS), MIXES, FEATURES, dtype=torch.float64, device=device)
     random = torch.Generator().manual_seed(seed)
     moments = torch.zeros(2, FEATURES, dtype=torch.float64, device=device)
-    depths = []
     for lesson in lessons:
         features = lesson.inputs.features.flatten(1).double()
         chosen = torch.randperm(features.shape[1], generator=random)[:pixels].to(device)
         features = features[:, chosen]
         moments += torch.stack([features.mean(1), features.square().mean(1)]) / len(lessons)
-        rows = torch.cat([features * lesson.inputs.cosine**n for n in range(ANGLES)])
         target, weights = (part.flatten(1)[:, chosen].double() for part in (lesson.multiple(), lesson.weights()))
-        for node in range(len(ALBEDOS)):
-            left[node] += (rows * weights[node]) @ rows.T
-            right[node] += rows @ (weights[node] * target[node])
-        depths.append(float(lesson.inputs.depth))
+        # All of a lesson's pixels have one mix: its square times that of the features is the whole's.
+        mix = mixes(lesson.inputs, known).double()
+        squares = torch.stack([(features * weights[node]) @ features.T for node in nodes])
+        left += (mix[:, None] * mix)[None, :, None, :, None] * squares[:, None, :, None, :]
+        right += mix[None, :, None] * ((weights * target) @ features.T)[:, None]
+    left, right = left.reshape(len(ALBEDOS), size, size), right.reshape(len(ALBEDOS), size)
     diagonal = left.diagonal(dim1=1, dim2=2)
     left += _RIDGE * torch.diag_embed(diagonal + 1e-3 * diagonal.mean(1, keepdim=True))
     spread = (moments[1] - moments[0].square()).clamp(min=1e-8).sqrt()
@@ -87,8 +93,8 @@ def fit_filter(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
         "weights": torch.linalg.solve(left, right),
         "mean": moments[0],
         "spread": spread,
-        "gates": torch.zeros(len(ALBEDOS)),
-        "range": torch.tensor([min(depths), max(depths)]),
+        **{name: torch.ones(shape) for name, shape in FIT.items()},
+        "range": known,
         "first": first,
         "first_bias": torch.zeros(HIDDEN),
         "second": second,
@@ -109,12 +115,12 @@ def train_network(
     seed: int = 0,
     report: Callable[[int, float], None] | None = None,
 ) -> OrdersModel:
-    """Trains the network of a fitted model, and sets its gates on lessons that it hasn't learned from.
+    """Trains the network of a fitted model, and fits its gate on lessons that it hasn't learned from.
 
     Args:
         model: Of `fit_filter`.
         lessons: At least one.
-        held_out: For the gates, of other smoke.
+        held_out: For the gate, of other smoke; at least one.
         steps: Each of one lesson.
         pixels: Of the lesson in a step.
         rate: The largest step size, which falls to 0.
@@ -153,30 +159,24 @@ def train_network(
         if report is not None and step % 100 == 0:
             report(step, error)
     final = {name: array.detach() for name, array in trained.items()}
-    return with_gates(OrdersModel(model.arrays | final), held_out)
+    return with_gate(OrdersModel(model.arrays | final), held_out)
 
 
-def with_gates(model: OrdersModel, held_out: Sequence[Lesson]) -> OrdersModel:
-    """The model with the gates that are best on some lessons and make none of them worse by 0.1 dB; 0 if none does.
-
-    A lesson's own noise is a part of each error alike.
-    """
-    gates = torch.zeros(len(ALBEDOS))
-    for node, albedo in enumerate(ALBEDOS):
-        best = 0.0
-        errors = torch.zeros(len(_GATES), len(held_out))
-        for number, lesson in enumerate(held_out):
-            filtered = model.filtered(lesson.inputs, [node])
-            correction = model.correction(lesson.inputs, filtered, [node])
-            for n, gate in enumerate(_GATES):
-                more = (filtered + gate * correction)[0].clamp(min=0.0)
-                light = albedo * lesson.inputs.single + albedo**2 * more
-                errors[n, number] = psnr(light, lesson.light[node])
-        for n, gate in enumerate(_GATES):
-            gain = errors[n] - errors[0]
-            if len(held_out) and float(gain.min()) >= -_LOSS and float(gain.mean()) > best:
-                best, gates[node] = float(gain.mean()), gate
-    return OrdersModel(model.arrays | {"gates": gates.to(model.arrays["weights"])})
+def with_gate(model: OrdersModel, held_out: Sequence[Lesson]) -> OrdersModel:
+    """The model with the gate that `gating.fit_gate` finds on lessons; a lesson's own noise is a part of each error."""
+    told, gains = [], []
+    for lesson in held_out:
+        filtered = model.filtered(lesson.inputs)
+        correction = model.correction(lesson.inputs, filtered, range(len(ALBEDOS)))
+        told.append(facts(lesson.inputs, filtered, correction, ALBEDOS))
+        for node, albedo in enumerate(ALBEDOS):
+            found = []
+            for share in GAINS:
+                more = (filtered[node] + share * correction[node]).clamp(min=0.0)
+                found.append(psnr(all_light(lesson.inputs, albedo, more), lesson.light[node]))
+            gains.append([each - found[0] for each in found])
+    told = torch.cat(told)
+    return OrdersModel(model.arrays | fit_gate(told, torch.tensor(gains, device=told.device)))
 
 
 def psnr(light: torch.Tensor, reference: torch.Tensor) -> float:

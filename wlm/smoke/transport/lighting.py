@@ -41,6 +41,8 @@ class LitSmoke:
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0: none.
         camera: The view.
         march: What it was made by.
+        thrown: float32 tensor [H, W, 3], light that its own fire throws on it and that it scatters to the camera, grey
+            but for the smoke's albedo; None: it is cold, or light is scattered once alone.
     """
 
     lights: tuple[AnyLight, ...]
@@ -51,6 +53,7 @@ class LitSmoke:
     depth: torch.Tensor
     camera: Camera
     march: March
+    thrown: torch.Tensor | None = None
 
     def shade(
         self,
@@ -93,7 +96,12 @@ class LitSmoke:
                 plane = plane * visibility[..., None]
             _add(image, plane, np.asarray(colour) / (4 * math.pi))
         if self.emission is not None:
-            image += self.emission[..., None] if ramp is None else ramp(self.emission)
+            glow = self.emission[..., None] if ramp is None else ramp(self.emission)
+            image += glow
+            if self.thrown is not None:
+                # In the mean colour of the fire that is seen.
+                whole = self.emission.sum().clamp(min=1e-12)
+                image += self.thrown * (1.0 if ramp is None else glow.sum((0, 1)) / whole)
         if background is None:
             return image
         if isinstance(background, torch.Tensor) or np.ndim(background) > 1:

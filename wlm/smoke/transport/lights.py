@@ -10,6 +10,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import unit
 from wlm.smoke.shading import Light
 
+_PARTS = 64  # rows of a map, at least, whose texels are shared out to lights
 _BRIGHTEST = 1e12  # of which float32 holds products with any phase function
 
 
@@ -63,6 +64,28 @@ class Environment:
         """The same radiance from everywhere."""
         return Environment(np.asarray(colour, np.float64).reshape(1, 1, 3))
 
+    def lights(self, count: int = 12) -> tuple[Light, ...]:
+        """Directional lights in its place, spread evenly, each with the light of the directions nearest to its own.
+
+        Args:
+            count: An even number of at least 2.
+        """
+        ways = half_sphere(count // 2)
+        ways = np.concatenate([ways, -ways])
+        values = np.asarray(self.radiance, np.float64)
+        # Texels in parts, such that none has more than one light's directions and a little.
+        down, along = (-(-least // n) for least, n in zip((_PARTS, 2 * _PARTS), values.shape, strict=False))
+        values = values.repeat(down, 0).repeat(along, 1)
+        rows, columns = values.shape[:2]
+        edges = np.cos(np.pi * np.arange(rows + 1) / rows)
+        height, turn = 0.5 * (edges[:-1] + edges[1:]), 2.0 * np.pi * (np.arange(columns) + 0.5) / columns
+        across = np.sqrt(1.0 - height**2)[:, None]
+        places = np.stack(np.broadcast_arrays(across * np.cos(turn), height[:, None], across * np.sin(turn)), -1)
+        power = values * ((edges[:-1] - edges[1:]) * 2.0 * np.pi / columns)[:, None, None]
+        nearest = (places @ ways.T).argmax(-1).ravel()
+        sums = np.stack([np.bincount(nearest, power[..., c].ravel(), len(ways)) for c in range(3)], -1)
+        return tuple(Light(tuple(map(float, way)), tuple(map(float, e))) for way, e in zip(ways, sums, strict=True))
+
     def chances(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Running sums of the chances of rows [R] and of columns within their rows [R, C], and the mean's integral."""
         mean = np.asarray(self.radiance, np.float64).mean(-1)
@@ -75,6 +98,14 @@ class Environment:
         row = power.sum(1)
         along = np.cumsum(power, 1) / np.where(row > 0, row, 1.0)[:, None]
         return np.cumsum(row) / total, along, float(total)
+
+
+def half_sphere(count: int) -> np.ndarray:
+    """Directions on one half of the sphere that are evenly spread with their opposites, float64 [count, 3]."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), height, across * np.sin(turn)], -1)
 
 
 def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:

@@ -13,8 +13,10 @@ from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
+from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.lights import half_sphere
 from wlm_kernels.smoke.settings import March
 
 _ROUNDS = 100  # of the descent to maps that aren't negative: one is then within 1e-4 of the least squares
@@ -34,7 +36,7 @@ def bake_sphere(
         volume: The smoke.
         camera: Orthographic.
         lights: Directions that they are fitted to, an even number of at least 12.
-        march: To each light; None: in steps of a voxel, without jitter.
+        march: To each light; None: in steps of a voxel, without jitter, for light of all orders `orders_march`.
         albedo: None: light scattered once, of albedo 1, as in all lightmaps. A number of 0 to 1: light of all orders at
             this albedo, which `scatter` predicts.
 
@@ -48,7 +50,8 @@ def bake_sphere(
         raise ValueError("camera: expected an orthographic one for six-way lightmaps")
     if lights < 12 or lights % 2:
         raise ValueError(f"lights: expected an even number of at least 12, got {lights}")
-    march = March(step=1.0, jitter=0.0) if march is None else march
+    if march is None:
+        march = March(step=1.0, jitter=0.0) if albedo is None else orders_march(volume)
     ways = half_sphere(lights // 2)
     lamps = [Light(tuple(map(float, way @ camera.axes))) for way in ways]
     both = torch.tensor(np.stack([weights(ways), weights(-ways)]), dtype=torch.float32, device=volume.device)
@@ -63,14 +66,6 @@ def bake_sphere(
             lit, sums = made.lit, _sums(both[0], made.planes[..., 0]) + _sums(both[1], back.planes[..., 0])
         maps = _not_negative(both.flatten(0, 1).T @ both.flatten(0, 1), sums)
     return SixWay(maps, lit.transparency, lit.emission, camera, lit.depth)
-
-
-def half_sphere(count: int) -> np.ndarray:
-    """Directions on one half of the sphere that are evenly spread with their opposites, float64 [count, 3]."""
-    k = np.arange(count) + 0.5
-    height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), height, across * np.sin(turn)], -1)
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
