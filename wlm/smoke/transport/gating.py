@@ -31,7 +31,7 @@ _FARTHEST = 4.0  # standard deviations, beyond which facts count as there
 _BASES = (0, 1, 2)  # among the features light of the light itself, of the opposite one, from all around
 _THICKNESS = 5
 _DECILES = 2.563  # standard deviations between the first and the last
-_STEPS, _RATE, _DECAY, _JITTER = 1500, 1e-2, 0.05, 0.15
+_STEPS, _RATE, _DECAY, _JITTER = 3000, 5e-2, 0.05, 0.15
 
 
 def facts(inputs: Inputs, filtered: torch.Tensor, correction: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
