@@ -18,8 +18,8 @@ from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
+from wlm_kernels.smoke import diffusion, march_coarse, march_guide, march_lights, march_motion, march_six, path
 from wlm_kernels.smoke import march as smoke_march
-from wlm_kernels.smoke import march_coarse, march_guide, march_lights, march_motion, march_six, path
 
 ARCHITECTURE = 90
 MODULES = (
@@ -52,6 +52,7 @@ MODULES = (
     "raster.rasterize",
     "raster.rays",
     "raster.texture",
+    "smoke.diffusion",
     "smoke.picture",
     "smoke.scales",
     "smoke.shadow",
@@ -171,8 +172,9 @@ def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
 
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_lights_and_paths(dtype: type, tmp_path: Path):
-    """The march to lights, and the path tracer."""
+    """The march to lights, light from points by diffusion, and the path tracer."""
     _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
+    _compile_all(diffusion.point_kernels(dtype), tmp_path / "points")
     for solid in (False, True):
         _compile_all(vars(path.path_kernels(dtype, solid)).values(), tmp_path / f"path{solid}")
 

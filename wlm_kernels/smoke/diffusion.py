@@ -18,6 +18,7 @@ from wlm_kernels.smoke.march import Medium, View, absorbed, clip, marched_ray, s
 from wlm_kernels.smoke.march_coarse import by_bricks
 
 _OPTIONS = {"enable_backward": False}
+wp.set_module_options(_OPTIONS)
 _WAYS = 4096  # from a point light
 _OVER = wp.constant(1.8)  # of over-relaxation
 _ROUNDS, _SWEEPS = 4, 24
@@ -46,7 +47,7 @@ def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
         wp.atomic_add(out, a, b, c, share * light)
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel
 def _reach(
     # in:
     extinction: wp.array3d[float],
@@ -81,7 +82,7 @@ def _lost_outside(own: float, size: float) -> float:
     return 1.0 / (size * (2.0 + 0.5 * size / own))
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel
 def _couple(
     # in:
     extinction: wp.array3d[float],
@@ -132,7 +133,7 @@ def _couple(
     flows[n, i, j, k] = wp.vec4(x, y, z, 1.0 / lost)
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel
 def _relax(
     # in:
     source: wp.array4d[float],
@@ -165,7 +166,7 @@ def _relax(
 
 
 @functools.cache
-def _kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
+def point_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     """Builds (once) the kernels `shoot` and `gather` for densities of a type, `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -297,7 +298,7 @@ def shoot(
     """
     density = medium.density
     inputs = [density, bricks, medium.extinction, place, radius, step, cell, power / _WAYS]
-    wp.launch(_kernels(density.dtype)[0], _WAYS, inputs=inputs, outputs=[out], device=density.device)
+    wp.launch(point_kernels(density.dtype)[0], _WAYS, inputs=inputs, outputs=[out], device=density.device)
 
 
 def spread(
@@ -344,4 +345,4 @@ def gather(
     """
     density = medium.density
     inputs = [density, bricks, medium.extinction, view, step, cutoff, cell, light]
-    wp.launch(_kernels(density.dtype)[1], out.shape, inputs=inputs, outputs=[out], device=density.device)
+    wp.launch(point_kernels(density.dtype)[1], out.shape, inputs=inputs, outputs=[out], device=density.device)
