@@ -49,9 +49,11 @@ class Inputs:
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """The march whose planes the filter is fitted to: in steps of a 130th of the smoke's longest edge, whatever the
-    voxels are, but of no less than a quarter of one."""
-    return March(step=max(_SHORTEST, max(volume.shape) / _STEPS), jitter=0.0, g=g)
+    """The march whose planes the filter takes: in steps of a 130th of the smoke's longest edge, but of no less than a
+    quarter of a voxel, and with a lattice whose nodes are as far apart, but a voxel at least: more of them take far
+    more time, and light of all orders is a tenth of a decibel nearer by them."""
+    step = max(volume.shape) / _STEPS
+    return March(step=max(_SHORTEST, step), spacing=max(1.0, step), jitter=0.0, g=g)
 
 
 def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:
