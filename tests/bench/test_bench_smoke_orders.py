@@ -72,9 +72,9 @@ def test_a_network_that_takes_from_the_filter_is_seen():
     """By the least gain of any light; one that adds nothing has none."""
     bench_ = Bench("smoke", "cpu", None, clock="time_ms", warmup=0, repeats=1, few=1)
     model = load_orders()
-    gates = {"gates": torch.ones(5), "range": torch.tensor([-9.0, 9.0])}
-    wild = OrdersModel(model.arrays | {"last": 4.0 * model.arrays["last"]} | gates)
-    none = OrdersModel(model.arrays | {"gates": torch.zeros(5)})
+    last = {"last": 4.0 * model.arrays["last"]}
+    wild = OrdersModel(model.arrays | last | {"gate_bias": torch.full((1,), 99.0)})
+    none = OrdersModel(model.arrays | {"gate_bias": torch.full((1,), -99.0)})
     sizes = replace(SINGLE, grids=(12,))
     worst, still = (grid_rows(bench_, sizes, each)[0] for each in (wild, none))
     assert worst["gain_min"] < -0.5 and still["gain_min"] == still["gain"] == 0.0

@@ -73,7 +73,7 @@ def test_a_gate_tells_lights_that_gain_from_those_that_lose():
     told[:, 4] += 2.0 * told[:, 4].sign()
     gains = torch.where(good[:, None], torch.tensor([0.0, 0.3, 0.5, 0.6]), torch.tensor([0.0, -0.1, -0.3, -0.5]))
     share = gate(fit_gate(told, gains), told)
-    assert share[good].mean() > 0.08 and share[~good].max() < 0.01 and share.max() <= 0.75
+    assert share[good].mean() > 0.08 and share[~good].max() < 0.01 and share.max() <= 0.5
     mixed = gains[torch.randperm(400, generator=random)]
     assert gate(fit_gate(told, mixed), told).max() < 0.05
     # What isn't a number counts as usual, and the picture has numbers.

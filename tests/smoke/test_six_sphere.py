@@ -60,7 +60,7 @@ def test_of_all_orders(device: str):
     exact = scatter(volume, camera, lamps, (0.9,) * 3).planes[..., 0]
     made = bake_sphere(volume, camera, lights=16, albedo=0.9)
     once = bake_sphere(volume, camera, lights=16)
-    assert rms(made, lamps, exact) < 0.35 < 0.5 < rms(once, lamps, exact)
+    assert rms(made, lamps, exact) < 0.35 < 0.45 < rms(once, lamps, exact)
     assert not bake_sphere(from_array(np.zeros((4, 4, 4)), device=device), camera, lights=12).lightmaps.any()
 
 
