@@ -101,7 +101,10 @@ def _root(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
-    """Compressed precomputed lighting on NVIDIA Warp kernels."""
+    """Compressed precomputed lighting on NVIDIA Warp kernels.
+
+    Begin with wlm inspect PATH: it says what a file or a folder holds, and which command takes it.
+    """
 
 
 def _command_path(error: Any) -> str:
