@@ -15,6 +15,7 @@ from wlm.atlas.data import from_arrays
 from wlm.atlas.scene.data import load_scene, scene_of
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.description import read_description
+from wlm.atlas.scene.detail import peaks_of, variation
 from wlm.atlas.scene.evaluation import compare_scene, evaluate_scene
 from wlm.atlas.scene.exact import decode64
 from wlm.atlas.scene.exporter import export_scene, read_scene
@@ -61,7 +62,7 @@ def test_light_of_two_sources_has_two_components():
     found = find_mixtures(moment.numpy(), texels, 2, 4, seed=0)
     number = found.nearest(moment)
     assert not set(number[:20].tolist()) & set(number[20:].tolist())
-    parts = torch.einsum("tkmc,tymc->tykc", found.take[number], light) + found.offset[number][:, None]
+    parts = torch.einsum("tmkc,tymc->tykc", found.factor[number], light) + found.offset[number][:, None]
     assert float(parts.min()) > 0.0 and float(parts.max()) > 0.5
     factor = torch.from_numpy(np.stack([found.factors(each) for each in number])).float()
     back = factor[:, None, 0] + torch.einsum("tkmc,tykc->tymc", factor[:, 1:], parts)
@@ -155,7 +156,8 @@ def test_mips(scene, device):
 
 def test_views_of_the_scene_decide(scene):
     """A crate in a closed room is hidden from around, and is seen from inside."""
-    room, crate, small = scene_weights(scene, SceneProfile(name="", views=3), 0, "cpu")
+    varies = variation(scene, peaks_of(scene), "cpu")
+    room, crate, small = scene_weights(scene, varies, SceneProfile(name="", views=3), 0, "cpu")
     assert min(crate.sum(), small.sum()) > 0
     per_cell = [each[each > 0].mean() for each in (room, crate, small)]
     assert per_cell[2] < per_cell[1]

@@ -2,7 +2,7 @@
 
 For a tile, a mixture and a size the squared error of all states is what the mixture leaves and
 
-    sum_m || sum_k f[m, k] r_k ||² = sum_j || sum_k L[k, j] r_k ||²,    F^T F = L L^T (Cholesky),
+    sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
 
 with r_k what component k is off once it is stored: clipped at 0 and rounded, as texels or as blocks.
 """
@@ -19,7 +19,7 @@ from wlm.atlas.model import BLOCK_SIDE, BLOCKS, FIRST_BLOCK_CODE, SIDE_BITS, TEX
 from wlm.atlas.scene.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.scene.model import FACTOR_BITS, SceneProfile
 from wlm.atlas.stages import Stages
-from wlm.atlas.tiles import Tiles, remainder, sample_weights, solve, tile_light
+from wlm.atlas.tiles import Tiles, errors, sample_weights, solve, tile_light
 from wlm.formats.dds import MOST_SIDE
 from wlm.system import Meter
 
@@ -41,7 +41,7 @@ class SceneTiles:
     """The tiles of all sheets and levels that have a weight.
 
     Attributes:
-        texels: float32 [T, B + 1, B + 1, M, 3], their light over its peaks.
+        texels: float32 [T, B + 1, B + 1, M, 3], their light over the states' units.
         weight: float32 [T, P], of their points; all add up to 1.
         plane: int [T], their sheet or level, ascending.
         index: int64 [T], number of each within it, row by row.
@@ -66,7 +66,7 @@ class SceneTiles:
 
     def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
         """Texels [T, B + 1, B + 1, K, 3] of components, of the states' and the tiles' mixtures."""
-        parts = torch.einsum("tkmc,tyxmc->tyxkc", mixtures.take[number], texels)
+        parts = torch.einsum("tmkc,tyxmc->tyxkc", mixtures.factor[number], texels)
         return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
 
 
@@ -128,8 +128,8 @@ def candidates(
         tried.append(Tried(mixtures, number, error, 0.0))
         left, chosen = _left(tried, sizes, bits)
         tried[-1] = replace(tried[-1], left=left)
-        # A tile that has fewer components than it may have takes no more where others may.
-        eager = np.flatnonzero(chosen == done)
+        # A tile that has fewer components than it may have takes no more, unless they leave nothing.
+        eager = np.arange(count) if ranks[done + 1 : done + 2] == [states] else np.flatnonzero(chosen == done)
         if left > _PAYS * before or not len(eager):
             break
         before = left
@@ -140,10 +140,9 @@ def _curves(
     tiles: SceneTiles, members: np.ndarray, mixtures: Mixtures, sizes: list[Size], meter: Meter, done: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """`number` and `error` of `Tried`, of some tiles."""
-    device, rank = tiles.device, mixtures.factor.shape[2]
+    device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
     factor, offset = mixtures.factor, mixtures.offset
-    root = _roots(mixtures.factor)
     number, error = np.zeros(len(members), int), np.zeros((len(sizes), len(members)))
     step = max(1, _AT_ONCE * 8 // rank)
     for at in range(0, len(members), step):
@@ -161,21 +160,10 @@ def _curves(
         for i, size in enumerate(sizes):
             samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
             held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
-            rest = remainder(piece, held).unflatten(0, (-1, rank))
-            rest = torch.einsum("tkcp,tckj->tjcp", rest, root[chosen])
-            left = (rest.square().mean(2).sum(1) * weight).double().sum(1)
+            left = errors(piece, held).unflatten(0, (-1, rank)).sum(1) / states
             error[i, part] = (left + lost).cpu().numpy()
         number[part] = chosen.cpu().numpy()
     return number, error
-
-
-def _roots(factor: torch.Tensor) -> torch.Tensor:
-    """L of F^T F / M = L L^T, float32 [G, 3, K, K]."""
-    gram = torch.einsum("gmkc,gmlc->gckl", factor.double(), factor.double()) / factor.shape[1]
-    trace = gram.diagonal(dim1=2, dim2=3).sum(2).clamp(min=1e-30)
-    # What makes it definite where components are alike.
-    gram = gram + 1e-9 * trace[..., None, None] * torch.eye(gram.shape[2], device=gram.device)
-    return torch.linalg.cholesky(gram).float()
 
 
 def costs(tried: list[Tried], sizes: list[Size]) -> np.ndarray:

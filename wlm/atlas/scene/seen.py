@@ -7,6 +7,7 @@ import torch
 
 from wlm.atlas.model import Profile
 from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.scene.detail import FLOOR, scales
 from wlm.atlas.scene.model import SceneProfile
 from wlm.atlas.weights import FineGrid, spread
 from wlm.interop import check_device
@@ -53,14 +54,17 @@ def seen_points(
         yield hit, sheet[hit], place[hit]
 
 
-def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, device: str) -> list[np.ndarray]:
+def scene_weights(
+    scene: LightmappedScene, varies: Sequence[np.ndarray], profile: SceneProfile, seed: int, device: str
+) -> list[np.ndarray]:
     """How much each quarter of a texel counts: the pixels of random views of the scene that show it, and a little.
 
-    Objects that are seen large so get more than those that are small, far away or hidden; views from inside count as
-    much as those from around.
+    Objects that are seen large so get more than those that are small, far away or hidden. A view counts by the inverse
+    of how much the light that it shows varies (`wlm.atlas.scene.detail`), and by no more if it shows more pixels.
 
     Args:
         scene: The scene.
+        varies: `variation`.
         profile: `views`, `unseen` and `border`.
         seed: Of the views.
         device: "cpu" or "cuda:N".
@@ -71,12 +75,10 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
     Raises:
         WlmError: There is no such device.
     """
-    views = scene_views(scene, profile.views, seed)
     grids = [FineGrid(sheet.mesh, device) for sheet in scene.sheets]
-    around, inside = (_counts(scene, grids, part, device) for part in (views[: profile.views], views[profile.views :]))
-    totals = [sum(float(each.sum()) for each in counts) for counts in (around, inside)]
-    scale = totals[0] / totals[1] if min(totals) > 0 else 1.0
-    visible = [a + scale * b for a, b in zip(around, inside, strict=True)]
+    scale = scales(varies, [sheet.mesh.mask for sheet in scene.sheets])
+    even = [np.tensordot(1.0 / scale**2, each, 1) / len(scale) for each in varies]
+    visible = _counts(scene, grids, even, scene_views(scene, profile.views, seed), device)
     # As `spread` has them.
     used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
     cells = sum(int(each.sum()) for each in used)
@@ -87,18 +89,26 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
 
 
 def _counts(
-    scene: LightmappedScene, grids: Sequence[FineGrid], views: Sequence[View | Viewpoint], device: str
+    scene: LightmappedScene,
+    grids: Sequence[FineGrid],
+    varies: Sequence[np.ndarray],
+    views: Sequence[View | Viewpoint],
+    device: str,
 ) -> list[torch.Tensor]:
-    """Pixels that show each cell of each sheet."""
+    """Shares of views that show each cell of each sheet, over how much light varies in the view."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
-    count = torch.zeros(int(first[-1]), dtype=torch.int64, device=device)
+    detail = torch.from_numpy(np.concatenate([each.ravel() for each in varies])).to(device)
+    count = torch.zeros(int(first[-1]), dtype=torch.float64, device=device)
     for _, sheet, uv in seen_points(scene, views, _RESOLUTION, device):
+        if not len(sheet):
+            continue
         height, width, start = place[sheet.long()].T
         column = torch.minimum((uv[:, 0].double() * width).long().clamp(min=0), width - 1)
         row = torch.minimum((uv[:, 1].double() * height).long().clamp(min=0), height - 1)
-        cell = start + row * width + column
-        count.index_add_(0, cell, torch.ones_like(cell))
-    flat = count.double()
-    return [flat[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
+        # A cell is a quarter of a texel.
+        lost = float(detail[start // 4 + (row // 2) * (width // 2) + column // 2].mean()) + FLOOR
+        cell, pixels = torch.unique(start + row * width + column, return_counts=True)
+        count[cell] += pixels / (lost * len(sheet))
+    return [count[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
