@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.atlas.layout import Size, allocate
+from wlm.atlas.layout import allocate
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, TEXELS
 from wlm.atlas.scene.curves import MOST_MIXTURES, Tried, costs
 from wlm.atlas.scene.model import FACTOR_BITS, TEXEL_BITS, SceneProfile
@@ -26,7 +26,8 @@ class Allocated:
         count: int [T], its components.
         component: int [T], its mixture's first in `factors`.
         factors: float64 [C, M, 3], of each mixture a constant and then its components.
-        size: int [T, 2], texels of a component.
+        coarse: int [T], how many of its components are coarse.
+        size: int [T, 2], texels of one of the others.
         second: bool [T], whether they are in the second texture.
         first: int64 [T, 2], place of the first component's on the page.
         page: int64 [T].
@@ -38,6 +39,7 @@ class Allocated:
     count: np.ndarray
     component: np.ndarray
     factors: np.ndarray
+    coarse: np.ndarray
     size: np.ndarray
     second: np.ndarray
     first: np.ndarray
@@ -46,28 +48,29 @@ class Allocated:
     error: float
 
 
-def allocated(tried: list[Tried], sizes: list[Size], bits: float, profile: SceneProfile) -> Allocated:
+def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocated:
     """Allocates components and sizes to the tiles of all sheets, and places them."""
-    error, cost = np.concatenate([each.error for each in tried]), costs(tried, sizes)
+    error, cost = np.concatenate([each.error for each in tried]), costs(tried)
     states, tiles = tried[0].mixtures.factor.shape[1], np.arange(error.shape[1])
     ranks, number = np.array([each.rank for each in tried]), np.stack([each.number for each in tried])
-    sides, seconds = np.array([(size.nx, size.ny) for size in sizes]), np.array([size.second for size in sizes])
+    choices = [choice for each in tried for choice in each.choices]
+    of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])
+    sides = np.array([(choice.size.nx, choice.size.ny) for choice in choices])
+    extents, seconds = (np.array(each) for each in zip(*((c.extent, c.size.second) for c in choices), strict=True))
     fewest, budget, found = len(tiles) * float(TEXEL_BITS), bits, None
     for _ in range(_TRIES):
         chosen = allocate(error, cost, budget, _LEAST_GAIN / TEXEL_BITS / len(tiles))
-        rank = chosen // len(sizes)
+        rank = of[chosen]
         used, mixture = np.unique(rank * MOST_MIXTURES + number[rank, tiles], return_inverse=True)
         begin = np.cumsum([0, *(ranks[used // MOST_MIXTURES] + 1)])
-        size, second = sides[chosen % len(sizes)], seconds[chosen % len(sizes)]
+        size, second = sides[chosen], seconds[chosen]
         first, page = np.zeros((len(tiles), 2), np.int64), np.zeros(len(tiles), np.int64)
         shapes, area = [], 0
         for texture in (False, True):
             at = np.flatnonzero(second == texture)
             step, shape = (BLOCK_SIDE if texture else 1), (0, 0, 0)
             if len(at):
-                first[at], page[at], side = packed(
-                    size[at] * np.stack([ranks[rank[at]], np.ones(len(at), int)], 1) // step
-                )
+                first[at], page[at], side = packed(extents[chosen[at]] // step)
                 first[at] *= step
                 shape = (int(page[at].max()) + 1, *(step * each for each in side))
             elif not texture:
@@ -81,7 +84,8 @@ def allocated(tried: list[Tried], sizes: list[Size], bits: float, profile: Scene
             pairs = (divmod(each, MOST_MIXTURES) for each in used.tolist())
             factors = np.concatenate([tried[r].mixtures.factors(g) for r, g in pairs])
             left = float(error[chosen, tiles].sum())
-            places = (size, second, first, page, tuple(shapes))
+            coarse = np.array([choice.coarse for choice in choices])[chosen]
+            places = (coarse, size, second, first, page, tuple(shapes))
             best = Allocated(rank, ranks[rank], component, factors, *places, left)
             if found is None or left < found.error:
                 found = best

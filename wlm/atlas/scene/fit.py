@@ -17,7 +17,7 @@ import torch
 from wlm import interop
 from wlm.atlas.colour import encode
 from wlm.atlas.layout import Size, place, texels_of
-from wlm.atlas.model import BLOCKS, TEXELS, tile_counts
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, tile_counts
 from wlm.atlas.scene.allocation import NO_ROOM, Allocated, allocated
 from wlm.atlas.scene.curves import SceneTiles, Tried, candidates, sizes_of
 from wlm.atlas.scene.data import LightmappedScene
@@ -31,6 +31,8 @@ from wlm.atlas.scene.model import (
     SceneModel,
     SceneProfile,
     SheetPlace,
+    coarse_place,
+    extent,
     pack_tiles,
 )
 from wlm.atlas.scene.packing import WIDTHS
@@ -120,10 +122,10 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
     with stages("curves"):
         tried = candidates(tiles, sizes, profile, room, seed, stages)
     with stages("allocate"):
-        given = allocated(tried, sizes, room, profile)
+        given = allocated(tried, room, profile)
         if numbers == SHORT_ENTRY and given.page.any():
             numbers = ENTRY
-            given = allocated(tried, sizes, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
+            given = allocated(tried, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
     with stages("solve"):
         texels, blocks, scale = _texels(tiles, tried, given)
     lut = np.ascontiguousarray(_table(tiles, layout, given)[..., :numbers])
@@ -134,7 +136,7 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
     sheets = len(scene.sheets)
     counts, samples, many = (
         np.bincount(tiles.plane, each, len(planes))[:sheets]
-        for each in (None, given.size.prod(1) * given.count, given.count)
+        for each in (None, extent(given.size, given.count, given.coarse).prod(1), given.count)
     )
     report = {
         "components": {str(each): int((given.count == each).sum()) for each in np.unique(given.count).tolist()},
@@ -144,6 +146,7 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         "components by sheet": (many / np.maximum(counts, 1)).round(2).tolist(),
         "pages": len(texels),
         "tiles of blocks": int(given.second.sum()),
+        "coarse components": int(given.coarse.sum()),
         "error by components": {str(each.rank): each.left for each in tried},
         "units": unit.tolist(),
         "seconds": stages.seconds,
@@ -211,12 +214,17 @@ def _texels(
             kinds = np.column_stack([given.size[part], given.second[part]])
             sides, chosen = np.unique(kinds, axis=0, return_inverse=True)
             sizes = [Size(nx, ny, BLOCKS if second else TEXELS, bool(second)) for nx, ny, second in sides.tolist()]
+            block, sizes = len(sizes), [*sizes, Size(BLOCK_SIDE, BLOCK_SIDE, BLOCKS, True)]
+            whole = each.rank - given.coarse[part]
             for k in range(each.rank):
                 piece = Tiles(mixture, components[:, k].contiguous(), weight, tiles.size)
-                for at, values, weights in solved(piece, sizes, chosen.ravel()):
+                number = np.where(k < whole, chosen.ravel(), block)
+                for at, values, weights in solved(piece, sizes, number):
                     at, (ny, nx) = part[at], values.shape[1:3]
-                    texture = int(given.second[at[0]])
-                    row, column = texels_of(given.first[at] + [k * nx, 0], nx, ny)
+                    texture, whole_of = int(given.second[at[0]]), each.rank - given.coarse[at]
+                    aside = coarse_place(given.size[at], whole_of, np.maximum(k - whole_of, 0))
+                    aside = np.where((k < whole_of)[:, None], given.size[at] * [k, 0], aside)
+                    row, column = texels_of(given.first[at] + aside, nx, ny)
                     number = given.component[at] + 1 + k
                     place = given.page[at, None, None], row, column
                     light[texture][place], owner[texture][place] = values, number[:, None, None]
@@ -235,5 +243,7 @@ def _table(tiles: SceneTiles, layout: _Layout, given: Allocated) -> np.ndarray:
     row = tiles.index // columns + np.array(layout.row)[tiles.plane]
     column = tiles.index % columns + np.array(layout.column)[tiles.plane]
     table = np.zeros((*layout.shape, 4), np.uint16)
-    table[row, column] = pack_tiles(given.first, given.size, given.component, given.count, given.page, given.second)
+    table[row, column] = pack_tiles(
+        given.first, given.size, given.component, given.count, given.page, given.second, given.coarse
+    )
     return table

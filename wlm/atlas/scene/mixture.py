@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 _ROUNDS = 12
+_ALIKE = 1e-6  # of light: less of it decides nothing
 _PERCENT = 0.1  # of a component: it is as low as that, and as high as all but that
 _MARGIN, _MARGIN_FIRST = 0.1, 0.02  # of its range and, of the first, of its height, that o_k is more
 
@@ -32,7 +33,8 @@ class Mixtures:
         factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
             below 0.
         offset: float32 [G, K, 3]: the states are `factor` times the components less this.
-        kept: float32 [G, 3 M M], flat projections onto the subspaces: times a tile's moments, how much light they keep.
+        kept: float32 [G, 3 M M], flat projections onto the subspaces: times a tile's moments, how much light they keep;
+            of the first components alone where the others follow.
     """
 
     factor: torch.Tensor
@@ -50,8 +52,9 @@ class Mixtures:
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
-        """The mixture that keeps most of each tile's light, int64 [T], by `moments`."""
-        return (moment.flatten(1) @ self.kept.T).argmax(1)
+        """The mixture that keeps most of each tile's light, int64 [T], by `moments`; the first where some are alike."""
+        energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
+        return _first_best(moment.flatten(1) @ self.kept.T, energy)
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -65,7 +68,9 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return part @ part.transpose(2, 3)
 
 
-def find_mixtures(moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int) -> Mixtures:
+def find_mixtures(
+    moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
+) -> Mixtures:
     """Finds mixtures of some tiles.
 
     Args:
@@ -74,26 +79,40 @@ def find_mixtures(moment: np.ndarray, texels: np.ndarray, rank: int, count: int,
         rank: K, 1 to M.
         count: Mixtures, at least 1; fewer where that many have no tile.
         seed: Of the tiles that they begin with.
+        like: Of how many components mixtures are found, the others follow; None: K.
     """
-    random, moment = np.random.default_rng(seed), np.asarray(moment, np.float64)
+    random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
     flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)
-    spaces = [_subspace(moment.sum(0), rank)]
+
+    def best_of(kept: np.ndarray) -> np.ndarray:
+        return _first_best(torch.from_numpy(kept), torch.from_numpy(energy)).numpy()
+
+    spaces = [_subspace(moment.sum(0), few)]
     lost = energy - _kept(flat, spaces)[:, 0]
     while len(spaces) < min(count, len(moment)):
         share = lost.clip(min=0.0)
-        if not share.sum() > 1e-9 * energy.sum():
+        if not share.sum() > _ALIKE * energy.sum():
             break
-        spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], rank))
+        spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], few))
         lost = np.minimum(lost, energy - _kept(flat, spaces[-1:])[:, 0])
     for _ in range(_ROUNDS):
-        nearest = _kept(flat, spaces).argmax(1)
-        spaces = [_subspace(moment[nearest == g].sum(0), rank) for g in np.unique(nearest)]
-    nearest = _kept(flat, spaces).argmax(1)
-    # One that lost its tiles in the last round has its own directions alone.
+        nearest = best_of(_kept(flat, spaces))
+        spaces = [_subspace(moment[nearest == g].sum(0), few) for g in np.unique(nearest)]
+    kept = [_projection(space) for space in spaces]
+    nearest = best_of(flat @ np.stack(kept).T)
+    if few < rank:
+        # One that lost its tiles in the last round has any directions.
+        spaces = [_subspace(moment[nearest == g].sum(0), rank) for g, space in enumerate(spaces)]
     offset = np.stack([_offset(space, texels[nearest == g]) for g, space in enumerate(spaces)])
     factor = np.stack([space.transpose(1, 2, 0) for space in spaces])
-    parts = factor, offset, np.stack([_projection(each) for each in spaces])
+    parts = factor, offset, np.stack(kept)
     return Mixtures(*(torch.from_numpy(np.ascontiguousarray(each)).float() for each in parts))
+
+
+def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
+    """Of what each mixture keeps [T, G], of so much [T], the first that keeps about the most, int64 [T]: rounding must
+    not deal tiles to others than those whose offsets are made for them."""
+    return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 
 
 def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
