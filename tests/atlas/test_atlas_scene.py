@@ -15,13 +15,13 @@ from wlm.atlas.data import from_arrays
 from wlm.atlas.scene.data import load_scene, scene_of
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.description import read_description
-from wlm.atlas.scene.detail import peaks_of, variation
+from wlm.atlas.scene.detail import peaks_of, scales, variation
 from wlm.atlas.scene.evaluation import compare_scene, evaluate_scene
 from wlm.atlas.scene.exact import decode64
 from wlm.atlas.scene.exporter import export_scene, read_scene
 from wlm.atlas.scene.fit import compress_scene
 from wlm.atlas.scene.mixture import find_mixtures, moments
-from wlm.atlas.scene.model import SceneProfile
+from wlm.atlas.scene.model import SceneProfile, pack_tiles, unpack_tiles
 from wlm.atlas.scene.seen import scene_weights
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.formats.exr import write_exr
@@ -161,6 +161,33 @@ def test_views_of_the_scene_decide(scene):
     assert min(crate.sum(), small.sum()) > 0
     per_cell = [each[each > 0].mean() for each in (room, crate, small)]
     assert per_cell[2] < per_cell[1]
+
+
+def test_states_count_by_what_they_would_lose(scene):
+    """At half of its light, a state counts as before; with more edges in it, less."""
+    frames = [each.frames.copy() for each in scene.sheets]
+    for each in frames:
+        each[1] = 0.5 * each[0]
+        each[2] = each[0]
+        each[2, :, ::8] *= 0.8
+    varied = scene_of([each.mesh for each in scene.sheets], frames)
+    peak = peaks_of(varied)
+    varies = variation(varied, peak, "cpu")
+    unit = scales(varies, [each.mesh.mask for each in scene.sheets]) * peak
+    assert unit[1] == pytest.approx(0.5 * unit[0], rel=1e-2) and unit[2] > 3.0 * unit[0]
+
+
+def test_coarse_components(model, device):
+    """Of blocks of tiles in blocks: the first components larger, the others one block each."""
+    assert model.report["coarse components"] > 0
+    first, size, component, count, page, blocks, coarse = unpack_tiles(model.lut, "mixed")
+    assert (coarse <= count).all() and blocks[coarse > 0].all() and (size[coarse > 0].prod(1) > 16).all()
+    again = pack_tiles(first, size, component, count, page, blocks, coarse)
+    assert (again == model.lut)[count > 0].all()
+    # Without them all is the same but for those tiles.
+    without = pack_tiles(first, size, component, count - coarse, page, blocks)
+    light, rest = (Decoder(dataclasses.replace(model, lut=lut), device).lightmap(0, 0) for lut in (model.lut, without))
+    assert 0.01 < (light != rest).any(2).mean() < 0.99
 
 
 def files(folder, states=("day", "night")):
