@@ -14,6 +14,8 @@ from wlm.errors import WlmError
 
 _TRIES, _FULL = 12, 0.995  # of placing all tiles, and how much of the room is full enough
 _LEAST_GAIN = 2.0**-24
+_LESS = 0.95  # of the bits: what the error is then says what a bit is worth
+_DROPPED = 8  # of the mixtures that aren't worth their factors one of so many is left out at once
 NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: expected more"
 
 
@@ -57,6 +59,7 @@ def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocat
     of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])
     sides = np.array([(choice.size.nx, choice.size.ny) for choice in choices])
     extents, seconds = (np.array(each) for each in zip(*((c.extent, c.size.second) for c in choices), strict=True))
+    error = _worth(error, cost, of, number, ranks * states + states, bits)
     fewest, budget, found = len(tiles) * float(TEXEL_BITS), bits, None
     for _ in range(_TRIES):
         chosen = allocate(error, cost, budget, _LEAST_GAIN / TEXEL_BITS / len(tiles))
@@ -100,3 +103,46 @@ def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocat
     if found is None:
         raise WlmError(NO_ROOM.format(profile.budget))
     return found
+
+
+def _worth(
+    error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
+) -> np.ndarray:
+    """Leaves mixtures out, the least useful first, until each saves more error than its factors' bits would elsewhere.
+
+    Args:
+        error: float64 [choices, T].
+        cost: [choices].
+        of: int [choices], the number of the list of `Tried` of each.
+        number: int [lists, T], the tiles' mixtures.
+        factors: [lists], factors of one mixture.
+        bits: Of all tiles and factors.
+
+    Returns:
+        `error`, larger than any where a tile's mixture is left out.
+    """
+    tiles = np.arange(error.shape[1])
+    ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in _two(error, cost, bits)]
+    gain = (ends[1][0] - ends[0][0]) / max(ends[0][1] - ends[1][1], 1.0)  # error that a bit saves
+    if len(number) == 1 or not gain > 0.0:
+        return error
+    # The least of error and bits, with as many components.
+    least = np.stack([(error[of == r] + gain * cost[of == r, None]).min(0) for r in range(len(number))])
+    pair, price = number + MOST_MIXTURES * np.arange(len(number))[:, None], gain * FACTOR_BITS * factors
+    while True:
+        best, second = np.argsort(least, axis=0)[:2]
+        worse = least[second, tiles] - least[best, tiles]
+        used, at = np.unique(pair[best, tiles], return_inverse=True)
+        ratio = np.bincount(at.ravel(), worse) / price[used // MOST_MIXTURES]
+        # Those of fewest components stay, so that each tile has one.
+        drop = np.flatnonzero((ratio < 1.0) & (used >= MOST_MIXTURES))
+        if not len(drop):
+            break
+        drop = drop[np.argsort(ratio[drop])][: -(-len(drop) // _DROPPED)]
+        least = np.where(np.isin(pair, used[drop]), np.inf, least)
+    never = 1e3 * float(error.max()) + 1.0
+    return np.where(np.isinf(least)[of], never, error)
+
+
+def _two(error: np.ndarray, cost: np.ndarray, bits: float) -> list[np.ndarray]:
+    return [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]
