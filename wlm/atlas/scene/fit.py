@@ -19,6 +19,7 @@ from wlm.atlas.colour import encode
 from wlm.atlas.layout import Size, place, texels_of
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, tile_counts
 from wlm.atlas.scene.allocation import NO_ROOM, Allocated, allocated
+from wlm.atlas.scene.balance import balance, tiles_seen
 from wlm.atlas.scene.curves import SceneTiles, Tried, candidates, sizes_of
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.detail import peaks_of, scales, variation
@@ -121,6 +122,9 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
     sizes = sizes_of(profile)
     with stages("curves"):
         tried = candidates(tiles, sizes, profile, room, seed, stages)
+    with stages("balance"):
+        seen = tiles_seen(scene, varies, tiles, layout.grid[: len(scene.sheets)], profile, seed, device)
+        tried = balance(tried, tiles.weight.double().sum(1).cpu().numpy(), seen, profile, room)
     with stages("allocate"):
         given = allocated(tried, room, profile)
         if numbers == SHORT_ENTRY and given.page.any():

@@ -13,7 +13,8 @@ from wlm.atlas.weights import FineGrid, spread
 from wlm.interop import check_device
 from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
 
-_RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
+RESOLUTION = 768
+"""Pixels along a side of a view that visibility is counted in."""
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
@@ -76,9 +77,7 @@ def scene_weights(
         WlmError: There is no such device.
     """
     grids = [FineGrid(sheet.mesh, device) for sheet in scene.sheets]
-    scale = scales(varies, [sheet.mesh.mask for sheet in scene.sheets])
-    even = [np.tensordot(1.0 / scale**2, each, 1) / len(scale) for each in varies]
-    visible = _counts(scene, grids, even, scene_views(scene, profile.views, seed), device)
+    visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
     # As `spread` has them.
     used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
     cells = sum(int(each.sum()) for each in used)
@@ -91,7 +90,7 @@ def scene_weights(
 def _counts(
     scene: LightmappedScene,
     grids: Sequence[FineGrid],
-    varies: Sequence[np.ndarray],
+    detail: "Detail",
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
@@ -99,16 +98,44 @@ def _counts(
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
-    detail = torch.from_numpy(np.concatenate([each.ravel() for each in varies])).to(device)
     count = torch.zeros(int(first[-1]), dtype=torch.float64, device=device)
-    for _, sheet, uv in seen_points(scene, views, _RESOLUTION, device):
+    for _, sheet, uv in seen_points(scene, views, RESOLUTION, device):
         if not len(sheet):
             continue
         height, width, start = place[sheet.long()].T
         column = torch.minimum((uv[:, 0].double() * width).long().clamp(min=0), width - 1)
         row = torch.minimum((uv[:, 1].double() * height).long().clamp(min=0), height - 1)
-        # A cell is a quarter of a texel.
-        lost = float(detail[start // 4 + (row // 2) * (width // 2) + column // 2].mean()) + FLOOR
         cell, pixels = torch.unique(start + row * width + column, return_counts=True)
-        count[cell] += pixels / (lost * len(sheet))
+        count[cell] += pixels / (detail.lost(sheet, uv) * len(sheet))
     return [count[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
+
+
+class Detail:
+    """How much the light of a scene varies, on a device.
+
+    Args:
+        scene: The scene.
+        varies: `variation`.
+        device: "cpu" or "cuda:N".
+    """
+
+    def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
+        masks = [sheet.mesh.mask for sheet in scene.sheets]
+        scale = scales(varies, masks)
+        even = [np.tensordot(1.0 / scale**2, each, 1).ravel() / len(scale) for each in varies]
+        first = np.cumsum([0, *(mask.size for mask in masks)])
+        place = np.array([(*mask.shape, start) for mask, start in zip(masks, first, strict=False)])
+        self._even, self._place = torch.from_numpy(np.concatenate(even)).to(device), torch.from_numpy(place).to(device)
+
+    def sizes(self, sheet: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows and columns of texels of the sheet at each point, int64 [N]."""
+        return tuple(self._place[sheet.long()].T[:2])
+
+    def lost(self, sheet: torch.Tensor, uv: torch.Tensor) -> float:
+        """What a view of the points [N] loses, in about, mean of states in which light varies alike; above 0."""
+        height, width, start = self._place[sheet.long()].T
+        column, row = (
+            (uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)
+            for axis, side in ((0, width), (1, height))
+        )
+        return float(self._even[start + row * width + column].mean()) + FLOOR
