@@ -116,6 +116,7 @@ def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
     [
         ("atlas-scene", [0.60438323, 0.86818969, 1.13199604]),  # one mixture, a layer for each component
         ("atlas-scene-mixed", [0.26424402, 0.60012102, 0.93599224]),
+        ("atlas-scene-coarse", [0.26860335, 0.70232235, 0.89431477]),
     ],
 )
 def test_kept_files(name, means, device):
