@@ -281,13 +281,6 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
     return (squared * grid.turned(tiles.weight[:, None])).double().sum((1, 2, 3))
 
 
-def remainder(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
-    """What samples [T, ny, nx, 3] have above the light at the points, float [T, 3, m * m]."""
-    grid = _Grid(tiles, samples.shape[2], samples.shape[1])
-    rest = grid.spread(samples.permute(0, 3, 1, 2)) - grid.turned(tiles.light)
-    return rest.transpose(2, 3).flatten(2)
-
-
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
     """How much each sample's own squared error counts, float [T, ny, nx]."""
     return _Grid(tiles, nx, ny).weights(tiles.weight)

@@ -1,9 +1,9 @@
 """From a scene's lightmaps to one model: mixtures of the states, tiles of all sheets, one allocation.
 
 The states' light is divided by how much it varies, so that each counts by its PSNR (`detail`). Tiles are dealt to
-mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), and
-numbers and sizes are allocated to the tiles of all sheets at once (`allocation`): one more bit gains as much in every
-object.
+mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), they
+count by what the views that show them lose (`balance`), and numbers and sizes are allocated to the tiles of all sheets
+at once (`allocation`): one more bit gains as much in every object.
 """
 
 import math
