@@ -11,7 +11,7 @@ from wlm.atlas.scene.data import load_scene
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.exporter import export_scene
 from wlm.atlas.scene.fit import compress_scene
-from wlm.atlas.scene.model import COUNT_BITS, ENTRY
+from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, ENTRY
 from wlm.formats.exr import write_exr
 
 STATES = ("dawn", "noon", "night")
@@ -51,7 +51,8 @@ def scene_folder(folder, uv_set=1, states=STATES, **settings):
     if model.lut.shape[2] == ENTRY:
         pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
         pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}
-        model = dataclasses.replace(model, lut=model.lut + np.array([0, 0, 0, 1 << COUNT_BITS], np.uint16), **pages)
+        second = np.array([0, 0, 0, 1 << (COUNT_BITS + COARSE_BITS)], np.uint16)
+        model = dataclasses.replace(model, lut=model.lut + second, **pages)
     export_scene(model, folder / "made", scene)
     return model
 

@@ -207,7 +207,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
-        light, weight = (interop.to_warp(_laid_out(each)) for each in (tiles.light, tiles.weight))
+        light, weight = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight))
         scale = interop.to_warp(1.0 / tiles.weight.mean(1))
         system = kernels.System()
         system.own, system.right, system.down, system.cross, system.diagonal = (
@@ -276,17 +276,10 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
     result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
     flat = samples.permute(0, 3, 1, 2).flatten(2)
     with on_stream(samples.device):
-        light, weight, stored = (interop.to_warp(_laid_out(each)) for each in (tiles.light, tiles.weight, flat))
+        light, weight, stored = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight, flat))
         grid = _grid(tiles, samples.shape[2], samples.shape[1])
         kernels.errors(light, weight, grid, stored, interop.to_warp(result))
     return result.mean(1)
-
-
-def remainder(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
-    """What samples [T, ny, nx, 3] have above the light at the points, float [T, 3, m * m]."""
-    points, device = SUPERSAMPLING * tiles.size, str(samples.device)
-    down, across = (linear(count, points, device) for count in samples.shape[1:3])
-    return (down @ samples.permute(0, 3, 1, 2) @ across.T).flatten(2) - tiles.light
 
 
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:

@@ -17,6 +17,8 @@ _SIDE_MASK = wp.constant(15)
 _BLOCK = wp.constant(4)
 _COUNT_BITS = wp.constant(8)
 _COUNT_MASK = wp.constant(255)
+_COARSE_BITS = wp.constant(4)
+_COARSE_MASK = wp.constant(15)
 
 
 @wp.func
@@ -31,6 +33,12 @@ def _mixed_blocks(blocks: wp.array3d[wp.vec3h], page: int, row: int, column: int
     """`_mixed` of the second texture."""
     near = wp.vec3(blocks[page, row, column + x.low])
     return wp.lerp(near, wp.vec3(blocks[page, row, column + x.high]), x.share)
+
+
+@wp.func
+def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
+    """`axis_at` where a component has one block."""
+    return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
 
 
 @wp.kernel
@@ -60,28 +68,41 @@ def _read(
     y = axis_at(lut[row, column, 1], down[1], first_block_code)
     step = (int(lut[row, column, 0]) & _SIDE_MASK) + 1
     of_blocks = step > first_block_code
+    rows = int(1)  # of blocks
     if of_blocks:
         step = _BLOCK * (step - first_block_code)
+        rows = wp.max((int(lut[row, column, 1]) & _SIDE_MASK) + 1 - first_block_code, 1)
     first = int(0)
     last = int(1)
     if lut.shape[2] == 4:
         first = int(lut[row, column, 2])
         last = int(lut[row, column, 3])
-    page = last >> _COUNT_BITS
+    page = last >> (_COUNT_BITS + _COARSE_BITS)
+    coarse = (last >> _COUNT_BITS) & _COARSE_MASK
     # NaN where there is no place.
     total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
     count = last & _COUNT_MASK
     if count > 0:
         total += factor[first]
+    whole = count - coarse
     for k in range(count):
+        right = k * step
+        if k >= whole:
+            # Blocks, one below the other beside the other components.
+            right = whole * step + _BLOCK * ((k - whole) / rows)
+            below = _BLOCK * ((k - whole) % rows)
+            x = _in_block(lut[row, column, 0], across[1], first_block_code)
+            y = _in_block(lut[row, column, 1], down[1], first_block_code)
+            y.low += below
+            y.high += below
         top = wp.vec3(0.0, 0.0, 0.0)
         bottom = wp.vec3(0.0, 0.0, 0.0)
         if of_blocks:
-            top = _mixed_blocks(blocks, page, y.low, k * step, x)
-            bottom = _mixed_blocks(blocks, page, y.high, k * step, x)
+            top = _mixed_blocks(blocks, page, y.low, right, x)
+            bottom = _mixed_blocks(blocks, page, y.high, right, x)
         else:
-            top = _mixed(texels, page, y.low, k * step, x)
-            bottom = _mixed(texels, page, y.high, k * step, x)
+            top = _mixed(texels, page, y.low, right, x)
+            bottom = _mixed(texels, page, y.high, right, x)
         total += wp.cw_mul(factor[first + 1 + k], wp.lerp(top, bottom, y.share))
     # Factors have any sign.
     for c in range(3):
@@ -101,8 +122,8 @@ def read(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_
         size: B, texels along a tile.
         factor: vec3 [C], of each mixture a constant and then one of each component.
         lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
-            - 1; number of its factors; page << 8 | number of components. Or of the first two alone, [ty, tx, 2]: one
-            component and one page.
+            - 1; number of its factors; page << 12 | number of coarse components << 8 | number of components. Or of the
+            first two alone, [ty, tx, 2]: one component and one page.
         texels: uint32 [pages, Hp, Wp], RGB9E5; the components of a tile follow each other along a row.
         blocks: vec3h [pages, Hb, Wb], the second texture, in blocks of 4 x 4 texels.
         first_block_code: As of `wlm_kernels.atlas.decode`; 16: no entry is of the second texture.

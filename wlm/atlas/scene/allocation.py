@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.atlas.layout import Size, allocate
+from wlm.atlas.layout import allocate
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, TEXELS
 from wlm.atlas.scene.curves import MOST_MIXTURES, Tried, costs
 from wlm.atlas.scene.model import FACTOR_BITS, TEXEL_BITS, SceneProfile
@@ -14,6 +14,8 @@ from wlm.errors import WlmError
 
 _TRIES, _FULL = 12, 0.995  # of placing all tiles, and how much of the room is full enough
 _LEAST_GAIN = 2.0**-24
+_LESS = 0.95  # of the bits: what the error is then says what a bit is worth
+_DROPPED = 8  # of the mixtures that aren't worth their factors one of so many is left out at once
 NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: expected more"
 
 
@@ -26,7 +28,8 @@ class Allocated:
         count: int [T], its components.
         component: int [T], its mixture's first in `factors`.
         factors: float64 [C, M, 3], of each mixture a constant and then its components.
-        size: int [T, 2], texels of a component.
+        coarse: int [T], how many of its components are coarse.
+        size: int [T, 2], texels of one of the others.
         second: bool [T], whether they are in the second texture.
         first: int64 [T, 2], place of the first component's on the page.
         page: int64 [T].
@@ -38,6 +41,7 @@ class Allocated:
     count: np.ndarray
     component: np.ndarray
     factors: np.ndarray
+    coarse: np.ndarray
     size: np.ndarray
     second: np.ndarray
     first: np.ndarray
@@ -46,28 +50,30 @@ class Allocated:
     error: float
 
 
-def allocated(tried: list[Tried], sizes: list[Size], bits: float, profile: SceneProfile) -> Allocated:
+def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocated:
     """Allocates components and sizes to the tiles of all sheets, and places them."""
-    error, cost = np.concatenate([each.error for each in tried]), costs(tried, sizes)
+    error, cost = np.concatenate([each.error for each in tried]), costs(tried)
     states, tiles = tried[0].mixtures.factor.shape[1], np.arange(error.shape[1])
     ranks, number = np.array([each.rank for each in tried]), np.stack([each.number for each in tried])
-    sides, seconds = np.array([(size.nx, size.ny) for size in sizes]), np.array([size.second for size in sizes])
+    choices = [choice for each in tried for choice in each.choices]
+    of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])
+    sides = np.array([(choice.size.nx, choice.size.ny) for choice in choices])
+    extents, seconds = (np.array(each) for each in zip(*((c.extent, c.size.second) for c in choices), strict=True))
+    error = _worth(error, cost, of, number, ranks * states + states, bits)
     fewest, budget, found = len(tiles) * float(TEXEL_BITS), bits, None
     for _ in range(_TRIES):
         chosen = allocate(error, cost, budget, _LEAST_GAIN / TEXEL_BITS / len(tiles))
-        rank = chosen // len(sizes)
+        rank = of[chosen]
         used, mixture = np.unique(rank * MOST_MIXTURES + number[rank, tiles], return_inverse=True)
         begin = np.cumsum([0, *(ranks[used // MOST_MIXTURES] + 1)])
-        size, second = sides[chosen % len(sizes)], seconds[chosen % len(sizes)]
+        size, second = sides[chosen], seconds[chosen]
         first, page = np.zeros((len(tiles), 2), np.int64), np.zeros(len(tiles), np.int64)
         shapes, area = [], 0
         for texture in (False, True):
             at = np.flatnonzero(second == texture)
             step, shape = (BLOCK_SIDE if texture else 1), (0, 0, 0)
             if len(at):
-                first[at], page[at], side = packed(
-                    size[at] * np.stack([ranks[rank[at]], np.ones(len(at), int)], 1) // step
-                )
+                first[at], page[at], side = packed(extents[chosen[at]] // step)
                 first[at] *= step
                 shape = (int(page[at].max()) + 1, *(step * each for each in side))
             elif not texture:
@@ -81,7 +87,8 @@ def allocated(tried: list[Tried], sizes: list[Size], bits: float, profile: Scene
             pairs = (divmod(each, MOST_MIXTURES) for each in used.tolist())
             factors = np.concatenate([tried[r].mixtures.factors(g) for r, g in pairs])
             left = float(error[chosen, tiles].sum())
-            places = (size, second, first, page, tuple(shapes))
+            coarse = np.array([choice.coarse for choice in choices])[chosen]
+            places = (coarse, size, second, first, page, tuple(shapes))
             best = Allocated(rank, ranks[rank], component, factors, *places, left)
             if found is None or left < found.error:
                 found = best
@@ -96,3 +103,46 @@ def allocated(tried: list[Tried], sizes: list[Size], bits: float, profile: Scene
     if found is None:
         raise WlmError(NO_ROOM.format(profile.budget))
     return found
+
+
+def _worth(
+    error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
+) -> np.ndarray:
+    """Leaves mixtures out, the least useful first, until each saves more error than its factors' bits would elsewhere.
+
+    Args:
+        error: float64 [choices, T].
+        cost: [choices].
+        of: int [choices], the number of the list of `Tried` of each.
+        number: int [lists, T], the tiles' mixtures.
+        factors: [lists], factors of one mixture.
+        bits: Of all tiles and factors.
+
+    Returns:
+        `error`, larger than any where a tile's mixture is left out.
+    """
+    tiles = np.arange(error.shape[1])
+    ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in _two(error, cost, bits)]
+    gain = (ends[1][0] - ends[0][0]) / max(ends[0][1] - ends[1][1], 1.0)  # error that a bit saves
+    if len(number) == 1 or not gain > 0.0:
+        return error
+    # The least of error and bits, with as many components.
+    least = np.stack([(error[of == r] + gain * cost[of == r, None]).min(0) for r in range(len(number))])
+    pair, price = number + MOST_MIXTURES * np.arange(len(number))[:, None], gain * FACTOR_BITS * factors
+    while True:
+        best, second = np.argsort(least, axis=0)[:2]
+        worse = least[second, tiles] - least[best, tiles]
+        used, at = np.unique(pair[best, tiles], return_inverse=True)
+        ratio = np.bincount(at.ravel(), worse) / price[used // MOST_MIXTURES]
+        # Those of fewest components stay, so that each tile has one.
+        drop = np.flatnonzero((ratio < 1.0) & (used >= MOST_MIXTURES))
+        if not len(drop):
+            break
+        drop = drop[np.argsort(ratio[drop])][: -(-len(drop) // _DROPPED)]
+        least = np.where(np.isin(pair, used[drop]), np.inf, least)
+    never = 1e3 * float(error.max()) + 1.0
+    return np.where(np.isinf(least)[of], never, error)
+
+
+def _two(error: np.ndarray, cost: np.ndarray, bits: float) -> list[np.ndarray]:
+    return [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]

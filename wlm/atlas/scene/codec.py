@@ -2,7 +2,7 @@
 
 Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]), `factor` (float32 [M, C, 3]) and
 `sheets` (int32 [S + levels, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
-Earlier files name no `entries`, the numbers of one, `wlm.atlas.scene.earlier`.
+Earlier files name no `entries`, the numbers of one, or no `coarse`, `wlm.atlas.scene.earlier`.
 """
 
 import math
@@ -13,8 +13,8 @@ from pydantic import Field, JsonValue
 
 from wlm.atlas.colour import decode as decode_blocks
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
-from wlm.atlas.scene.earlier import side_by_side
-from wlm.atlas.scene.model import SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, unpack_tiles
+from wlm.atlas.scene.earlier import side_by_side, without_coarse
+from wlm.atlas.scene.model import ENTRY, SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, extent, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact
@@ -33,6 +33,7 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "states": list(model.states),
         "sheets": [sheet.name for sheet in model.sheets],
         "entries": model.lut.shape[2],
+        "coarse": True,
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
@@ -50,6 +51,7 @@ class _Header(Header):
     sheets: list[Name]
     block_texels: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
     entries: Literal[2, 4] | None = None
+    coarse: Literal[True] | None = None
     profile: SceneProfile
     report: dict[str, JsonValue]
     parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
@@ -86,11 +88,15 @@ def decode(artifact: Artifact) -> SceneModel:
     if header.entries is None:
         texels, lut, sheets = _of_earlier(texels, lut, factor.shape[1], sheets)
         factor = np.pad(factor, ((0, 0), (1, 0), (0, 0)))
+    elif header.coarse is None and lut.shape[2] == ENTRY:
+        lut = without_coarse(lut)
     colour = "mixed" if len(blocks) else TEXELS
-    first, size, component, count, page, of_blocks = unpack_tiles(lut, colour)
+    first, size, component, count, page, of_blocks, coarse = unpack_tiles(lut, colour)
     if colour == "mixed" and (unpack_entries(lut[..., :2], colour)[2][..., 1] != of_blocks).any():
         raise ValueError("part lut: a tile is of both textures")
-    size[..., 0] *= np.maximum(count, 1)
+    if (coarse > np.where(of_blocks, count, 0)).any():
+        raise ValueError("part lut: expected coarse components of tiles of blocks alone, at most all of them")
+    size = np.where(count[..., None] > 0, extent(size, count, coarse), size)
     beyond = ((first + size) > np.where(of_blocks[..., None], second[::-1], texels.shape[:0:-1])).any(-1)
     beyond |= page >= np.where(of_blocks, len(blocks), len(texels))
     if (beyond & (count > 0)).any() or (component + count >= factor.shape[1]).any():

@@ -2,9 +2,10 @@
 
 For a tile, a mixture and a size the squared error of all states is what the mixture leaves and
 
-    sum_m || sum_k f[m, k] r_k ||² = sum_j || sum_k L[k, j] r_k ||²,    F^T F = L L^T (Cholesky),
+    sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
 
-with r_k what component k is off once it is stored: clipped at 0 and rounded, as texels or as blocks.
+with r_k what component k is off once it is stored: clipped at 0 and rounded, as texels or as blocks. So each component
+has a curve of its own, and the last, in which there is least, may be coarse, of one block each.
 """
 
 import math
@@ -15,11 +16,11 @@ import torch
 
 from wlm.atlas.colour import stored
 from wlm.atlas.layout import Size, allocate
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, FIRST_BLOCK_CODE, SIDE_BITS, TEXELS
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, FIRST_BLOCK_CODE, SIDE_BITS, TEXELS
 from wlm.atlas.scene.mixture import Mixtures, find_mixtures, moments
-from wlm.atlas.scene.model import FACTOR_BITS, SceneProfile
+from wlm.atlas.scene.model import FACTOR_BITS, MOST_COARSE, SceneProfile, extent
 from wlm.atlas.stages import Stages
-from wlm.atlas.tiles import Tiles, remainder, sample_weights, solve, tile_light
+from wlm.atlas.tiles import Tiles, errors, sample_weights, solve, tile_light
 from wlm.formats.dds import MOST_SIDE
 from wlm.system import Meter
 
@@ -41,7 +42,7 @@ class SceneTiles:
     """The tiles of all sheets and levels that have a weight.
 
     Attributes:
-        texels: float32 [T, B + 1, B + 1, M, 3], their light over its peaks.
+        texels: float32 [T, B + 1, B + 1, M, 3], their light over the states' units.
         weight: float32 [T, P], of their points; all add up to 1.
         plane: int [T], their sheet or level, ascending.
         index: int64 [T], number of each within it, row by row.
@@ -66,8 +67,33 @@ class SceneTiles:
 
     def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
         """Texels [T, B + 1, B + 1, K, 3] of components, of the states' and the tiles' mixtures."""
-        parts = torch.einsum("tkmc,tyxmc->tyxkc", mixtures.take[number], texels)
+        parts = torch.einsum("tmkc,tyxmc->tyxkc", mixtures.factor[number], texels)
         return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What the components of a tile may become.
+
+    Attributes:
+        size: Of those that aren't coarse.
+        count: Components.
+        coarse: How many of them, the last, have one block each.
+    """
+
+    size: Size
+    count: int
+    coarse: int
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Texels along x and y of all components."""
+        return tuple(extent(np.array([self.size.nx, self.size.ny]), np.array(self.count), self.coarse).tolist())
+
+    @property
+    def bits(self) -> float:
+        """Of all components."""
+        return float(math.prod(self.extent) * COLOUR_BITS[self.size.format])
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +103,14 @@ class Tried:
     Attributes:
         mixtures: Those there are.
         number: int [T], the one of each tile.
-        error: float64 [sizes, T], mean over the states, at each size.
+        choices: What the components may become.
+        error: float64 [choices, T], mean over the states.
         left: The error that is left where tiles may have up to so many components, about.
     """
 
     mixtures: Mixtures
     number: np.ndarray
+    choices: list[Choice]
     error: np.ndarray
     left: float
 
@@ -99,6 +127,16 @@ def sizes_of(profile: SceneProfile) -> list[Size]:
     whole = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE) if mixed else ()
     sizes = [Size(nx, ny, TEXELS) for ny in sides for nx in sides]
     return sizes + [Size(nx, ny, BLOCKS, True) for ny in whole for nx in whole]
+
+
+def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
+    """What so many components of a tile may become: of one size, or of blocks the last of them coarse."""
+    few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
+    return [
+        Choice(size, count, coarse)
+        for size in sizes
+        for coarse in (0, *(few if size.second and size.nx * size.ny > BLOCK_SIDE**2 else ()))
+    ]
 
 
 def candidates(
@@ -120,16 +158,18 @@ def candidates(
     moment, bounds = np.concatenate(moment), tiles.texels[few][:, row, column].numpy()
     meter, tried, before, eager = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf, np.arange(count)
     for done, rank in enumerate(ranks):
-        mixtures = find_mixtures(moment, bounds, rank, 1 if rank == states else min(max(many, 1), MOST_MIXTURES), seed)
+        # As many components as states hold all of any tile; they differ in how much is in the first of them.
+        like = ranks[done - 1] if rank == states and done else rank
+        mixtures = find_mixtures(moment, bounds, rank, min(max(many, 1), MOST_MIXTURES), seed, like)
+        choices, number = choices_of(rank, sizes), np.zeros(count, int)
         # Where a tile isn't tried, nothing is gained.
-        error = np.repeat(tried[0].error.max(0)[None], len(sizes), 0) if tried else np.zeros((len(sizes), count))
-        number = np.zeros(count, int)
-        number[eager], error[:, eager] = _curves(tiles, eager, mixtures, sizes, meter, done * count)
-        tried.append(Tried(mixtures, number, error, 0.0))
-        left, chosen = _left(tried, sizes, bits)
+        error = np.repeat(tried[0].error.max(0)[None], len(choices), 0) if tried else np.zeros((len(choices), count))
+        number[eager], error[:, eager] = _curves(tiles, eager, mixtures, sizes, choices, meter, done * count)
+        tried.append(Tried(mixtures, number, choices, error, 0.0))
+        left, chosen = _left(tried, bits)
         tried[-1] = replace(tried[-1], left=left)
-        # A tile that has fewer components than it may have takes no more where others may.
-        eager = np.flatnonzero(chosen == done)
+        # A tile that has fewer components than it may have takes no more, unless they leave nothing.
+        eager = np.arange(count) if ranks[done + 1 : done + 2] == [states] else np.flatnonzero(chosen == done)
         if left > _PAYS * before or not len(eager):
             break
         before = left
@@ -137,14 +177,21 @@ def candidates(
 
 
 def _curves(
-    tiles: SceneTiles, members: np.ndarray, mixtures: Mixtures, sizes: list[Size], meter: Meter, done: int
+    tiles: SceneTiles,
+    members: np.ndarray,
+    mixtures: Mixtures,
+    sizes: list[Size],
+    choices: list[Choice],
+    meter: Meter,
+    done: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`number` and `error` of `Tried`, of some tiles."""
-    device, rank = tiles.device, mixtures.factor.shape[2]
+    device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
     factor, offset = mixtures.factor, mixtures.offset
-    root = _roots(mixtures.factor)
-    number, error = np.zeros(len(members), int), np.zeros((len(sizes), len(members)))
+    number, error = np.zeros(len(members), int), np.zeros((len(choices), len(members)))
+    block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
+    place = {size: i for i, size in enumerate(sizes)}
     step = max(1, _AT_ONCE * 8 // rank)
     for at in range(0, len(members), step):
         if meter.due(done + at):
@@ -158,34 +205,27 @@ def _curves(
         lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
         whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
         piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+        alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)  # of each component
         for i, size in enumerate(sizes):
             samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
             held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
-            rest = remainder(piece, held).unflatten(0, (-1, rank))
-            rest = torch.einsum("tkcp,tckj->tjcp", rest, root[chosen])
-            left = (rest.square().mean(2).sum(1) * weight).double().sum(1)
+            alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
+        for i, choice in enumerate(choices):
+            whole = rank - choice.coarse
+            left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
             error[i, part] = (left + lost).cpu().numpy()
         number[part] = chosen.cpu().numpy()
     return number, error
 
 
-def _roots(factor: torch.Tensor) -> torch.Tensor:
-    """L of F^T F / M = L L^T, float32 [G, 3, K, K]."""
-    gram = torch.einsum("gmkc,gmlc->gckl", factor.double(), factor.double()) / factor.shape[1]
-    trace = gram.diagonal(dim1=2, dim2=3).sum(2).clamp(min=1e-30)
-    # What makes it definite where components are alike.
-    gram = gram + 1e-9 * trace[..., None, None] * torch.eye(gram.shape[2], device=gram.device)
-    return torch.linalg.cholesky(gram).float()
+def costs(tried: list[Tried]) -> np.ndarray:
+    """Bits of each number of components and what they may become."""
+    return np.array([choice.bits for each in tried for choice in each.choices])
 
 
-def costs(tried: list[Tried], sizes: list[Size]) -> np.ndarray:
-    """Bits of each number of components and size."""
-    bits = np.array([float(size.bits) for size in sizes])
-    return np.concatenate([bits * each.rank for each in tried])
-
-
-def _left(tried: list[Tried], sizes: list[Size], bits: float) -> tuple[float, np.ndarray]:
+def _left(tried: list[Tried], bits: float) -> tuple[float, np.ndarray]:
     """The error that is left, about; and the number in the list of what each tile takes, int [T]."""
     error = np.concatenate([each.error for each in tried])
-    chosen = allocate(error, costs(tried, sizes), bits, 0.0)
-    return float(error[chosen, np.arange(len(chosen))].sum()), chosen // len(sizes)
+    chosen = allocate(error, costs(tried), bits, 0.0)
+    of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])
+    return float(error[chosen, np.arange(len(chosen))].sum()), of[chosen]

@@ -1,10 +1,11 @@
-"""Files of scenes of earlier versions: one mixture for all tiles, each component on a layer of its own."""
+"""Files of scenes of earlier versions: one mixture for all tiles, each component on a layer of its own; or entries that
+don't say which components are coarse."""
 
 import numpy as np
 
 from wlm.atlas.layout import texels_of
 from wlm.atlas.model import TEXELS, unpack_entries
-from wlm.atlas.scene.model import pack_tiles
+from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, MOST_PAGES, pack_tiles
 from wlm.atlas.scene.packing import packed
 
 
@@ -43,3 +44,16 @@ def side_by_side(texels: np.ndarray, lut: np.ndarray, count: int, page: np.ndarr
     counts, pages = np.zeros(cells, int), np.zeros(cells, int)
     counts[of], pages[of] = count, on[number.ravel()]
     return result, pack_tiles(corner, side, np.zeros(cells, int), counts, pages).reshape(*page.shape, 4)
+
+
+def without_coarse(lut: np.ndarray) -> np.ndarray:
+    """Entries [Hc, Wc, 4] whose pages are right above the number of components, as they are now.
+
+    Raises:
+        ValueError: There are more pages than there may be.
+    """
+    page, count = lut[..., 3] >> COUNT_BITS, lut[..., 3] & ((1 << COUNT_BITS) - 1)
+    if (page >= MOST_PAGES).any():
+        raise ValueError(f"part lut: page {page.max()}: expected one below {MOST_PAGES}")
+    last = (page << (COUNT_BITS + COARSE_BITS)) + count
+    return np.concatenate([lut[..., :3], last[..., None].astype(np.uint16)], 2)

@@ -1,8 +1,9 @@
 """From a scene's lightmaps to one model: mixtures of the states, tiles of all sheets, one allocation.
 
-The states' light is divided by its peak, so that each counts by its PSNR. Tiles are dealt to mixtures of one, two and
-more components (`mixture`), each has a curve of error for each number of them (`curves`), and numbers and sizes are
-allocated to the tiles of all sheets at once (`allocation`): one more bit gains as much in every object.
+The states' light is divided by how much it varies, so that each counts by its PSNR (`detail`). Tiles are dealt to
+mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), they
+count by what the views that show them lose (`balance`), and numbers and sizes are allocated to the tiles of all sheets
+at once (`allocation`): one more bit gains as much in every object.
 """
 
 import math
@@ -16,10 +17,12 @@ import torch
 from wlm import interop
 from wlm.atlas.colour import encode
 from wlm.atlas.layout import Size, place, texels_of
-from wlm.atlas.model import BLOCKS, TEXELS, tile_counts
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, tile_counts
 from wlm.atlas.scene.allocation import NO_ROOM, Allocated, allocated
+from wlm.atlas.scene.balance import balance, tiles_seen
 from wlm.atlas.scene.curves import SceneTiles, Tried, candidates, sizes_of
 from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.scene.detail import peaks_of, scales, variation
 from wlm.atlas.scene.model import (
     ENTRY,
     NUMBER_BITS,
@@ -29,6 +32,8 @@ from wlm.atlas.scene.model import (
     SceneModel,
     SceneProfile,
     SheetPlace,
+    coarse_place,
+    extent,
     pack_tiles,
 )
 from wlm.atlas.scene.packing import WIDTHS
@@ -46,7 +51,6 @@ from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import OnProgress
 
 _AT_ONCE = 1024  # tiles
-_PERCENTILE = 99.9  # of a state's light: its peak
 _BRIGHT = 1024.0  # what a component's largest texel becomes: RGB9E5 has as many octaves below it as above
 
 
@@ -101,8 +105,10 @@ def compress_scene(
 def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stages: Stages) -> SceneModel:
     device = stages.device
     with stages("weights"):
-        weights = scene_weights(scene, profile, seed, device)
-        peak = _peaks(scene, weights)
+        peak = peaks_of(scene)
+        varies = variation(scene, peak, device)
+        weights = scene_weights(scene, varies, profile, seed, device)
+        unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
         planes = planes_of(scene, weights, profile.mips, device)
     layout = _laid_out(planes, profile.tile)
     # One state has one component.
@@ -110,17 +116,20 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
     bits = profile.budget * scene.source_bits - len(planes) * SHEET_BITS
     room = bits - math.prod(layout.shape) * numbers * NUMBER_BITS
     with stages("tiles"):
-        tiles = _tiles(planes, peak, profile.tile, device)
+        tiles = _tiles(planes, unit, profile.tile, device)
     if room < len(tiles.index) * TEXEL_BITS:
         raise WlmError(NO_ROOM.format(profile.budget))
     sizes = sizes_of(profile)
     with stages("curves"):
         tried = candidates(tiles, sizes, profile, room, seed, stages)
+    with stages("balance"):
+        seen = tiles_seen(scene, varies, tiles, layout.grid[: len(scene.sheets)], profile, seed, device)
+        tried = balance(tried, tiles.weight.double().sum(1).cpu().numpy(), seen, profile, room)
     with stages("allocate"):
-        given = allocated(tried, sizes, room, profile)
+        given = allocated(tried, room, profile)
         if numbers == SHORT_ENTRY and given.page.any():
             numbers = ENTRY
-            given = allocated(tried, sizes, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
+            given = allocated(tried, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
     with stages("solve"):
         texels, blocks, scale = _texels(tiles, tried, given)
     lut = np.ascontiguousarray(_table(tiles, layout, given)[..., :numbers])
@@ -131,7 +140,7 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
     sheets = len(scene.sheets)
     counts, samples, many = (
         np.bincount(tiles.plane, each, len(planes))[:sheets]
-        for each in (None, given.size.prod(1) * given.count, given.count)
+        for each in (None, extent(given.size, given.count, given.coarse).prod(1), given.count)
     )
     report = {
         "components": {str(each): int((given.count == each).sum()) for each in np.unique(given.count).tolist()},
@@ -141,11 +150,12 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         "components by sheet": (many / np.maximum(counts, 1)).round(2).tolist(),
         "pages": len(texels),
         "tiles of blocks": int(given.second.sum()),
+        "coarse components": int(given.coarse.sum()),
         "error by components": {str(each.rank): each.left for each in tried},
-        "peaks": peak.tolist(),
+        "units": unit.tolist(),
         "seconds": stages.seconds,
     }
-    factor = (given.factors * peak[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
+    factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
     parts = (tuple(rows[:sheets]), np.ascontiguousarray(factor), texels, lut, tuple(rows[sheets:]), report)
     second = {"blocks": blocks[0], "block_texels": blocks[1].astype(np.float16)} if blocks else {}
     return SceneModel(scene.name, scene.source, profile, scene.states, *parts, **second)
@@ -165,20 +175,16 @@ def _laid_out(planes: list[Plane], tile: int) -> _Layout:
     return _Layout(grid, best[1][:, 1].tolist(), best[1][:, 0].tolist(), best[2])
 
 
-def _peaks(scene: LightmappedScene, weights: list[np.ndarray]) -> np.ndarray:
-    """The bright end of each state's light, float64 [M], above 0; of what is seen, and of one texel not."""
-    seen = [(weight > 0).reshape(weight.shape[0] // 2, 2, -1, 2).any(axis=(1, 3)) for weight in weights]
-    light = [sheet.frames[:, each].max(axis=2) for sheet, each in zip(scene.sheets, seen, strict=True)]
-    peak = np.percentile(np.concatenate(light, axis=1), _PERCENTILE, axis=1)
-    # A state of darkness is exact whatever its peak is.
-    return np.where(peak > 0, peak, float(peak.max()) or 1.0).astype(np.float64)
+def _of_texels(weight: np.ndarray) -> np.ndarray:
+    """Weights of texels [H, W] of those of their quarters [2 H, 2 W]."""
+    return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
 
 
-def _tiles(planes: list[Plane], peak: np.ndarray, tile: int, device: str) -> SceneTiles:
+def _tiles(planes: list[Plane], unit: np.ndarray, tile: int, device: str) -> SceneTiles:
     """Cuts the light of all states into tiles."""
     total = sum(float(plane.weight.sum()) for plane in planes)
     texels, weights, numbers, owner = [], [], [], []
-    scale = torch.from_numpy(peak).float()[:, None]
+    scale = torch.from_numpy(unit).float()[:, None]
     for number, plane in enumerate(planes):
         if not plane.weight.any():
             continue
@@ -212,12 +218,17 @@ def _texels(
             kinds = np.column_stack([given.size[part], given.second[part]])
             sides, chosen = np.unique(kinds, axis=0, return_inverse=True)
             sizes = [Size(nx, ny, BLOCKS if second else TEXELS, bool(second)) for nx, ny, second in sides.tolist()]
+            block, sizes = len(sizes), [*sizes, Size(BLOCK_SIDE, BLOCK_SIDE, BLOCKS, True)]
+            whole = each.rank - given.coarse[part]
             for k in range(each.rank):
                 piece = Tiles(mixture, components[:, k].contiguous(), weight, tiles.size)
-                for at, values, weights in solved(piece, sizes, chosen.ravel()):
+                number = np.where(k < whole, chosen.ravel(), block)
+                for at, values, weights in solved(piece, sizes, number):
                     at, (ny, nx) = part[at], values.shape[1:3]
-                    texture = int(given.second[at[0]])
-                    row, column = texels_of(given.first[at] + [k * nx, 0], nx, ny)
+                    texture, whole_of = int(given.second[at[0]]), each.rank - given.coarse[at]
+                    aside = coarse_place(given.size[at], whole_of, np.maximum(k - whole_of, 0))
+                    aside = np.where((k < whole_of)[:, None], given.size[at] * [k, 0], aside)
+                    row, column = texels_of(given.first[at] + aside, nx, ny)
                     number = given.component[at] + 1 + k
                     place = given.page[at, None, None], row, column
                     light[texture][place], owner[texture][place] = values, number[:, None, None]
@@ -236,5 +247,7 @@ def _table(tiles: SceneTiles, layout: _Layout, given: Allocated) -> np.ndarray:
     row = tiles.index // columns + np.array(layout.row)[tiles.plane]
     column = tiles.index % columns + np.array(layout.column)[tiles.plane]
     table = np.zeros((*layout.shape, 4), np.uint16)
-    table[row, column] = pack_tiles(given.first, given.size, given.component, given.count, given.page, given.second)
+    table[row, column] = pack_tiles(
+        given.first, given.size, given.component, given.count, given.page, given.second, given.coarse
+    )
     return table

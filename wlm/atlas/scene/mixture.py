@@ -5,14 +5,13 @@ tile has few. Tiles are dealt to mixtures: subspaces of the states, each the one
 in the one that has least error for it (k-plane clustering, Bradley and Mangasarian 2000, with subspaces for planes).
 
 In a mixture of K components with orthonormal directions v_0 to v_(K-1), light x in the states is close to
-v_0 a + sum_j v_j b_j, a = v_0 x, b_j = v_j x. Light isn't negative, nor then is v_0 (Perron), nor a; and b_j is at
-least l_j a, with l_j the least ratio of all tiles'. So with
 
-    c_0 = a,   c_j = b_j - l_j a,   f_0 = v_0 + sum_j l_j v_j,   f_j = v_j,   x ~ sum_k f_k c_k,
+    sum_k v_k b_k = sum_k v_k c_k - sum_k v_k o_k,    b_k = v_k x,    c_k = b_k + o_k.
 
-no component is negative, so that textures of unsigned texels hold them, while factors have any sign. Samples of least
-squares overshoot, next to shadows below 0; so to each component a constant is added, a tenth of what most are at most,
-which a constant for each state takes away.
+Light isn't negative, nor then is v_0 (Perron), nor b_0. The others are as often negative, and samples of least squares
+overshoot. With o_k above what most of them are below 0, no component c_k is negative, so that textures of unsigned
+texels hold them, while factors have any sign; a constant for each state takes the o_k away. As the directions are
+orthonormal, an error of one component is no error of another, and none is made larger.
 """
 
 from dataclasses import dataclass, fields
@@ -21,9 +20,9 @@ import numpy as np
 import torch
 
 _ROUNDS = 12
-_LEAST_PERCENT = 0.02  # of the ratios: what is below the least is clipped
-_MARGIN, _BRIGHT_PERCENT = 0.1, 99.0  # what is added to components, of what most texels stay below
-_DIM = 1e-3  # of the mean coefficient of v_0: below it a ratio says nothing
+_ALIKE = 1e-6  # of light: less of it decides nothing
+_PERCENT = 0.1  # of a component: it is as low as that, and as high as all but that
+_MARGIN, _MARGIN_FIRST = 0.1, 0.02  # of its range and, of the first, of its height, that o_k is more
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +30,14 @@ class Mixtures:
     """Mixtures of one number of components.
 
     Attributes:
-        factor: float32 [G, M, K, 3], of the components in each state.
-        take: float32 [G, K, M, 3]: components are these times the states, plus `offset`, clipped at 0.
+        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
+            below 0.
         offset: float32 [G, K, 3]: the states are `factor` times the components less this.
-        kept: float32 [G, 3 M M], flat projections onto the subspaces: times a tile's moments, how much light they keep.
+        kept: float32 [G, 3 M M], flat projections onto the subspaces: times a tile's moments, how much light they keep;
+            of the first components alone where the others follow.
     """
 
     factor: torch.Tensor
-    take: torch.Tensor
     offset: torch.Tensor
     kept: torch.Tensor
 
@@ -53,8 +52,9 @@ class Mixtures:
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
-        """The mixture that keeps most of each tile's light, int64 [T], by `moments`."""
-        return (moment.flatten(1) @ self.kept.T).argmax(1)
+        """The mixture that keeps most of each tile's light, int64 [T], by `moments`; the first where some are alike."""
+        energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
+        return _first_best(moment.flatten(1) @ self.kept.T, energy)
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -68,7 +68,9 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return part @ part.transpose(2, 3)
 
 
-def find_mixtures(moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int) -> Mixtures:
+def find_mixtures(
+    moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
+) -> Mixtures:
     """Finds mixtures of some tiles.
 
     Args:
@@ -77,25 +79,40 @@ def find_mixtures(moment: np.ndarray, texels: np.ndarray, rank: int, count: int,
         rank: K, 1 to M.
         count: Mixtures, at least 1; fewer where that many have no tile.
         seed: Of the tiles that they begin with.
+        like: Of how many components mixtures are found, the others follow; None: K.
     """
-    random, moment = np.random.default_rng(seed), np.asarray(moment, np.float64)
+    random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
     flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)
-    spaces = [_subspace(moment.sum(0), rank)]
+
+    def best_of(kept: np.ndarray) -> np.ndarray:
+        return _first_best(torch.from_numpy(kept), torch.from_numpy(energy)).numpy()
+
+    spaces = [_subspace(moment.sum(0), few)]
     lost = energy - _kept(flat, spaces)[:, 0]
     while len(spaces) < min(count, len(moment)):
         share = lost.clip(min=0.0)
-        if not share.sum() > 1e-9 * energy.sum():
+        if not share.sum() > _ALIKE * energy.sum():
             break
-        spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], rank))
+        spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], few))
         lost = np.minimum(lost, energy - _kept(flat, spaces[-1:])[:, 0])
     for _ in range(_ROUNDS):
-        nearest = _kept(flat, spaces).argmax(1)
-        spaces = [_subspace(moment[nearest == g].sum(0), rank) for g in np.unique(nearest)]
-    nearest = _kept(flat, spaces).argmax(1)
-    # One that lost its tiles in the last round has its own directions alone.
-    made = [_positive(space, texels[nearest == g]) for g, space in enumerate(spaces)]
-    parts = (torch.from_numpy(np.stack(each)).float() for each in zip(*made, strict=True))
-    return Mixtures(*parts, torch.from_numpy(np.stack([_projection(each) for each in spaces])).float())
+        nearest = best_of(_kept(flat, spaces))
+        spaces = [_subspace(moment[nearest == g].sum(0), few) for g in np.unique(nearest)]
+    kept = [_projection(space) for space in spaces]
+    nearest = best_of(flat @ np.stack(kept).T)
+    if few < rank:
+        # One that lost its tiles in the last round has any directions.
+        spaces = [_subspace(moment[nearest == g].sum(0), rank) for g, space in enumerate(spaces)]
+    offset = np.stack([_offset(space, texels[nearest == g]) for g, space in enumerate(spaces)])
+    factor = np.stack([space.transpose(1, 2, 0) for space in spaces])
+    parts = factor, offset, np.stack(kept)
+    return Mixtures(*(torch.from_numpy(np.ascontiguousarray(each)).float() for each in parts))
+
+
+def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
+    """Of what each mixture keeps [T, G], of so much [T], the first that keeps about the most, int64 [T]: rounding must
+    not deal tiles to others than those whose offsets are made for them."""
+    return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 
 
 def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
@@ -114,22 +131,12 @@ def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
     return flat @ np.stack([_projection(each) for each in spaces]).T
 
 
-def _positive(space: np.ndarray, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Factors [M, K, 3], `take` [K, M, 3] and `offset` [K, 3] of components that aren't negative."""
-    channels, states, rank = space.shape
-    factor, take = np.empty((states, rank, channels)), np.empty((rank, states, channels))
-    offset = np.zeros((rank, channels))
-    for channel, directions in enumerate(space):
-        least = np.zeros(rank)
-        part = texels.reshape(-1, states, channels)[:, :, channel] @ directions
-        bright = part[:, 0] > _DIM * max(float(part[:, 0].mean()), 0.0) if len(part) else np.zeros(0, bool)
-        if rank > 1 and bright.any():
-            least[1:] = np.percentile(part[bright, 1:] / part[bright, :1], _LEAST_PERCENT, axis=0)
-        factor[:, :, channel] = directions
-        factor[:, 0, channel] += directions @ least
-        take[:, :, channel] = directions.T - np.outer(least, directions[:, 0])
-        take[0, :, channel] = directions[:, 0]
-        if len(part):
-            components = part - part[:, :1] * least
-            offset[:, channel] = _MARGIN * np.percentile(components, _BRIGHT_PERCENT, axis=0).clip(min=0.0)
-    return factor, take, offset
+def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:
+    """What is added to components so that they aren't negative, [K, 3]."""
+    if not len(texels):
+        return np.zeros((space.shape[2], len(space)))
+    parts = np.einsum("nmc,cmk->nkc", texels.reshape(-1, *texels.shape[2:]), space)
+    low, high = np.percentile(parts, [_PERCENT, 100.0 - _PERCENT], axis=0)
+    offset = (_MARGIN * (high - low) - low).clip(min=0.0)
+    offset[0] = _MARGIN_FIRST * high[0].clip(min=0.0)
+    return offset

@@ -1,7 +1,8 @@
 """The model of a scene's lightmaps: one table and one texture for all sheets and all states.
 
 The lightmaps of a sheet share its tiles. A tile has a few components, K rectangles of one size beside each other in
-T_p, and a mixture; light at a point in state m is
+T_p, and a mixture; of tiles in blocks the last components may be *coarse*, of one block of 4 x 4 texels each. Light at
+a point in state m is
 
     C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place of u by T_c, k rectangles to the right),
 
@@ -16,7 +17,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from wlm.atlas.model import SOURCE_BITS, pack_entries, unpack_entries
+from wlm.atlas.model import BLOCK_SIDE, SOURCE_BITS, pack_entries, unpack_entries
 from wlm.system import Model, Settings
 
 TEXEL_BITS = 32
@@ -34,8 +35,11 @@ FACTOR_BITS = 128
 SHEET_BITS = 128
 """Bits of a sheet's or level's row: eight numbers of 16."""
 
-COUNT_BITS = 8
-"""Of an entry's fourth number: the lowest, for the number of components; above them is the page."""
+COUNT_BITS, COARSE_BITS = 8, 4
+"""Of an entry's fourth number: the lowest, for the number of components, and the next, for how many of them are coarse;
+above them is the page."""
+
+MOST_PAGES, MOST_COARSE = 1 << (16 - COUNT_BITS - COARSE_BITS), (1 << COARSE_BITS) - 1
 
 
 class SceneProfile(Settings):
@@ -155,6 +159,7 @@ def pack_tiles(
     count: np.ndarray,
     page: np.ndarray,
     blocks: np.ndarray | bool = False,
+    coarse: np.ndarray | int = 0,
 ) -> np.ndarray:
     """Encodes entries of T_c.
 
@@ -162,20 +167,45 @@ def pack_tiles(
         first, size, blocks: As of `pack_entries`: the rectangle of the first component.
         component: int [...], number of the first component's factors, below 65,536.
         count: int [...], components, 0 to 255; 0: the tile is black.
-        page: int [...], 0 to 255.
+        page: int [...], below `MOST_PAGES`.
+        coarse: int [...], how many of the components are coarse, 0 to `MOST_COARSE`; of tiles in blocks alone.
 
     Returns:
         uint16 [..., 4].
     """
-    rest = np.stack([component, (np.asarray(page) << COUNT_BITS) + count], -1).astype(np.uint16)
+    above = (np.asarray(page) << COARSE_BITS) + coarse
+    rest = np.stack(np.broadcast_arrays(component, (above << COUNT_BITS) + count), -1).astype(np.uint16)
     return np.concatenate([pack_entries(first, size, blocks), rest], -1)
 
 
 def unpack_tiles(lut: np.ndarray, colour: str) -> tuple[np.ndarray, ...]:
-    """Decodes `pack_tiles`, to int64, and `blocks` to bool [...]; of short entries, too."""
+    """Decodes `pack_tiles`, to int64, and `blocks` to bool [...], in its order; of short entries, too."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], colour)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
-        return first, size, zeros, zeros + 1, zeros, blocks[..., 0]
+        return first, size, zeros, zeros + 1, zeros, blocks[..., 0], zeros
     last = lut[..., 3].astype(np.int64)
-    return first, size, lut[..., 2].astype(np.int64), last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS, blocks[..., 0]
+    count, above = last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS
+    component, page, coarse = lut[..., 2].astype(np.int64), above >> COARSE_BITS, above & MOST_COARSE
+    return first, size, component, count, page, blocks[..., 0], coarse
+
+
+def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
+    """Where the coarse components of tiles are, one below the other in columns, beside the others.
+
+    Args:
+        size: int [..., 2], texels of the others along x and y.
+        whole: int [...], how many others there are.
+        number: int [...], of the coarse component, from 0.
+
+    Returns:
+        int [..., 2], x and y of the first texel, from that of the tile's first component.
+    """
+    column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
+    return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
+
+
+def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
+    """Texels along x and y of all components of tiles, int [..., 2], of numbers as of `pack_tiles`."""
+    columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
+    return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

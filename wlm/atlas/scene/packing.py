@@ -6,12 +6,11 @@ import numpy as np
 
 from wlm.atlas.layout import place
 from wlm.atlas.model import MOST_SIZE
+from wlm.atlas.scene.model import MOST_PAGES
 from wlm.errors import WlmError
 
 WIDTHS = np.linspace(0.7, 1.5, 9)
 """Of a page, or a table, over the square root of its area, that are tried."""
-
-_MOST_PAGES = 256
 
 
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
@@ -27,14 +26,14 @@ def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         WlmError: They are too many for all pages.
     """
     order, pages = np.lexsort((size[:, 0], size[:, 1])), max(1, -(-int(size.prod(1).sum()) // MOST_SIZE**2))
-    while pages <= _MOST_PAGES:
+    while pages <= MOST_PAGES:
         page = np.empty(len(size), np.int64)
         page[order] = np.arange(len(size)) % pages  # as many of each size on each
         first, shape = _on_pages(size, page, pages)
         if max(shape) <= MOST_SIZE:
             return first, page, shape
         pages += 1
-    raise WlmError(f"budget: expected at most {_MOST_PAGES} pages of {MOST_SIZE} texels along a side")
+    raise WlmError(f"budget: expected at most {MOST_PAGES} pages of {MOST_SIZE} texels along a side")
 
 
 def _on_pages(size: np.ndarray, page: np.ndarray, pages: int) -> tuple[np.ndarray, tuple[int, int]]:

@@ -7,12 +7,14 @@ import torch
 
 from wlm.atlas.model import Profile
 from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.scene.detail import FLOOR, scales
 from wlm.atlas.scene.model import SceneProfile
 from wlm.atlas.weights import FineGrid, spread
 from wlm.interop import check_device
 from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
 
-_RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
+RESOLUTION = 768
+"""Pixels along a side of a view that visibility is counted in."""
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
@@ -53,14 +55,17 @@ def seen_points(
         yield hit, sheet[hit], place[hit]
 
 
-def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, device: str) -> list[np.ndarray]:
+def scene_weights(
+    scene: LightmappedScene, varies: Sequence[np.ndarray], profile: SceneProfile, seed: int, device: str
+) -> list[np.ndarray]:
     """How much each quarter of a texel counts: the pixels of random views of the scene that show it, and a little.
 
-    Objects that are seen large so get more than those that are small, far away or hidden; views from inside count as
-    much as those from around.
+    Objects that are seen large so get more than those that are small, far away or hidden. A view counts by the inverse
+    of how much the light that it shows varies (`wlm.atlas.scene.detail`), and by no more if it shows more pixels.
 
     Args:
         scene: The scene.
+        varies: `variation`.
         profile: `views`, `unseen` and `border`.
         seed: Of the views.
         device: "cpu" or "cuda:N".
@@ -71,12 +76,8 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
     Raises:
         WlmError: There is no such device.
     """
-    views = scene_views(scene, profile.views, seed)
     grids = [FineGrid(sheet.mesh, device) for sheet in scene.sheets]
-    around, inside = (_counts(scene, grids, part, device) for part in (views[: profile.views], views[profile.views :]))
-    totals = [sum(float(each.sum()) for each in counts) for counts in (around, inside)]
-    scale = totals[0] / totals[1] if min(totals) > 0 else 1.0
-    visible = [a + scale * b for a, b in zip(around, inside, strict=True)]
+    visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
     # As `spread` has them.
     used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
     cells = sum(int(each.sum()) for each in used)
@@ -87,18 +88,54 @@ def scene_weights(scene: LightmappedScene, profile: SceneProfile, seed: int, dev
 
 
 def _counts(
-    scene: LightmappedScene, grids: Sequence[FineGrid], views: Sequence[View | Viewpoint], device: str
+    scene: LightmappedScene,
+    grids: Sequence[FineGrid],
+    detail: "Detail",
+    views: Sequence[View | Viewpoint],
+    device: str,
 ) -> list[torch.Tensor]:
-    """Pixels that show each cell of each sheet."""
+    """Shares of views that show each cell of each sheet, over how much light varies in the view."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
-    count = torch.zeros(int(first[-1]), dtype=torch.int64, device=device)
-    for _, sheet, uv in seen_points(scene, views, _RESOLUTION, device):
+    count = torch.zeros(int(first[-1]), dtype=torch.float64, device=device)
+    for _, sheet, uv in seen_points(scene, views, RESOLUTION, device):
+        if not len(sheet):
+            continue
         height, width, start = place[sheet.long()].T
         column = torch.minimum((uv[:, 0].double() * width).long().clamp(min=0), width - 1)
         row = torch.minimum((uv[:, 1].double() * height).long().clamp(min=0), height - 1)
-        cell = start + row * width + column
-        count.index_add_(0, cell, torch.ones_like(cell))
-    flat = count.double()
-    return [flat[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
+        cell, pixels = torch.unique(start + row * width + column, return_counts=True)
+        count[cell] += pixels / (detail.lost(sheet, uv) * len(sheet))
+    return [count[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
+
+
+class Detail:
+    """How much the light of a scene varies, on a device.
+
+    Args:
+        scene: The scene.
+        varies: `variation`.
+        device: "cpu" or "cuda:N".
+    """
+
+    def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
+        masks = [sheet.mesh.mask for sheet in scene.sheets]
+        scale = scales(varies, masks)
+        even = [np.tensordot(1.0 / scale**2, each, 1).ravel() / len(scale) for each in varies]
+        first = np.cumsum([0, *(mask.size for mask in masks)])
+        place = np.array([(*mask.shape, start) for mask, start in zip(masks, first, strict=False)])
+        self._even, self._place = torch.from_numpy(np.concatenate(even)).to(device), torch.from_numpy(place).to(device)
+
+    def sizes(self, sheet: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows and columns of texels of the sheet at each point, int64 [N]."""
+        return tuple(self._place[sheet.long()].T[:2])
+
+    def lost(self, sheet: torch.Tensor, uv: torch.Tensor) -> float:
+        """What a view of the points [N] loses, in about, mean of states in which light varies alike; above 0."""
+        height, width, start = self._place[sheet.long()].T
+        column, row = (
+            (uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)
+            for axis, side in ((0, width), (1, height))
+        )
+        return float(self._even[start + row * width + column].mean()) + FLOOR

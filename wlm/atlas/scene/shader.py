@@ -1,7 +1,7 @@
 """The GLSL that reads a scene's exported lightmaps; `wlm.atlas.scene.exporter` writes it."""
 
 from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
-from wlm.atlas.scene.model import COUNT_BITS, SHORT_ENTRY, SceneModel
+from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, MOST_COARSE, SHORT_ENTRY, SceneModel
 from wlm.shading import sampler
 
 _TEXT = """\
@@ -46,7 +46,8 @@ vec3 wlm_scene(vec2 uv, int sheet, float state)
     for (int k = 0; k <= components; k++) {{
         vec3 factor = texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, before), 0).rgb;
         factor = mix(factor, texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, after), 0).rgb, share);
-        vec2 spot = (at + vec2(float(k - 1) * (steps.x + 1.0), 0.0)) / extent;
+        vec2 spot = at + vec2(float(k - 1) * (steps.x + 1.0), 0.0);
+{coarse}        spot = spot / extent;
         if (k > 0)
             {read}
         if (components > 0)
@@ -65,6 +66,15 @@ _BLOCKS = """\
         extent = vec2({width}.0, {height}.0);
     }}
 """
+_COARSE = """\
+        int small = k - 1 - components + {small}; // of the coarse components, of one block each
+        if (small >= 0) {{
+            int rows = int(steps.y + 1.0) / {side};
+            vec2 aside = vec2(float(components - {small}) * (steps.x + 1.0) + {side}.0 * float(small / rows),
+                              {side}.0 * float(small % rows));
+            spot = first + aside + (x - vec2(tile)) * {last}.0 + vec2(0.5, 0.5);
+        }}
+"""
 _READ = "factor = factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;"
 _READ_MIXED = """\
 factor = factor * (blocks ? textureLod(WLM_SCENE_BLOCKS, vec3(spot, page), 0.0).rgb
@@ -72,10 +82,11 @@ factor = factor * (blocks ? textureLod(WLM_SCENE_BLOCKS, vec3(spot, page), 0.0).
 
 _LONG = {
     "entry": "The first texel of the tile's first rectangle, and in the low bits its texels less one; its first\n"
-    "    // component's number; its page, and in the low bits its components.",
+    "    // component's number; its page, its coarse components, and in the lowest bits all its components.",
     "components": f"int(entry.w & {(1 << COUNT_BITS) - 1}u)",
     "component": "int(entry.z)",
-    "page": f"float(entry.w >> {COUNT_BITS}u)",
+    "page": f"float(entry.w >> {COUNT_BITS + COARSE_BITS}u)",
+    "small": f"int((entry.w >> {COUNT_BITS}u) & {MOST_COARSE}u)",
 }
 _SHORT = {
     "entry": "The first texel of the tile's rectangle, and in the low bits its texels less one.",
@@ -119,8 +130,11 @@ def scene_glsl(model: SceneModel) -> str:
         kinds["blocks"] = "sampler2DArray"
     rows, columns = model.block_texels.shape[1:3]
     sizes = {"code": FIRST_BLOCK_CODE, "side": BLOCK_SIDE, "last": BLOCK_SIDE - 1, "width": columns, "height": rows}
+    short = model.lut.shape[2] == SHORT_ENTRY
+    numbers = _SHORT if short else _LONG
     text = _TEXT.format(
         blocks=_BLOCKS.format(**sizes) if mixed else "",
+        coarse=_COARSE.format(**sizes, **numbers) if mixed and not short else "",
         read=_READ_MIXED if mixed else _READ,
         second="// wlm_scene_blocks: blocks_0.dds and so on, likewise.\n" if mixed else "",
         last=len(model.states) - 1,
@@ -130,6 +144,6 @@ def scene_glsl(model: SceneModel) -> str:
         samplers="".join(sampler(f"wlm_scene_{name}", kind) for name, kind in kinds.items()),
         bits=SIDE_BITS,
         mask=(1 << SIDE_BITS) - 1,
-        **(_SHORT if model.lut.shape[2] == SHORT_ENTRY else _LONG),
+        **numbers,
     )
     return text + _GRAD.format(octaves=TAIL_OCTAVES - 1) if model.levels else text
