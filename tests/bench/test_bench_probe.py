@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from builders.bench_rows import check_command, check_outputs, keys
+from typer.testing import CliRunner
 
 import wlm.bench.probe as bench
 from wlm.bench import write_json
-from wlm.bench.probe import PANELS, run, run_rivals, run_rows
+from wlm.bench.probe import PANELS, run, run_rivals, run_rows, run_volume
+from wlm.cli.bench import app
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
@@ -98,6 +100,16 @@ def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
         run_rivals(tmp_path / "hall.json", probes_path="room.npz")
 
 
+def test_the_volume_alone_is_the_same(sets, rows, monkeypatch):
+    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
+    alone = run_volume(device="cpu", probes_path="room.npz", frames=4)
+    names = [f"{light}, walk of 4 frames" for light in ("lossless", "5%")]
+    beside = [row for row in rows if row.scene == "room" and row.method == "volume" and row.option in names]
+    assert keys(alone) == keys(beside) and len(alone) == 2
+    for name in ("psnr", "light_psnr", "blocks", "coverage"):
+        assert [row[name] for row in alone] == [row[name] for row in beside]
+
+
 def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS)
 
@@ -112,6 +124,8 @@ def test_the_command(rows, tmp_path, monkeypatch):
 def test_what_is_refused(sets, tmp_path):
     with pytest.raises(WlmError, match="No such file"):
         run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
+    result = CliRunner().invoke(app, ["probe", "--volume-only", "--quick"])
+    assert result.exit_code != 0 and "--volume-only: expected without" in str(result.exception)
     with pytest.raises(WlmError, match="device 'tpu'"):
         run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
     with pytest.raises(ValueError, match="at least one set and one profile"):

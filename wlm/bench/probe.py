@@ -16,12 +16,8 @@ For each set these kinds of rows, but where another is named:
   list of dead probes is counted for them too; positions are for nobody.
 - method "held out", the first profile and the transform of 5%: the light at every fifth probe, of a file of the others,
   beside that of the uncompressed others by plain rules, and the light half-way between probes.
-- method "volume": a walk with the cascaded volume, over the probes as they were ("lossless") and as the first profile
-  ("ours") and the transform of 5% have them, whose figures are means and 95th percentiles of a frame. Its PSNR is that
-  of what is read at probes near the viewer against the input, beside it that of the same probes as they were decoded,
-  and of what is read farther away. It starts with an empty volume: what its first frame takes, and the frames until
-  nothing waits. The light's RMS is that of the probes that the volume was made from, its RMSE is against these.
-- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
+- methods "volume" and "views" of `wlm.bench.probe_volume`, the first profile and the transform of 5%: the light through
+  the cascaded volume along a walk, and pictures under it. `run_volume` has the walks alone.
 
 A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
 CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
@@ -30,7 +26,6 @@ CUDA is timed as the replay of a graph, so that gaps between launches do not cou
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -39,6 +34,7 @@ from wlm.baselines.probe import WEIGHT_BITS, at_bytes, unreal_packing
 from wlm.baselines.probe_torch import DenseFit
 from wlm.baselines.rival import Rival
 from wlm.bench.plot import Panel
+from wlm.bench.probe_volume import view_rows, volume_rows
 from wlm.bench.rows import Row, read_json
 from wlm.bench.runner import Bench, Fit, Note, demo_data, exact_errors
 from wlm.errors import WlmError
@@ -49,10 +45,8 @@ from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fields import pack_dead
 from wlm.probe.fit import compress
-from wlm.probe.light import Light, StoredLight, light_of
-from wlm.probe.model import ProbeModel, Profile
-from wlm.probe.seen import VIEWS, score_views
-from wlm.probe.walk import score_volume
+from wlm.probe.model import Profile
+from wlm.probe.seen import VIEWS
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""
@@ -162,6 +156,37 @@ def run_rivals(
     return [row for bench in benches for row in bench.rival_rows(sizes[bench.scene])]
 
 
+def run_volume(
+    *,
+    device: str,
+    probes_path: str | os.PathLike[str] | None = None,
+    keys: Sequence[str] = (),
+    frames: int | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the volume alone, over the probes as they were and as the transform of 5% has them.
+
+    Args:
+        device: As for `run`.
+        probes_path: As for `run`.
+        keys: As for `run`.
+        frames: Of the walk, at least one; None: as many as a tenth of a block each takes.
+        progress: As for `run`.
+
+    Returns:
+        The rows of method "volume", set by set.
+
+    Raises:
+        WlmError: The file, a key or the device isn't there.
+    """
+    rows = []
+    for probes in _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ())):
+        bench = _ProbeBench(probes, device, progress)
+        models = {fit.option: fit.model for fit in bench.transforms((_BESIDE,)).values()}
+        rows += volume_rows(bench, probes, models, frames)
+    return rows
+
+
 def _sizes(rows: Iterable[Row]) -> dict[str, int]:
     """Bytes of the transforms' files, by their option."""
     return {row.option: int(row["bytes"]) for row in rows if row.method == _TRANSFORM and row.get("bytes")}
@@ -216,8 +241,8 @@ def run_rows(
             rows += bench.rival_rows({fit.option: fit.bytes for fit in transforms.values()})
         both = [fit for fit in (first, transforms.get(_BESIDE)) if fit is not None]
         rows += [bench.held_out_row(fit) for fit in both]
-        rows += bench.volume_rows(both, frames)
-        rows += bench.view_rows(first.model, VIEWS if frames is None else min(frames, VIEWS))
+        rows += volume_rows(bench, probes, {"ours" if fit is first else fit.option: fit.model for fit in both}, frames)
+        rows += view_rows(bench, probes, first.model, VIEWS if frames is None else min(frames, VIEWS))
     return rows
 
 
@@ -405,56 +430,6 @@ class _ProbeBench(Bench):
             **_size_and_psnr(report),
         )
 
-    def volume_rows(self, fits: Sequence[Fit], frames: int | None) -> list[Row]:
-        """A walk with the probes as they were and one with each model's, each from an empty volume."""
-        rows = []
-        lights: dict[str, Light] = {"lossless": StoredLight(self.probes.values, self.device)}
-        for fit in fits:
-            light = light_of(fit.model.decoder(self.device), self.probes.position)
-            lights["ours" if fit is fits[0] else fit.option] = light
-        for name, light in lights.items():
-            self.note(f"the volume, {name}")
-            walked = score_volume(self.probes, light, frames=frames)
-            spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
-            rows.append(
-                self.row(
-                    "volume",
-                    f"{name}, walk of {walked['frames']} frames",
-                    f"the finest blocks are {walked['block']:.3g} units wide",
-                    frames=walked["frames"],
-                    first_ms=walked["first_ms"],
-                    frames_first=walked["first_frames"],
-                    memory=walked["memory_bytes"] / 2**20,
-                    psnr=walked["psnr"],
-                    light_psnr=walked["light_psnr"],
-                    far_psnr=walked["far_psnr"],
-                    **_light(walked),
-                    **{key: value["mean"] for key, value in spread.items()},
-                    **{f"{key}_p95": value["p95"] for key, value in spread.items()},
-                )
-            )
-        return rows
-
-    def view_rows(self, model: ProbeModel, views: int) -> list[Row]:
-        """Pictures of balls under the light, for each way to read it."""
-        self.note(f"{views} views of balls")
-        decoded = model.decoder(self.device).decode_probes(self.probes.position)
-        try:
-            scores = score_views(self.probes, decoded, views=views, device=self.device)
-        except WlmError as error:  # no spherical harmonics
-            return [self.missing_row("views", "balls", error)]
-        return [
-            self.row(
-                "views",
-                f"{score.drawn}, {score.light}",
-                f"{score.views} views under the probes as they were and under these",
-                psnr=score.psnr,
-                ssim=score.ssim,
-                flip=score.flip,
-            )
-            for score in scores
-        ]
-
     def _decode(
         self, decoder: Decoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
@@ -477,12 +452,6 @@ class _ProbeBench(Bench):
 def _size_and_psnr(report: Report) -> dict[str, float]:
     names = {"bytes": "bytes", "bpp": "bits_per_probe", "share_of_float32": "ratio", "psnr": "psnr"}
     return {name: getattr(report, attribute) for name, attribute in names.items()}
-
-
-def _light(figures: dict[str, Any]) -> dict[str, float | None]:
-    """What the samples of a walk say of the light; none where no probe is near the viewer."""
-    names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
-    return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}
 
 
 def _in_given_order(points: Points) -> None:

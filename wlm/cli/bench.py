@@ -140,18 +140,26 @@ def probe(
     ] = None,
     rivals: _Rivals = True,
     rivals_at: _RivalsAt = None,
+    volume_only: Annotated[
+        bool, typer.Option("--volume-only", help="The volume alone: probes as they were, a transform of 5%.")
+    ] = False,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
     baseline: _Baseline = None,
 ) -> None:
     """Light probes: PSNR, size and decode time of the profiles, of their decodes and of the PCA family."""
     device = _prepare(device, json_path, plot_path, baseline)
-    from wlm.bench.probe import PANELS, run, run_rivals
+    from wlm.bench.probe import PANELS, run, run_rivals, run_volume
 
     common = {"probes_path": probes_path, "keys": keys or (), "progress": note}
     files = {"probes": probes_path, "key": keys}
     beside: list[Row] = []
-    if rivals_at is not None:
+    if volume_only:
+        if quick or not rivals or rivals_at is not None:
+            raise WlmError("--volume-only: expected without --quick, --no-rivals and --rivals-at")
+        rows = run_volume(device=device, **common)
+        command = _command("probe", volume_only=True, device=device, **files)
+    elif rivals_at is not None:
         if quick or not rivals or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
         rows = run_rivals(rivals_at, **common)
@@ -160,7 +168,7 @@ def probe(
     else:
         rows = run(quick=quick, device=device, rivals=rivals, **common)
         command = _command("probe", quick=quick, no_rivals=not rivals, device=device, **files)
-    _finish(rows, command, device, json_path, plot_path, PANELS, [*beside, *rows], baseline)
+    _finish(rows, command, device, json_path, plot_path, PANELS, [*beside, *rows], baseline, partial=volume_only)
 
 
 @app.command()
