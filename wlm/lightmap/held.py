@@ -42,6 +42,7 @@ def held_tiles(model: LightmapModel) -> list[HeldTile]:
         sizes[model.kind == TileKind.FRAMES] = stored["frame_sizes"]
     for page, size in zip(pages(model.kind, model.tile_columns, len(model.times)), model.video_sizes, strict=True):
         sizes[page.numbers] = np.diff(np.linspace(0, int(size), len(page.numbers) + 1).astype(int))
+    sizes[model.kind == TileKind.LEVELS] = model.level_sizes
     constant = model.kind == TileKind.CONSTANT
     sizes[constant] = model.constant.nbytes // max(int(constant.sum()), 1)
     result = []

@@ -14,20 +14,25 @@ planes that are coded are luma, a green and an orange difference, in our own ari
 to 0.4 dB, and is no part of AV1's standard, which is exact to the bit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from wlm.formats.av1 import encode_av1
 from wlm.lightmap.frames import round_half
-from wlm.lightmap.tiles import TILE
+from wlm.lightmap.level_packing import STEPS
+from wlm.lightmap.levels import encode_tile, mean_psnr, steps_for, tile_psnr
+from wlm.lightmap.streams import load_kernels
 from wlm.lightmap.video_packing import EXTRA, MIDDLE, WHITE, Page, decode_levels
-from wlm.metrics import evaluate_frame
 from wlm.texels import fill_smoothly
+from wlm.workers import each
+from wlm_kernels.lightmap import level_coder
 
 TRIAL_SPEED = 6
 """Of encodings that only choose: beyond it libaom is of another kind, which takes a quality for another."""
 
+_DEAR = 1.0  # bits a valid texel and time, from which on levels are tried: below, AV1 is far ahead
 _STEP = 4  # of the quality, for another point on the curve of PSNR over size
 
 
@@ -50,27 +55,75 @@ def encode_levels(levels: np.ndarray, quality: int, speed: int, extra: str = EXT
     return encode_av1(planes, quality, speed, extra)
 
 
+@dataclass(frozen=True, eq=False)
+class EncodedPage:
+    """A page as a stream of video, or its tiles as levels.
+
+    Attributes:
+        stream: The stream.
+        ranges: Of its tiles half [n, T, 2], least and greatest.
+        levels: Stream and ranges of each tile that is stored as levels, see `wlm.lightmap.levels`; empty where the page
+            is video.
+    """
+
+    stream: bytes
+    ranges: np.ndarray
+    levels: list[tuple[bytes, np.ndarray]] = field(default_factory=list)
+
+
 def encode_page(
     page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
-) -> tuple[bytes, np.ndarray]:
-    """Encodes a page, with the ranges that yield more for their bytes: those of each time, or those of all times.
-
-    Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
-    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
-    quality, which says what PSNR the smaller would have at the size of the larger.
+) -> EncodedPage:
+    """Encodes a page as AV1, or as levels where these are no worse in any tile and take fewer bytes.
 
     Args:
         page: The page.
         colour: Of its tiles float32 [T, 128, 128, 3], in gamma space.
         valid: Of each bool [128, 128].
         gamma: Of that space.
-        quality, speed: As for `encode_levels`.
-
-    Returns:
-        The stream, and the ranges of the tiles, half [n, T, 2], least and greatest.
+        quality: 0 to 100; one of `STEPS`: levels.
+        speed: Of AV1's encoder.
 
     Raises:
         WlmError: The encoder is missing.
+    """
+    if quality in STEPS:
+        return EncodedPage(b"", np.zeros(0, np.float16), _encoded_levels(colour, valid, [STEPS[quality]] * len(valid)))
+    stream, ranges = _encode_video(page, colour, valid, gamma, quality, speed)
+    encoded = EncodedPage(stream, ranges)
+    count = len(colour[0])
+    if 8 * len(stream) < _DEAR * count * sum(int(inside.sum()) for inside in valid):
+        return encoded
+    decoded = _decoded(page, ranges, decode_levels(stream, count, *page.shape))
+    psnr = [mean_psnr(*tile, gamma) for tile in zip(colour, decoded, valid, strict=True)]
+    steps = [steps_for(tile, inside, gamma, goal) for tile, inside, goal in zip(colour, valid, psnr, strict=True)]
+    levels = _encoded_levels(colour, valid, steps)
+    reached = (tile_psnr(tile, inside, gamma, s) for tile, inside, s in zip(colour, valid, steps, strict=True))
+    if any(found < goal for found, goal in zip(reached, psnr, strict=True)):
+        return encoded
+    smaller = sum(len(own) + bounds.nbytes for own, bounds in levels) < len(stream) + ranges.nbytes
+    return replace(encoded, levels=levels) if smaller else encoded
+
+
+def _encoded_levels(
+    colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], steps: Sequence[float]
+) -> list[tuple[bytes, np.ndarray]]:
+    """Stream and ranges of each of some tiles as levels."""
+    load_kernels(level_coder)
+    return list(each(lambda tile: encode_tile(*tile), zip(colour, valid, steps, strict=True)))
+
+
+def _encode_video(
+    page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
+) -> tuple[bytes, np.ndarray]:
+    """Encodes a page as AV1, with the ranges that yield more for their bytes: those of each time, or of all times.
+
+    Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
+    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
+    quality, which says what PSNR the smaller would have at the size of the larger.
+
+    Returns:
+        The stream, and the ranges of the tiles, half [n, T, 2], least and greatest.
     """
     by_time = np.stack([_range_of(tile[:, inside]) for tile, inside in zip(colour, valid, strict=True)])
     over_all = np.broadcast_to(np.stack([by_time[..., 0].min(1), by_time[..., 1].max(1)], 1)[:, None], by_time.shape)
@@ -122,6 +175,13 @@ def _encoded(
     return encode_levels(levels, quality, speed)
 
 
+def _decoded(page: Page, ranges: np.ndarray, levels: np.ndarray) -> Iterator[np.ndarray]:
+    """The colours of a page's tiles, float32 [T, 128, 128, 3] each."""
+    for bounds, window in zip(ranges.astype(np.float32), page.windows(), strict=True):
+        low, span = bounds[:, 0], (bounds[:, 1] - bounds[:, 0]) / np.float32(WHITE)
+        yield low[:, None, None, None] + levels[:, *window] * span[:, None, None, None]
+
+
 def _psnr(
     page: Page,
     colour: Sequence[np.ndarray],
@@ -131,12 +191,6 @@ def _psnr(
     gamma: float,
 ) -> float:
     """PSNR of a decoded page by the tiled protocol, dB; 0 where no tile has a score."""
-    scores = []
-    for tile, mask, (low, high), window in zip(
-        colour, valid, ranges.astype(np.float32).transpose(0, 2, 1), page.windows(), strict=True
-    ):
-        for t, original in enumerate(tile):
-            decoded = low[t] + levels[t, *window] * ((high[t] - low[t]) / np.float32(WHITE))
-            score = evaluate_frame(original**gamma, decoded**gamma, mask, TILE, ("psnr",)).psnr[0, 0]
-            scores.append(score)
+    tiles = zip(colour, _decoded(page, ranges, levels), valid, strict=True)
+    scores = [mean_psnr(*tile, gamma) for tile in tiles]
     return float(np.nanmean(scores)) if np.isfinite(scores).any() else 0.0

@@ -110,9 +110,14 @@ def unpack_video(video: np.ndarray, sizes: np.ndarray, kind: np.ndarray, columns
         except ValueError as error:
             raise ValueError(f"part video: page {i}: {error}") from error
         for row, window in zip(np.searchsorted(numbers, page.numbers), page.windows(), strict=True):
-            red, green, blue = np.moveaxis(levels[:, *window].astype(np.uint32), 3, 0)
-            words[row] = red | green << 10 | blue << 20 | np.uint32(3 << 30)
+            words[row] = words_of(levels[:, *window])
     return words
+
+
+def words_of(levels: np.ndarray) -> np.ndarray:
+    """Words uint32 [...] of red, green and blue, uint16 [..., 3]; see `unpack_video`."""
+    red, green, blue = np.moveaxis(levels.astype(np.uint32), -1, 0)
+    return red | green << 10 | blue << 20 | np.uint32(3 << 30)
 
 
 def levels_of(words: np.ndarray) -> np.ndarray:
