@@ -203,6 +203,21 @@ def test_they_take_the_place_of_av1_where_they_are_no_worse(hours, monkeypatch):
     assert _reached(hours, video_quality=60)[0] == low, "more bytes than AV1 are never chosen"
 
 
+def test_each_tile_has_what_takes_fewer_bytes(monkeypatch):
+    """A rough wall beside smooth light: neither form is best for both."""
+    rough, smooth = moving_light(hours=(6.0, 12.0)).frames, np.empty((2, 128, 128, 3))
+    y, x = np.mgrid[:128, :128] / 128.0
+    for i, hour in enumerate((6.0, 12.0)):
+        smooth[i] = (1.2 + np.sin(4.0 * x + hour) * np.cos(3.0 * y))[..., None] * [1.0, 0.8, 0.6]
+    light = from_arrays(np.concatenate([rough, smooth], 2), (6.0, 12.0), period=24.0, name="both")
+    kinds, psnr, size = _reached(light, video_quality=97)
+    assert kinds["levels"] == kinds["video"] == 1
+    assert compress(light, "video", video_quality=97, video_speed=8).kind.tolist() == [TileKind.LEVELS, TileKind.VIDEO]
+    monkeypatch.setattr(video, "_DEAR", np.inf)
+    _, av1_psnr, av1_size = _reached(light, video_quality=97)
+    assert size < av1_size and psnr > av1_psnr - 0.1
+
+
 def test_the_steps_are_the_same_share_in_all_channels():
     rng = np.random.default_rng(0)
     colour = (rng.random((1, 128, 128, 3)) * [1.0, 0.25, 0.0] + [0.0, 0.5, 0.25]).astype(np.float32)

@@ -243,7 +243,7 @@ def test_a_kept_file_decodes_as_when_it_was_written(device):
         np.testing.assert_allclose(model.decoder(device).frame(8.25)[::4, ::4], stored["frame"], rtol=1e-5)
 
 
-def test_the_quality_is_chosen(few_hours):
+def test_the_quality_is_chosen(few_hours, av1_alone):
     light = from_arrays(few_hours.frames[:2, :128], few_hours.times[:2], few_hours.mask[:128])
     settings = Profile.load("video").override({"video_speed": 9})
 

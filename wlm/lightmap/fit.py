@@ -357,11 +357,10 @@ class _Fit:
         for page in pages(model.kind, model.tile_columns, len(model.times)):
             tiles = split(self._lightmaps, profile.gamma, page.numbers)
             encoded = encode_page(page, tiles.colour, tiles.mask, *settings)
-            if encoded.levels:
-                levels |= zip(page.numbers.tolist(), encoded.levels, strict=True)
-            else:
+            levels |= {int(page.numbers[place]): own for place, own in encoded.levels.items()}
+            if len(encoded.video):
                 streams.append(encoded.stream)
-                ranges[np.searchsorted(numbers, page.numbers)] = encoded.ranges
+                ranges[np.searchsorted(numbers, page.numbers[encoded.video])] = encoded.ranges
             done += len(page.numbers)
             if meter.due(done):
                 meter.report(done)

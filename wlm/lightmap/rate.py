@@ -75,8 +75,8 @@ def choose(
 ) -> Choice:
     """Chooses the resolution of F_uvt, in a quarter of the steps of the fit that follows.
 
-    Of video it chooses the quality, by bisection: the least that reaches the PSNR, the greatest that fits the size,
-    from up to seven encodings of the set, with both up to fourteen.
+    Of video it chooses the quality, by bisection, levels above AV1 included: the least that reaches the PSNR, the
+    greatest that fits the size, from up to seven encodings of the set, with both up to fourteen.
 
     Args:
         lightmaps: The set.

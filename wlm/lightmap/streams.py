@@ -199,13 +199,16 @@ def read_levels(stream: np.ndarray, valid: np.ndarray, times: int) -> np.ndarray
         ValueError: The stream isn't one of such levels.
     """
     _check_plain(stream)
-    arrays = [_array(np.zeros(shape)) for shape in ((times, 3, LEVELS), (times, 3), (times, 3, *valid.shape))]
+    shapes = (times, 3, LEVELS), (times, 3), (times, 3, *valid.shape)
+    arrays = [wp.zeros(shape, dtype=int, device="cpu") for shape in shapes]
     _read(stream, "levels", lambda c: _launch_levels(c, valid, *arrays))
     listed, counts, places = (array.numpy() for array in arrays)
     if (listed[np.arange(LEVELS) < counts[..., None]] >= LEVELS).any() or (places >= counts[..., None, None]).any():
         raise ValueError(f"expected levels below {LEVELS}, and places among them")
-    levels = np.take_along_axis(listed, places.reshape(times, 3, -1), 2).reshape(places.shape)
-    return np.ascontiguousarray(np.moveaxis(levels, 1, 3)).astype(np.uint16)
+    levels = np.empty((times, *valid.shape, 3), np.uint16)
+    for t, channel in np.ndindex(times, 3):
+        levels[t, ..., channel] = listed[t, channel][places[t, channel]]
+    return levels
 
 
 def _launch_levels(c: coder.Coder, valid: np.ndarray, listed: wp.array, counts: wp.array, places: wp.array) -> None:

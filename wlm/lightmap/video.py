@@ -15,7 +15,7 @@ to 0.4 dB, and is no part of AV1's standard, which is exact to the bit.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,60 +57,87 @@ def encode_levels(levels: np.ndarray, quality: int, speed: int, extra: str = EXT
 
 @dataclass(frozen=True, eq=False)
 class EncodedPage:
-    """A page as a stream of video, or its tiles as levels.
+    """The tiles of a page as a stream of video, or as levels.
 
     Attributes:
-        stream: The stream.
-        ranges: Of its tiles half [n, T, 2], least and greatest.
-        levels: Stream and ranges of each tile that is stored as levels, see `wlm.lightmap.levels`; empty where the page
-            is video.
+        video: int, places of the tiles of video in the page, rising.
+        stream: Their stream; empty where there is none.
+        ranges: Of each of them half [n, T, 2], least and greatest.
+        levels: Of each other tile, by its place, its stream and its ranges as levels, see `wlm.lightmap.levels`.
     """
 
+    video: np.ndarray
     stream: bytes
     ranges: np.ndarray
-    levels: list[tuple[bytes, np.ndarray]] = field(default_factory=list)
+    levels: dict[int, tuple[bytes, np.ndarray]]
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        levels = sum(len(stream) + ranges.nbytes for stream, ranges in self.levels.values())
+        return len(self.stream) + self.ranges.nbytes + levels
 
 
 def encode_page(
     page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
 ) -> EncodedPage:
-    """Encodes a page as AV1, or as levels where these are no worse in any tile and take fewer bytes.
+    """Encodes a page as AV1; tiles as levels where these take fewer bytes at no lower PSNR.
+
+    What a tile takes of AV1's stream quick encodings of each tile alone say, which in sum are within 2% of one of all.
 
     Args:
         page: The page.
         colour: Of its tiles float32 [T, 128, 128, 3], in gamma space.
         valid: Of each bool [128, 128].
         gamma: Of that space.
-        quality: 0 to 100; one of `STEPS`: levels.
+        quality: 0 to 100; one of `STEPS`: all tiles are levels.
         speed: Of AV1's encoder.
 
     Raises:
         WlmError: The encoder is missing.
     """
+    tiles = list(zip(colour, valid, strict=True))
+    none = np.zeros(0, int), b"", np.zeros((0, len(colour[0]), 2), np.float16)
     if quality in STEPS:
-        return EncodedPage(b"", np.zeros(0, np.float16), _encoded_levels(colour, valid, [STEPS[quality]] * len(valid)))
+        return EncodedPage(*none, dict(enumerate(_encoded_levels(tiles, [STEPS[quality]] * len(tiles)))))
     stream, ranges = _encode_video(page, colour, valid, gamma, quality, speed)
-    encoded = EncodedPage(stream, ranges)
-    count = len(colour[0])
-    if 8 * len(stream) < _DEAR * count * sum(int(inside.sum()) for inside in valid):
-        return encoded
-    decoded = _decoded(page, ranges, decode_levels(stream, count, *page.shape))
-    psnr = [mean_psnr(*tile, gamma) for tile in zip(colour, decoded, valid, strict=True)]
-    steps = [steps_for(tile, inside, gamma, goal) for tile, inside, goal in zip(colour, valid, psnr, strict=True)]
-    levels = _encoded_levels(colour, valid, steps)
-    reached = (tile_psnr(tile, inside, gamma, s) for tile, inside, s in zip(colour, valid, steps, strict=True))
-    if any(found < goal for found, goal in zip(reached, psnr, strict=True)):
-        return encoded
-    smaller = sum(len(own) + bounds.nbytes for own, bounds in levels) < len(stream) + ranges.nbytes
-    return replace(encoded, levels=levels) if smaller else encoded
+    alone = EncodedPage(np.arange(len(tiles)), stream, ranges, {})
+    if 8 * len(stream) < _DEAR * len(colour[0]) * sum(int(inside.sum()) for inside in valid):
+        return alone
+    decoded = _decoded(page, ranges, decode_levels(stream, len(colour[0]), *page.shape))
+    goals = [mean_psnr(tile, other, inside, gamma) for (tile, inside), other in zip(tiles, decoded, strict=True)]
+    steps = [steps_for(*tile, gamma, goal) for tile, goal in zip(tiles, goals, strict=True)]
+    levels = dict(enumerate(_encoded_levels(tiles, steps)))
+    worse = [i for i, goal in enumerate(goals) if tile_psnr(*tiles[i], gamma, steps[i]) < goal]
+    shares = np.array([_alone(page, i, tiles[i], ranges[i], quality, max(speed, TRIAL_SPEED)) for i in levels], float)
+    shares *= len(stream) / shares.sum()
+    dearer = [i for i, (own, bounds) in levels.items() if len(own) + bounds.nbytes >= shares[i] + ranges[i].nbytes]
+    choices = [alone]
+    if not worse:
+        choices.append(EncodedPage(*none, levels))
+    kept = sorted({*worse, *dearer})
+    if 0 < len(kept) < len(tiles):
+        rest = Page.of(page.numbers[kept], page.places[kept])
+        some = [colour[i] for i in kept], [valid[i] for i in kept], ranges[kept]
+        others = {i: own for i, own in levels.items() if i not in kept}
+        choices.append(EncodedPage(np.array(kept), _encoded(rest, *some, quality, speed), ranges[kept], others))
+    return min(choices, key=lambda choice: choice.size)
+
+
+def _alone(
+    page: Page, at: int, tile: tuple[np.ndarray, np.ndarray], ranges: np.ndarray, quality: int, speed: int
+) -> int:
+    """Bytes of one tile of a page as a stream of its own."""
+    own = Page.of(page.numbers[[at]], page.places[[at]])
+    return len(_encoded(own, [tile[0]], [tile[1]], ranges[None], quality, speed))
 
 
 def _encoded_levels(
-    colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], steps: Sequence[float]
+    tiles: Sequence[tuple[np.ndarray, np.ndarray]], steps: Sequence[float]
 ) -> list[tuple[bytes, np.ndarray]]:
-    """Stream and ranges of each of some tiles as levels."""
+    """Stream and ranges of each of some tiles, colour and valid texels, as levels."""
     load_kernels(level_coder)
-    return list(each(lambda tile: encode_tile(*tile), zip(colour, valid, steps, strict=True)))
+    return list(each(lambda one: encode_tile(*one[0], one[1]), zip(tiles, steps, strict=True)))
 
 
 def _encode_video(
