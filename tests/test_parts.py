@@ -17,6 +17,7 @@ MODELS = (
     "lightmap",
     "lightmap-frames",
     "lightmap-video",
+    "lightmap-levels",
     "lightmap-layers",
     "probe",
     "atlas-tiles",

@@ -128,8 +128,8 @@ def test_a_codec_without_its_package_says_so(lightmaps, monkeypatch):
     assert eight["psnr"] > 40.0
 
 
-@pytest.mark.parametrize(("name", "changes"), [("frames", {}), ("video", {"video_speed": 8})])
-def test_frames_and_video_have_nothing_to_fit(lightmaps, name, changes):
+@pytest.mark.parametrize(("name", "changes"), [("frames", {}), ("video", {"video_speed": 8}), ("levels", {})])
+def test_images_have_nothing_to_fit(lightmaps, name, changes):
     rows = run_rows(lightmaps, [Profile.load(name).override(changes)], device="cpu", chosen=[0], repeats=1)
     assert keys(rows) == [("ours", name), ("texture", name)]
     assert [rows[0].get(figure) for figure in (f"{name}_tiles", "constant_tiles", "steps")] == [2, 1, None]

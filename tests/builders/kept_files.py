@@ -44,28 +44,35 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 def _lightmap() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (2, 6), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
+    ranges = {"kind": (2, 7), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
     return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
 def _frames() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (1, 6), "ranges": ((0, 0, 0), 3.0)}
+    ranges = {"kind": (1, 7), "ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _video() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (1, 6), "video_ranges": ((0, 0, 0), 3.0)}
+    ranges = {"kind": (1, 7), "video_ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_model((5, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
+
+
+def _levels() -> Kept:
+    from builders.synthetic import random_model
+
+    ranges = {"kind": (1, 7), "level_ranges": ((0, 0, 0, 0), 3.0)}
+    return Kept(_written(random_model((6, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _layers() -> Kept:
     from builders.layered_sets import random_layers
 
-    ranges = {"0.kind": (0, 6), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
+    ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
 
 
@@ -220,6 +227,7 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
         "lightmap-video": _video,
+        "lightmap-levels": _levels,
         "lightmap-layers": _layers,
         "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),

@@ -4,8 +4,10 @@ import numpy as np
 
 from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.frame_packing import clear_unneeded, needed_blocks
+from wlm.lightmap.level_packing import join_streams
 from wlm.lightmap.model import LightmapModel, Profile
-from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm.lightmap.streams import code_levels
+from wlm.lightmap.tiles import TileGrid, TileKind, valid_texels
 from wlm.lightmap.video import encode_levels
 from wlm.lightmap.video_packing import pages
 from wlm_kernels import mlp
@@ -53,6 +55,12 @@ def random_model(
         levels = rng.random((len(times), *(side // 16 for side in page.shape), 3)).repeat(16, 1).repeat(16, 2)
         streams.append(np.frombuffer(encode_levels(levels.astype(np.float32), 60, 10), np.uint8))
     video_ranges = np.sort(rng.uniform(0.0, 1.5, (int((kind == TileKind.VIDEO).sum()), len(times), 2)), axis=2)
+    levelled = np.flatnonzero(kind == TileKind.LEVELS)
+    shape = len(levelled), len(times), 8, 8, 3
+    levels = np.random.default_rng(seed).integers(0, 1024, shape, np.uint16).repeat(16, 2).repeat(16, 3)
+    valid = [valid_texels(mask, number) for number in levelled.tolist()]
+    coded = join_streams([code_levels(*tile) for tile in zip(levels, valid, strict=True)])
+    level_ranges = np.sort(rng.uniform(0.0, 1.5, (len(levelled), len(times), 2, 3)), axis=2)
     return LightmapModel(
         name="random",
         width=width,
@@ -79,6 +87,9 @@ def random_model(
         video=np.concatenate(streams) if streams else np.zeros(0, np.uint8),
         video_sizes=np.array([len(stream) for stream in streams], np.uint32),
         video_ranges=video_ranges.astype(np.float16),
+        levels=coded[0],
+        level_sizes=coded[1],
+        level_ranges=level_ranges.astype(np.float16),
     )
 
 

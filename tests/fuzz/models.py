@@ -318,7 +318,12 @@ READERS = (
         "lightmap",
         "a.wlm",
         stored(
-            "lightmap.wlm", "lightmap-packed.wlm", "lightmap-coded.wlm", "lightmap-frames.wlm", "lightmap-video.wlm"
+            "lightmap.wlm",
+            "lightmap-packed.wlm",
+            "lightmap-coded.wlm",
+            "lightmap-frames.wlm",
+            "lightmap-video.wlm",
+            "lightmap-levels.wlm",
         ),
         vary_artifact,
         _lightmap,

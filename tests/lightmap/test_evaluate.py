@@ -69,7 +69,7 @@ def test_the_scores_are_those_of_the_protocol(fitted, report):
 
 def test_what_is_held_and_left_out_is_counted(fitted, report):
     _, model, size = fitted
-    assert report.kinds == {"empty": 1, "constant": 1, "static": 1, "dynamic": 1, "frames": 0, "video": 0}
+    assert report.kinds == {"empty": 1, "constant": 1, "static": 1, "dynamic": 1, "frames": 0, "video": 0, "levels": 0}
     assert (report.tiles, report.times, report.bytes) == (3, 5, size)
     assert report.not_scored == {"empty": 5, "not_held": 0, "few_texels": 0, "zero_range": 5}
     assert report.scored == 10

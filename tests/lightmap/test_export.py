@@ -32,6 +32,7 @@ AXES = [
     {"kinds": (4, 3, 4, 4)},
     {"kinds": (4, 2, 1, 4), "interpolation": "network", "period": None},
     {"kinds": (5, 4, 1, 5)},
+    {"kinds": (6, 4, 5, 6)},
 ]
 
 
@@ -234,7 +235,7 @@ void main()
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="no glslangValidator: install glslang-tools")
 @pytest.mark.parametrize("exact", ["", "#define WLM_LIGHTMAP_EXACT\n"])
-@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (5, 4, 1, 5)}, {"kinds": (2, 1, 0, 2)}], ids=str)
+@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (5, 4, 1, 6)}, {"kinds": (2, 1, 0, 2)}], ids=str)
 def test_the_shader_compiles(settings, exact, tmp_path):
     model = random_model(**settings)
     names = [f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(texture_names(model))]

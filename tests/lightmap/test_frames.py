@@ -139,7 +139,8 @@ def two_hours():
 
 def test_two_states_are_as_good_as_bc7_in_fewer_bytes(two_hours, tmp_path):
     model = compress(two_hours, "M")
-    assert count_kinds(model) == {"empty": 0, "constant": 0, "static": 0, "dynamic": 0, "frames": 2, "video": 0}
+    kinds = count_kinds(model)
+    assert sum(kinds.values()) == kinds["frames"] == 2
     assert model.warnings == () and memory_bytes(model) == 2 * 2 * (16384 + 12) + 2
     model.save(tmp_path / "a.wlm")
     found = wlm.lightmap.evaluate(wlm.load(tmp_path / "a.wlm"), two_hours, metrics=("psnr",))

@@ -12,20 +12,22 @@ from wlm.lightmap.held import held_tiles
 
 @pytest.fixture(scope="module")
 def model():
-    mask = np.ones((236, 375), bool)
+    mask = np.ones((364, 375), bool)
+    mask[256:, 128:] = False
     mask[:128, :128] = False
     mask[130:, 130:250] = False
-    return random_model((0, 1, 2, 3, 4, 5), columns=3, mask=mask)
+    return random_model((0, 1, 2, 3, 4, 5, 6, 0, 0), columns=3, mask=mask)
 
 
 def test_the_bytes_are_those_of_the_file(model):
     tiles = held_tiles(model)
     parts = part_bytes(model, model.file_bytes())
-    named = ("uv", "uvt", "ut", "vt", "net", "frames", "video", "constant")
+    named = ("uv", "uvt", "ut", "vt", "net", "frames", "video", "levels", "constant")
     assert sum(tile.bytes for tile in tiles) == sum(parts.get(name, 0) for name in named)
-    assert [tile.kind for tile in tiles] == ["empty", "constant", "static", "dynamic", "frames", "video"]
-    assert [(tile.number, tile.row, tile.column) for tile in tiles] == [(n, n // 3, n % 3) for n in range(6)]
-    valid = [int(model.mask[y : y + 128, x : x + 128].sum()) for y in (0, 128) for x in (0, 128, 256)]
+    kinds = ["empty", "constant", "static", "dynamic", "frames", "video", "levels", "empty", "empty"]
+    assert [tile.kind for tile in tiles] == kinds
+    assert [(tile.number, tile.row, tile.column) for tile in tiles] == [(n, n // 3, n % 3) for n in range(9)]
+    valid = [int(model.mask[y : y + 128, x : x + 128].sum()) for y in (0, 128, 256) for x in (0, 128, 256)]
     assert [tile.valid for tile in tiles] == valid
     assert tiles[0].bytes == 0 and tiles[2].bytes < tiles[3].bytes
 

@@ -361,7 +361,7 @@ PROBES = "".join(
 LONG = "probes of a transform"
 SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
-    "lightmap of video": lambda folder: lightmap((5, 3, 5, 0), folder, gelu="exact", period=None, hidden=10),
+    "lightmap of video": lambda folder: lightmap((5, 3, 6, 0), folder, gelu="exact", period=None, hidden=10),
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
     "atlas mips": partial(mips, MIXED),
     "atlas cascade mips": partial(mips, "cascade"),

@@ -169,6 +169,7 @@ TABLES: dict[str, dict[str, Figure]] = {
         "dynamic_tiles": Figure("dynamic tiles", form=_WHOLE),
         "frames_tiles": Figure("tiles of frames", form=_WHOLE),
         "video_tiles": Figure("tiles of video", form=_WHOLE),
+        "levels_tiles": Figure("tiles of levels", form=_WHOLE),
         "tiles_timed": Figure("tiles timed", form=_WHOLE),
         "lightmaps": Figure("lightmaps", form=_WHOLE),
         "resolution": Figure("resolution", "pixels", _WHOLE),

@@ -41,6 +41,7 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.frame_decode import image_kinds
 from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
 from wlm.lightmap.page import MapDecoder
 from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
@@ -438,9 +439,7 @@ class _LightmapBench(Bench):
             decoders.append(make(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
-        for kind in (TileKind.FRAMES, TileKind.VIDEO):
-            if (model.kind == kind).any():
-                decoders.append(FrameDecoder(model, self.device, kind))
+        decoders += [FrameDecoder(model, self.device, kind) for kind in image_kinds(model)]
         for decoder in decoders:
             decoder.set_time(self.times[0])
         return decoders

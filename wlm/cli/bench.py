@@ -73,7 +73,7 @@ def lightmap(
     profiles: _Profiles = None,
     qualities: Annotated[
         list[int] | None,
-        typer.Option("--quality", metavar="0..100", help="Profile video at this quality. Several times."),
+        typer.Option("--quality", metavar="0..105", help="Profile video at this quality. Several times."),
     ] = None,
     rivals: _Rivals = True,
     rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone.")] = False,

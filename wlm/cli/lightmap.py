@@ -73,7 +73,7 @@ _Map = Annotated[
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, H, ..., frames, video, or a YAML file of settings.")] = "M",
+    profile: Annotated[str, typer.Option(help="L, M, ..., frames, video, levels, or a YAML file of settings.")] = "M",
     tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,

@@ -93,7 +93,7 @@ def decode(artifact: Artifact) -> LightmapModel:
         others = {name: part for name, part in others.items() if name != "frame_sizes"}
         others["frames"] = unpack_frames(*packed, table, kind, mask)
     parts = check_parts(others, table)
-    for name in ("ranges", "video_ranges"):
+    for name in ("ranges", "video_ranges", "level_ranges"):
         if (parts[name][:, :, 0] > parts[name][:, :, 1]).any():
             raise ValueError(f"part {name}: expected no least above its greatest")
     model = LightmapModel(
@@ -108,8 +108,8 @@ def decode(artifact: Artifact) -> LightmapModel:
         times=times,
         **parts,
     )
-    if len(model.video_ranges):
-        _ = model.video_levels  # whatever is wrong with a stream is wrong with the file
+    if len(model.unpacked):
+        _ = model.words  # whatever is wrong with a stream is wrong with the file
     return model
 
 

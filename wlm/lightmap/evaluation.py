@@ -279,16 +279,17 @@ def bits_per_texel(model: LightmapModel, mask: np.ndarray, file_bytes: int) -> f
 def memory_bytes(model: LightmapModel) -> int:
     """Bytes of a model's maps, networks and scales as a GPU holds them.
 
-    Blocks are as they are, networks in half floats, video is unpacked.
+    Blocks are as they are, networks in half floats, video and levels are unpacked.
     """
-    held = [value for name, value in model.parts.items() if name not in ("video", "video_sizes")]
-    if len(model.video_ranges):
-        held.append(model.video_levels)
+    streams = "video", "video_sizes", "levels", "level_sizes"
+    held = [value for name, value in model.parts.items() if name not in streams]
+    if len(model.unpacked):
+        held.append(model.words)
     return sum(value.nbytes for value in held)
 
 
 def count_kinds(model: LightmapModel) -> dict[str, int]:
-    """Number of tiles of the grid by kind: empty (or not compressed), constant, static, dynamic, frames, video."""
+    """Number of tiles of the grid by kind, in small letters; "empty" are those that weren't compressed as well."""
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
 
 
@@ -300,7 +301,7 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
     Raises:
         ValueError: `file_bytes` is less than the parts take.
     """
-    stored, unnamed = encode(model)[1], ("streams", "stream_sizes", "frame_sizes", "video_sizes")
+    stored, unnamed = encode(model)[1], ("streams", "stream_sizes", "frame_sizes", "video_sizes", "level_sizes")
     parts = {name: value.nbytes for name, value in stored.items() if name not in unnamed}
     if "stream_sizes" in stored:
         parts |= zip(STREAMS, stored["stream_sizes"].sum(0, dtype=int).tolist(), strict=True)

@@ -9,13 +9,13 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import blocks_image, decode_image
 from wlm.formats.bc7_modes import decode_blocks
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale
-from wlm.lightmap.tiles import TileGrid, TileKind
+from wlm.lightmap.tiles import UNPACKED, TileGrid, TileKind
 from wlm.lightmap.video_packing import WHITE, levels_of
 
 SQRT_12 = math.sqrt(12.0)
 """Features in [0, 1] are fed to the network as (f - 1/2) sqrt(12): mean 0 and deviation 1 if they are uniform."""
 
-_IMAGES = (TileKind.FRAMES, TileKind.VIDEO)
+_IMAGES = (TileKind.FRAMES, *UNPACKED)
 
 
 def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
@@ -90,8 +90,8 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
     before, after, share = model.axis.neighbours(time)
     if model.kind[number] == TileKind.FRAMES:
         peak = model.ranges[_row(model, number), :, 1].max(1)
-    elif model.kind[number] == TileKind.VIDEO:
-        peak = model.video_peaks[_row(model, number)]
+    elif model.kind[number] in UNPACKED:
+        peak = model.word_peaks[_row(model, number)]
     else:
         peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
@@ -109,16 +109,17 @@ def _place(model: LightmapModel, number: int) -> int:
 
 
 def _row(model: LightmapModel, number: int) -> int:
-    """The tile's place among those of its kind."""
-    return int((model.kind[:number] == model.kind[number]).sum())
+    """The tile's place among those of its kind; of video and levels among both."""
+    kind = TileKind(int(model.kind[number]))
+    return int(np.isin(model.kind[:number], UNPACKED if kind in UNPACKED else (kind,)).sum())
 
 
 def _frame(model: LightmapModel, number: int, at: int) -> np.ndarray:
     """A frame of a tile in gamma space [128, 128, 3]."""
     row = _row(model, number)
-    if model.kind[number] == TileKind.VIDEO:
-        least, greatest = model.video_ranges[row, at].astype(np.float64)
-        return least + levels_of(model.video_levels[row, at]) / WHITE * (greatest - least)
+    if model.kind[number] in UNPACKED:
+        least, greatest = model.word_ranges[row, at].astype(np.float64)
+        return least + levels_of(model.words[row, at]) / WHITE * (greatest - least)
     levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
     return least + levels * (greatest - least)

@@ -20,7 +20,7 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.page import MapDecoder
 from wlm.lightmap.shader import EXACT, decode_glsl
-from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.tiles import UNPACKED, TileKind
 from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-lightmap-export"
@@ -234,10 +234,12 @@ def _tiles(model: LightmapModel, starts: np.ndarray) -> list[dict[str, Any]]:
         elif kind == TileKind.FRAMES:
             least, greatest = model.ranges[row].swapaxes(0, 1)
             tile |= {"least": rounded(least), "greatest": rounded(greatest), "peak": rounded(greatest.max(1))}
-        elif kind == TileKind.VIDEO:
-            least, greatest = model.video_ranges[row].repeat(3, 1).reshape(-1, 2, 3).swapaxes(0, 1)
-            peak = rounded(model.video_peaks[row])
-            tile |= {"least": rounded(least), "greatest": rounded(greatest), "peak": peak}
+        elif kind in UNPACKED:
+            at = int(places[number])
+            least, greatest = model.word_ranges[at].swapaxes(0, 1)
+            peak = rounded(model.word_peaks[at])
+            # One texture, and to an engine one kind.
+            tile |= {"kind": "video", "least": rounded(least), "greatest": rounded(greatest), "peak": peak}
         else:
             at = mapped[number]
             shift, spread = model.affine[at]

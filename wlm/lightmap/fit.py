@@ -17,6 +17,7 @@ from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.dispatch import Batch, Dispatch
 from wlm.lightmap.frame_packing import needed_blocks
 from wlm.lightmap.frames import choose_frames, encode_frames, missing_encoder
+from wlm.lightmap.level_packing import join_streams
 from wlm.lightmap.model import LightmapModel, Profile, part_table
 from wlm.lightmap.packing import check_packable, clear_unread
 from wlm.lightmap.reads import Reads
@@ -346,23 +347,29 @@ class _Fit:
                 meter.report(i + 1)
 
     def store_video(self, progress: OnProgress | None) -> None:
-        """Encodes the tiles that are stored as video, and puts them into the model."""
-        model, profile, streams = self.model, self.profile, []
+        """Encodes the tiles that are stored as video, or as levels instead, and puts them into the model."""
+        model, profile = self.model, self.profile
+        settings = profile.gamma, profile.video_quality, profile.video_speed
         numbers = np.flatnonzero(model.kind == TileKind.VIDEO)
+        streams, ranges, levels = [], np.empty(model.video_ranges.shape, np.float16), {}
         meter = Meter(progress, "video", len(numbers))
         done = 0
         for page in pages(model.kind, model.tile_columns, len(model.times)):
             tiles = split(self._lightmaps, profile.gamma, page.numbers)
-            settings = profile.gamma, profile.video_quality, profile.video_speed
-            stream, ranges = encode_page(page, tiles.colour, tiles.mask, *settings)
-            model.video_ranges[np.searchsorted(numbers, page.numbers)] = ranges
-            streams.append(np.frombuffer(stream, np.uint8))
+            encoded = encode_page(page, tiles.colour, tiles.mask, *settings)
+            levels |= {int(page.numbers[place]): own for place, own in encoded.levels.items()}
+            if len(encoded.video):
+                streams.append(encoded.stream)
+                ranges[np.searchsorted(numbers, page.numbers[encoded.video])] = encoded.ranges
             done += len(page.numbers)
             if meter.due(done):
                 meter.report(done)
-        if streams:
-            model.video = np.concatenate(streams)
-            model.video_sizes = np.array([len(stream) for stream in streams], np.uint32)
+        model.kind[list(levels)] = TileKind.LEVELS
+        model.video, model.video_sizes = join_streams(streams)
+        model.video_ranges = ranges[model.kind[numbers] == TileKind.VIDEO]
+        if levels:
+            model.levels, model.level_sizes = join_streams([levels[number][0] for number in sorted(levels)])
+            model.level_ranges = np.stack([levels[number][1] for number in sorted(levels)])
 
     def batches(self, most: int | None = None) -> list[Batch]:
         """Batches of `BATCH_TEXELS`, of so many tiles at most and at least one; dynamic tiles first."""

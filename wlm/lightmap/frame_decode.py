@@ -1,4 +1,4 @@
-"""Tiles that are stored as images, frames or video, on a device."""
+"""Tiles that are stored as images, frames, video or levels, on a device."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.formats import bc7_modes
 from wlm.lightmap.model import TILE, LightmapModel
-from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.tiles import UNPACKED, TileKind
 from wlm_kernels.lightmap.frames import FRAMES, StoredFrames, Tables
 from wlm_kernels.lightmap.images import ImageKernels
 from wlm_kernels.lightmap.video import VIDEO, StoredVideo
@@ -44,21 +44,24 @@ class ImageTiles(HeldTiles):
         device_bytes: Memory that they take up on the device, bytes.
     """
 
-    def __init__(self, model: LightmapModel, kind: TileKind, greatest: np.ndarray, kernels: ImageKernels) -> None:
-        """Finds the tiles of a kind.
+    def __init__(
+        self, model: LightmapModel, kinds: Sequence[TileKind], greatest: np.ndarray, kernels: ImageKernels
+    ) -> None:
+        """Finds the tiles of some kinds.
 
         Args:
             model: The model.
-            kind: FRAMES or VIDEO.
+            kinds: Their kinds.
             greatest: float32 [n, T], their greatest colour.
             kernels: Those of its images.
 
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(np.flatnonzero(model.kind == kind))
+        super().__init__(np.flatnonzero(np.isin(model.kind, kinds)))
         if not len(self.numbers):
-            raise WlmError(f"{model.name}: expected at least one tile of {kind.name.lower()}, found none")
+            names = " or ".join(kind.name.lower() for kind in kinds)
+            raise WlmError(f"{model.name}: expected at least one tile of {names}, found none")
         self._axis, self._greatest, self._kernels = model.axis, greatest, kernels
         self._stored: Any = None
         self.device_bytes = 0
@@ -96,7 +99,7 @@ class FrameTiles(ImageTiles):
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(model, TileKind.FRAMES, model.ranges[:, :, 1].astype(np.float32).max(2), FRAMES)
+        super().__init__(model, (TileKind.FRAMES,), model.ranges[:, :, 1].astype(np.float32).max(2), FRAMES)
         ends = model.ranges.astype(np.float32).reshape(-1, 2, 3)
         words = np.ascontiguousarray(model.frames).view("<u8").reshape(-1, TILE // 4, TILE // 4, 2)
         stored = StoredFrames()
@@ -114,8 +117,8 @@ class FrameTiles(ImageTiles):
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
 
-class VideoTiles(ImageTiles):
-    """The unpacked video of a model on a device."""
+class UnpackedTiles(ImageTiles):
+    """The unpacked video and levels of a model on a device."""
 
     def __init__(self, model: LightmapModel, device: str) -> None:
         """Uploads the levels.
@@ -123,18 +126,30 @@ class VideoTiles(ImageTiles):
         Raises:
             WlmError: The model has none.
         """
-        super().__init__(model, TileKind.VIDEO, model.video_peaks, VIDEO)
-        least, greatest = np.moveaxis(model.video_ranges.astype(np.float32), 2, 0).reshape(2, -1)
+        super().__init__(model, UNPACKED, model.word_peaks, VIDEO)
+        least, greatest = np.moveaxis(model.word_ranges.astype(np.float32), 2, 0).reshape(2, -1, 3)
         stored = StoredVideo()
-        stored.levels = wp.array(model.video_levels.reshape(-1, TILE, TILE), dtype=wp.uint32, device=device)
-        stored.least = wp.array(least, dtype=float, device=device)
-        stored.span = wp.array(greatest - least, dtype=float, device=device)
+        stored.levels = wp.array(model.words.reshape(-1, TILE, TILE), dtype=wp.uint32, device=device)
+        stored.least = wp.array(np.ascontiguousarray(least), dtype=wp.vec3, device=device)
+        stored.span = wp.array(greatest - least, dtype=wp.vec3, device=device)
         stored.times, stored.gamma = len(model.times), model.profile.gamma
         self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.levels, stored.least, stored.span))
 
 
 def image_tiles(model: LightmapModel, device: str) -> list[ImageTiles]:
-    """The tiles of a model that are images, by kind; without those that it has none of."""
-    kinds = (TileKind.FRAMES, FrameTiles), (TileKind.VIDEO, VideoTiles)
-    return [make(model, device) for kind, make in kinds if (model.kind == kind).any()]
+    """The tiles of a model that are images: frames, then what is unpacked; without those that it has none of."""
+    return [IMAGE_TILES[kind](model, device) for kind in image_kinds(model)]
+
+
+def image_kinds(model: LightmapModel) -> list[TileKind]:
+    """Those of `IMAGE_TILES` that a model has."""
+    kinds = (TileKind.FRAMES,), UNPACKED
+    return [kind for kind, held in zip(IMAGE_TILES, kinds, strict=True) if np.isin(model.kind, held).any()]
+
+
+IMAGE_TILES: dict[TileKind, type[FrameTiles] | type[UnpackedTiles]] = {
+    TileKind.FRAMES: FrameTiles,
+    TileKind.VIDEO: UnpackedTiles,
+}
+"""Tiles that are decoded together: frames, and video with levels."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm.lightmap.codec import encode
+from wlm.lightmap.level_packing import STEPS
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.tiles import TileKind, valid_texels
 from wlm.lightmap.video_packing import pages
@@ -42,6 +43,7 @@ def held_tiles(model: LightmapModel) -> list[HeldTile]:
         sizes[model.kind == TileKind.FRAMES] = stored["frame_sizes"]
     for page, size in zip(pages(model.kind, model.tile_columns, len(model.times)), model.video_sizes, strict=True):
         sizes[page.numbers] = np.diff(np.linspace(0, int(size), len(page.numbers) + 1).astype(int))
+    sizes[model.kind == TileKind.LEVELS] = model.level_sizes
     constant = model.kind == TileKind.CONSTANT
     sizes[constant] = model.constant.nbytes // max(int(constant.sum()), 1)
     result = []
@@ -68,4 +70,8 @@ def _why(model: LightmapModel, kind: TileKind, valid: int) -> str:
         return f"its light changes over time{less}"
     if kind == TileKind.FRAMES and profile.frames == "auto":
         return f"{times} times as BC7 take no more bytes than maps and a network"
+    if kind == TileKind.LEVELS and profile.video_quality in STEPS:
+        return f"the setting video_quality is {profile.video_quality}"
+    if kind == TileKind.LEVELS:
+        return f"no worse than AV1 of quality {profile.video_quality}, in fewer bytes"
     return f"the setting frames is {profile.frames}"

@@ -21,7 +21,8 @@ from pydantic import Field, model_validator
 
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
-from wlm.lightmap.tiles import TILE, TileKind, valid_texels
+from wlm.lightmap.level_packing import STEPS, unpack_levels
+from wlm.lightmap.tiles import TILE, UNPACKED, TileKind, valid_texels
 from wlm.lightmap.video_packing import WHITE, levels_of, unpack_video
 from wlm.lightmap.weights import packed_bytes
 from wlm.system import Model, Settings
@@ -75,10 +76,12 @@ class Profile(Settings):
             aren't light; None: the range of the tile at that time, which the paper's protocol divides by.
         static_budget_db: See `wlm.lightmap.tiles.classify`.
         frames: Which tiles that are neither empty nor constant hold the lightmap of each time as BC7 rather than maps
-            and a network: "auto", where that takes no more bytes, "never" or "always". "video": all are an AV1 stream.
+            and a network: "auto", where that takes no more bytes, "never" or "always". "video": all are an AV1 stream,
+            or levels that are coded without loss, see `video_quality`.
         frames_loss: Of these frames' rate-distortion optimisation: what the root mean square error of a block's texels
             may grow by, in squares, in levels of 255, to make the file smaller; 0 for none.
-        video_quality: Of video, 0 to 100; of 100 levels are as exact as 10 bits and the change of colours allow.
+        video_quality: Of video: 0 to 100 of AV1, or levels where these are no worse and take fewer bytes; from 101 on
+            levels, see `wlm.lightmap.level_packing.STEPS`, of 105 as exact as 10 bits of a channel's own range allow.
         video_speed: Of its encoder, 0 (the smallest file, very slow) to 10.
     """
 
@@ -110,7 +113,7 @@ class Profile(Settings):
     static_budget_db: float = Field(60.0, gt=0.0)
     frames: Literal["auto", "never", "always", "video"] = "auto"
     frames_loss: float = Field(0.2, ge=0.0, le=255.0)
-    video_quality: int = Field(96, ge=0, le=100)
+    video_quality: int = Field(96, ge=0, le=max(STEPS))
     video_speed: int = Field(3, ge=0, le=10)
 
     @model_validator(mode="after")
@@ -257,15 +260,15 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
     """The arrays of a model, in the order of its file.
 
     N_m tiles have maps (STATIC and DYNAMIC, by number), N_d of them temporal ones; N_c tiles are constant, N_f are
-    frames and N_v video.
+    frames, N_v video and N_l levels.
 
     Args:
         profile: The settings.
         kind: uint8 [tiles], as in `LightmapModel`.
         times: T.
     """
-    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES, TileKind.VIDEO
-    dynamic, static, constant, framed, filmed = (int((kind == value).sum()) for value in counted)
+    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES, TileKind.VIDEO, TileKind.LEVELS
+    dynamic, static, constant, framed, filmed, levelled = (int((kind == value).sum()) for value in counted)
     streamed = None if filmed else 0  # of any size, where there are any
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
@@ -287,6 +290,9 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         "video": Part(np.uint8, (streamed,)),
         "video_sizes": Part(np.uint32, (streamed,)),
         "video_ranges": Part(np.float16, (filmed, times, 2), least=0.0),
+        "levels": Part(np.uint8, (None if levelled else 0,)),
+        "level_sizes": Part(np.uint32, (levelled,)),
+        "level_ranges": Part(np.float16, (levelled, times, 2, 3), least=0.0),
     }
 
 
@@ -314,7 +320,10 @@ class LightmapModel(Model):
         ranges: Their least and greatest colour, in gamma space.
         video: The streams of the tiles that are stored as video, see `wlm.lightmap.video`.
         video_sizes: Bytes of each stream.
-        video_ranges: Colour of the tiles' levels 0 and 1, in gamma space.
+        video_ranges: Colour of the tiles' levels 0 and 1023, in gamma space.
+        levels: The streams of the tiles that are stored as levels, see `wlm.lightmap.level_packing`.
+        level_sizes: Bytes of each stream.
+        level_ranges: Colour of their levels 0 and 1023, in gamma space.
         warnings: What the fit fell back on, one line each; not in the file.
     """
 
@@ -345,6 +354,9 @@ class LightmapModel(Model):
     video: np.ndarray
     video_sizes: np.ndarray
     video_ranges: np.ndarray
+    levels: np.ndarray
+    level_sizes: np.ndarray
+    level_ranges: np.ndarray
     warnings: tuple[str, ...] = ()
 
     @property
@@ -371,30 +383,53 @@ class LightmapModel(Model):
         result[kinds == TileKind.STATIC] = self.scale_static
         return result
 
+    @property
+    def unpacked(self) -> np.ndarray:
+        """int [N_v + N_l], numbers of the tiles of `UNPACKED`; `words`, `word_ranges`, `word_peaks` have their rows."""
+        return np.flatnonzero(np.isin(self.kind, UNPACKED))
+
     @cached_property
-    def video_levels(self) -> np.ndarray:
-        """The levels of the tiles of video, uint32 [N_v, T, 128, 128] as of `unpack_video`, decoded once.
+    def words(self) -> np.ndarray:
+        """Their levels, uint32 [N_v + N_l, T, 128, 128] as of `unpack_video`, decoded once.
 
         Raises:
-            ValueError, WlmError: As `unpack_video`.
+            ValueError, WlmError: As `unpack_video` and `unpack_levels`.
         """
-        return unpack_video(self.video, self.video_sizes, self.kind, self.tile_columns, len(self.times))
+        times, kinds = len(self.times), self.kind[self.unpacked]
+        video = unpack_video(self.video, self.video_sizes, self.kind, self.tile_columns, times)
+        levels = unpack_levels(self.levels, self.level_sizes, self.kind, self.mask, times)
+        if not len(video) or not len(levels):
+            return levels if len(levels) else video
+        return _by_kind(kinds, video, levels)
+
+    @property
+    def word_ranges(self) -> np.ndarray:
+        """Colour of their levels 0 and 1023 by channel, in gamma space, half [N_v + N_l, T, 2, 3]."""
+        shared = self.video_ranges[..., None].repeat(3, -1)
+        return _by_kind(self.kind[self.unpacked], shared, self.level_ranges)
 
     @cached_property
-    def video_peaks(self) -> np.ndarray:
-        """The greatest colour of their valid texels, in gamma space, float32 [N_v, T]."""
-        peaks = np.zeros(self.video_ranges.shape[:2], np.float32)
-        for row, number in enumerate(np.flatnonzero(self.kind == TileKind.VIDEO).tolist()):
+    def word_peaks(self) -> np.ndarray:
+        """The greatest colour of their valid texels, in gamma space, float32 [N_v + N_l, T]."""
+        least, greatest = np.moveaxis(self.word_ranges.astype(np.float32), 2, 0)
+        peaks = np.zeros(least.shape, np.float32)
+        for row, number in enumerate(self.unpacked.tolist()):
             inside = valid_texels(self.mask, number)
             if inside.any():
-                peaks[row] = levels_of(self.video_levels[row][:, inside]).max((1, 2))
-        least, greatest = np.moveaxis(self.video_ranges.astype(np.float32), 2, 0)
-        return least + peaks / np.float32(WHITE) * (greatest - least)
+                peaks[row] = levels_of(self.words[row][:, inside]).max(1)
+        return (least + peaks / np.float32(WHITE) * (greatest - least)).max(2)
 
     @property
     def tile_columns(self) -> int:
         """Tiles in a row of the grid."""
         return -(-self.width // TILE)
+
+
+def _by_kind(kinds: np.ndarray, video: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """The rows of tiles of video and of those of levels in the order of their numbers."""
+    result = np.empty((len(kinds), *levels.shape[1:]), levels.dtype)
+    result[kinds == TileKind.VIDEO], result[kinds == TileKind.LEVELS] = video, levels
+    return result
 
 
 def encode_time(axis: TimeAxis) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import TILE, LightmapModel
-from wlm.lightmap.tiles import TileKind, valid_texels
+from wlm.lightmap.tiles import UNPACKED, TileKind, valid_texels
 
 HEAD = 2
 """Fours in front of the tiles' records in a table."""
@@ -23,9 +23,9 @@ MOST_SIDE = 16384
 """Texels along a side of a texture of all tiles."""
 
 MOST_LAYERS = 2048
-"""Stored times of tiles that are frames or video."""
+"""Stored times of tiles that are frames, video or levels."""
 
-CODES = {TileKind.STATIC: 1, TileKind.DYNAMIC: 2, TileKind.FRAMES: 3, TileKind.VIDEO: 4}
+CODES = {TileKind.STATIC: 1, TileKind.DYNAMIC: 2, TileKind.FRAMES: 3, **dict.fromkeys(UNPACKED, 4)}
 """A record's first number; 0 of empty and constant tiles."""
 
 _MAPS, _TEMPORAL = 4, 12  # inputs that come from textures, of static and dynamic tiles; then the encoded time
@@ -69,8 +69,7 @@ def rows_of(model: LightmapModel) -> np.ndarray:
     rows = np.full(model.kind.size, -1)
     mapped = np.concatenate([np.flatnonzero(model.kind == kind) for kind in (TileKind.DYNAMIC, TileKind.STATIC)])
     rows[mapped] = np.arange(len(mapped))
-    for kind in (TileKind.FRAMES, TileKind.VIDEO):
-        numbers = np.flatnonzero(model.kind == kind)
+    for numbers in (np.flatnonzero(model.kind == TileKind.FRAMES), model.unpacked):
         rows[numbers] = np.arange(len(numbers))
     return rows
 
@@ -80,7 +79,7 @@ def textures(model: LightmapModel, bare: bool = False) -> dict[str, Texture]:
 
     Args:
         model: The model.
-        bare: Texels of video that belong to no chart are 0, which packs better.
+        bare: Texels of video and levels that belong to no chart are 0, which packs better.
 
     Raises:
         WlmError: One is larger than GPUs take.
@@ -95,11 +94,10 @@ def textures(model: LightmapModel, bare: bool = False) -> dict[str, Texture]:
         "planes": _sheet(planes, "R8G8_UNORM", profile.plane_rows, profile.plane_columns),
         "frames": _layers(model.frames, "BC7_UNORM"),
     }
-    if (model.kind == TileKind.VIDEO).any():
-        words = model.video_levels.astype("<u4")
+    if len(model.unpacked):
+        words = model.words.astype("<u4")
         if bare:
-            numbers = np.flatnonzero(model.kind == TileKind.VIDEO).tolist()
-            words *= np.stack([valid_texels(model.mask, number) for number in numbers])[:, None]
+            words *= np.stack([valid_texels(model.mask, number) for number in model.unpacked.tolist()])[:, None]
         made["video"] = _layers(words.view(np.uint8).reshape(*words.shape, 4), "R10G10B10A2_UNORM")
     made = {name: texture for name, texture in made.items() if texture is not None}
     for name, texture in made.items():
@@ -215,14 +213,14 @@ def hour_table(model: LightmapModel, time: float, nets: tuple[np.ndarray, np.nda
         layer = weights[start + inputs * wide : start + (inputs + len(encoded) + 1) * wide].astype(np.float64)
         layer = layer.reshape(-1, wide, 4)
         tiles[number, 3 : 3 + wide] = layer[-1] + np.tensordot(encoded, layer[:-1], 1)
-    # Of video one range for all channels.
-    for kind, ranges in ((TileKind.FRAMES, model.ranges), (TileKind.VIDEO, model.video_ranges[..., None])):
-        held = tiles[model.kind == kind]
+    framed = np.flatnonzero(model.kind == TileKind.FRAMES)
+    for numbers, ranges in ((framed, model.ranges), (model.unpacked, model.word_ranges)):
+        held = tiles[numbers]
         held[:, 0, 3] = share
         for first, image in ((1, before), (3, after)):
             held[:, first : first + 2, :3] = ranges[:, image]
             held[:, first, 3] = image
-        tiles[model.kind == kind] = held
+        tiles[numbers] = held
     return table
 
 

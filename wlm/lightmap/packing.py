@@ -22,14 +22,15 @@ from wlm.lightmap.streams import (
     code_blocks,
     code_bytes,
     code_plane,
+    load_kernels,
     read_blocks,
     read_bytes,
     read_plane,
-    tables,
 )
 from wlm.lightmap.tiles import TileKind, valid_texels
 from wlm.lightmap.weights import pack_net, packed_bytes, unpack_net
 from wlm.workers import each
+from wlm_kernels.lightmap import tile_coder
 
 STREAMS = ("uv", "uvt", "ut", "vt", "net")
 """The streams of a tile; a static one has the first and the last."""
@@ -124,7 +125,7 @@ def pack_tiles(
         streams["net"] = code_bytes(values, _classes(profile, dynamic))
         return [streams[name] for name in STREAMS]
 
-    tables()
+    load_kernels(tile_coder)
     tiles = list(each(packed, mapped_tiles(kind)))
     return {
         "streams": np.frombuffer(b"".join(stream for tile in tiles for stream in tile), np.uint8),
@@ -194,7 +195,7 @@ def unpack_tiles(
         else:
             parts[net][row] = np.ascontiguousarray(values.reshape(2, -1).T).view("<f2").ravel()
 
-    tables()
+    load_kernels(tile_coder)
     for _ in each(unpack, zip(mapped, ends, sizes.astype(np.int64), strict=True)):
         continue
     return parts

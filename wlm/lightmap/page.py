@@ -11,6 +11,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import TimeTable
+from wlm.lightmap.frame_decode import image_kinds
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
 from wlm.lightmap.tiles import TileGrid, TileKind
@@ -48,9 +49,8 @@ class MapDecoder:
             self.decoders.append(fast_decoder(model, self.device, shared=True))
         if (model.kind == TileKind.STATIC).any():
             self.decoders.append(ExactDecoder(model, self.device, kind=TileKind.STATIC, shared=True))
-        for kind in (TileKind.FRAMES, TileKind.VIDEO):
-            if (model.kind == kind).any():
-                self.decoders.append(FrameDecoder(model, self.device, kind, shared=True))
+        for kind in image_kinds(model):
+            self.decoders.append(FrameDecoder(model, self.device, kind, shared=True))
         self._corners = [self._places(decoder.numbers) for decoder in self.decoders]
         self._times = TimeTable(model, self.device)
         self._constant = self._places(np.flatnonzero(model.kind == TileKind.CONSTANT))

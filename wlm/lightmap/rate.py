@@ -20,6 +20,7 @@ from wlm.lightmap.codec import encode
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.evaluation import bits_per_texel, evaluate
 from wlm.lightmap.fit import Trials, compress
+from wlm.lightmap.level_packing import STEPS
 from wlm.lightmap.model import LightmapModel, Profile
 from wlm.lightmap.packing import STREAMS
 from wlm.lightmap.survey import Survey
@@ -38,7 +39,7 @@ _PER_OCTAVE = 2.3  # dB for twice the bytes: 2.1 in the living room, 2.1 to 3 in
 _OCTAVES = 0.15  # between two sizes whose PSNR gives the figure of this scene
 _LEAST_PER_OCTAVE, _MOST_PER_OCTAVE = 1.0, 4.0
 _ROOM = 0.99  # of the largest size
-_QUALITIES = range(101)  # of video
+_QUALITIES = (*range(100), *STEPS)  # of video; without 100, which takes more bytes than the next
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,8 @@ def choose(
 ) -> Choice:
     """Chooses the resolution of F_uvt, in a quarter of the steps of the fit that follows.
 
-    Of video it chooses the quality, by bisection: the least that reaches the PSNR, the greatest that fits the size,
-    from up to seven encodings of the set, with both up to fourteen.
+    Of video it chooses the quality, by bisection, levels above AV1 included: the least that reaches the PSNR, the
+    greatest that fits the size, from up to seven encodings of the set, with both up to fourteen.
 
     Args:
         lightmaps: The set.
@@ -126,7 +127,7 @@ def _choose_quality(
         """Bits per texel and time, and PSNR, where it is asked for."""
         changes = {"video_quality": quality, "video_speed": max(profile.video_speed, TRIAL_SPEED)}
         model = compress(lightmaps, profile.override(changes), **options)
-        if not len(model.video_ranges):
+        if not len(model.unpacked):
             raise WlmError(f"{lightmaps.name}: no tile is more than a colour, so there is no size to choose")
         bpp = bits_per_texel(model, lightmaps.mask, model.file_bytes())
         if target_psnr is None:
@@ -139,10 +140,11 @@ def _choose_quality(
         if fitting == 0:
             least = trial(0)[0] / _ROOM
             raise WlmError(f"--max-bpp: expected at least {least:.3f} for profile {profile.name}, got {max_bpp:g}")
-    best = fitting - 1
+    best = _QUALITIES[fitting - 1]
     if target_psnr is None:
         return Choice(profile.override({"video_quality": best}), trial(best)[0])
-    chosen = min(bisect_left(_QUALITIES[:fitting], True, key=lambda quality: trial(quality)[1] >= target_psnr), best)
+    reached = bisect_left(_QUALITIES[:fitting], True, key=lambda quality: trial(quality)[1] >= target_psnr)
+    chosen = _QUALITIES[min(reached, fitting - 1)]
     bpp, psnr = trial(chosen)
     if psnr < target_psnr and max_bpp is None:
         raise WlmError(f"--target-psnr: expected at most {psnr:.1f} for profile {profile.name}, got {target_psnr:g}")

@@ -2,7 +2,7 @@
 
 `wlm.lightmap.Decoder` returns arrays on the host; these are for a renderer's loop. Each holds the tiles of one kind,
 gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` where networks are wide, an `ExactDecoder` of the static
-tiles and a `FrameDecoder` each of those that are frames and video. `wlm.lightmap.page` puts them together to a texture
+tiles and a `FrameDecoder` each of frames and of video and levels. `wlm.lightmap.page` puts them together to a texture
 of the map.
 """
 
@@ -13,7 +13,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import StoredTiles, TimeTable, gelu_of, rgba
-from wlm.lightmap.frame_decode import FrameTiles, VideoTiles, inverse_of
+from wlm.lightmap.frame_decode import IMAGE_TILES, inverse_of
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap import decode as lightmap_decode
@@ -195,7 +195,7 @@ class ExactDecoder(_TileDecoder):
 
 
 class FrameDecoder:
-    """The tiles that are stored as frames, or as video: one thread reads one texel of one or two images.
+    """The tiles that are stored as frames, or as video and levels: one thread reads one texel of one or two images.
 
     Attributes:
         numbers: int [n], numbers of these tiles in the grid, in the order of `out`.
@@ -205,19 +205,19 @@ class FrameDecoder:
     def __init__(
         self, model: LightmapModel, device: str = "cpu", kind: TileKind = TileKind.FRAMES, shared: bool = False
     ) -> None:
-        """Uploads the images, video unpacked, and allocates all buffers; the time is the first stored one.
+        """Uploads the images, video and levels unpacked, and allocates all buffers; the time is the first stored one.
 
         Args:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
-            kind: FRAMES or VIDEO.
+            kind: FRAMES, or VIDEO of all that is unpacked, levels too.
             shared: As of `StripDecoder`.
 
         Raises:
             WlmError: No such device, or a model without such tiles.
         """
         self.model, self.device, self.shared = model, interop.check_device(device), shared
-        self._tiles = (VideoTiles if kind == TileKind.VIDEO else FrameTiles)(model, self.device)
+        self._tiles = IMAGE_TILES[kind](model, self.device)
         self.numbers = self._tiles.numbers
         count = len(self.numbers)
         self._rows = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=self.device)

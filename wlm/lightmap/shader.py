@@ -290,7 +290,7 @@ def texture_names(model: LightmapModel) -> list[str]:
         "networks": has[TileKind.STATIC] or has[TileKind.DYNAMIC],
         "uvt": has[TileKind.DYNAMIC],
         "frames": has[TileKind.FRAMES],
-        "video": has[TileKind.VIDEO],
+        "video": has[TileKind.VIDEO] or has[TileKind.LEVELS],
     }
     needed |= {"uv": needed["networks"], "planes": needed["uvt"]}
     return [name for name in _TEXTURES if needed.get(name, True)]
@@ -314,7 +314,7 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
         "uvt": columns(dynamic * slices, side, side),
         "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
         "frames": columns(int((model.kind == TileKind.FRAMES).sum()), TILE, TILE),
-        "video": columns(int((model.kind == TileKind.VIDEO).sum()), TILE, TILE),
+        "video": columns(len(model.unpacked), TILE, TILE),
     }
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {

@@ -1,4 +1,4 @@
-"""Streams of coded numbers: maps, planes and bytes to a stream and back, see `wlm_kernels.lightmap.coder`.
+"""Streams of coded numbers: maps, planes, bytes and levels to a stream and back, see `wlm_kernels.lightmap.coder`.
 
 A stream's first byte has the number of lowest bits that are 0 in all numbers of it (0 to 7), and 8 more where it holds
 everything, what isn't read as well.
@@ -8,16 +8,37 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap import coder, tile_coder
+from wlm_kernels.lightmap import coder, level_coder, tile_coder
 
 _ROOM = 2.0  # of a stream, beside what its numbers take uncoded
 _WHOLE = 8
-_WIDTHS = {"blocks": 12, "numbers": 25}  # of predictions, at first
+
+LEVELS = 1 << level_coder.LEVEL_BITS
+"""Levels of a channel, from 0."""
+
+
+@dataclass(frozen=True)
+class _Size:
+    """What a coder has room for, and the width of its predictions at first."""
+
+    width: int
+    mixtures: int = coder.MIXTURES
+    trees: int = coder.TREES
+    bits: int = 8
+    nodes: int = 512
+
+
+_SIZES = {
+    "blocks": _Size(12),
+    "numbers": _Size(25),
+    "levels": _Size(4, level_coder.LEVEL_MIXTURES, level_coder.LEVEL_TREES, level_coder.LEVEL_BITS, LEVELS),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +56,15 @@ class BlockGrid:
     slices: np.ndarray
 
 
+def load_kernels(module: ModuleType) -> None:
+    """Compiles the kernels of `tile_coder` or `level_coder`, which threads are to find compiled."""
+    wp.load_module(module, "cpu")
+    _tables()
+
+
 @cache
-def tables() -> tuple[wp.array, wp.array, wp.array]:
-    """Logarithm, sigmoid and rate, see `coder.Coder`; to be made, with the kernels, before threads need them."""
-    wp.load_module(tile_coder, "cpu")
+def _tables() -> tuple[wp.array, wp.array, wp.array]:
+    """Logarithm, sigmoid and rate, see `coder.Coder`."""
     logarithm = [0] + [round(256 * math.log(i)) for i in range(1, 65538)]
     half = coder.HALF
     sigmoid = [round(65536 / (1 + math.exp((half - i) / 256))) for i in range(2 * half)]
@@ -142,11 +168,58 @@ def read_bytes(stream: np.ndarray, classes: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: The stream isn't one of so many bytes.
     """
-    if _first(stream) != (0, False):
-        raise ValueError("expected a first byte of 0")
+    _check_plain(stream)
     found = _array(np.zeros(len(classes)))
     _read(stream, "numbers", lambda c: _launch(c, tile_coder.code_bytes, _array(classes), found))
     return found.numpy().astype(np.uint8)
+
+
+def code_levels(levels: np.ndarray, valid: np.ndarray) -> bytes:
+    """Codes the levels of a tile's valid texels.
+
+    Args:
+        levels: uint16 [T, H, W, 3], below `LEVELS`.
+        valid: bool [H, W], one at least.
+    """
+    times = len(levels)
+    listed, counts = np.zeros((times, 3, LEVELS), np.int32), np.zeros((times, 3), np.int32)
+    places = np.zeros((times, 3, *valid.shape), np.int32)
+    for t, channel in np.ndindex(times, 3):
+        found, place = np.unique(levels[t, ..., channel][valid], return_inverse=True)
+        listed[t, channel, : len(found)], counts[t, channel] = found, len(found)
+        places[t, channel, valid] = place
+    arrays = _array(listed), _array(counts), _array(places)
+    return _written(lambda c: _launch_levels(c, valid, *arrays), 4 * times * int(valid.sum()), "levels", 0)
+
+
+def read_levels(stream: np.ndarray, valid: np.ndarray, times: int) -> np.ndarray:
+    """Reads what `code_levels` wrote: uint16 [times, H, W, 3]; texels that aren't valid have levels near them.
+
+    Raises:
+        ValueError: The stream isn't one of such levels.
+    """
+    _check_plain(stream)
+    shapes = (times, 3, LEVELS), (times, 3), (times, 3, *valid.shape)
+    arrays = [wp.zeros(shape, dtype=int, device="cpu") for shape in shapes]
+    _read(stream, "levels", lambda c: _launch_levels(c, valid, *arrays))
+    listed, counts, places = (array.numpy() for array in arrays)
+    if (listed[np.arange(LEVELS) < counts[..., None]] >= LEVELS).any() or (places >= counts[..., None, None]).any():
+        raise ValueError(f"expected levels below {LEVELS}, and places among them")
+    levels = np.empty((times, *valid.shape, 3), np.uint16)
+    for t, channel in np.ndindex(times, 3):
+        levels[t, ..., channel] = listed[t, channel][places[t, channel]]
+    return levels
+
+
+def _launch_levels(c: coder.Coder, valid: np.ndarray, listed: wp.array, counts: wp.array, places: wp.array) -> None:
+    weights = _array(np.zeros((3, level_coder.NEAR)))
+    _launch(c, level_coder.code_levels, _array(valid), listed, counts, places, weights)
+
+
+def _check_plain(stream: np.ndarray) -> None:
+    """Raises a `ValueError` where a stream's first byte isn't that of numbers with all of their bits."""
+    if _first(stream) != (0, False):
+        raise ValueError("expected a first byte of 0")
 
 
 def _everywhere(grid: BlockGrid) -> np.ndarray:
@@ -182,11 +255,11 @@ def _launch(c: coder.Coder, kernel: Any, *arguments: Any) -> None:
     wp.launch(kernel, 1, inputs=[c, *arguments], device="cpu")
 
 
-def _written(launch: Callable[[coder.Coder], None], plain: int, widths: str, first: int) -> bytes:
+def _written(launch: Callable[[coder.Coder], None], plain: int, what: str, first: int) -> bytes:
     """The stream that a launch writes; `plain` is about its size at most."""
     room = int(_ROOM * plain) + 64
     while True:
-        c = _coder(np.zeros(room, np.uint8), True, widths)
+        c = _coder(np.zeros(room, np.uint8), True, what)
         launch(c)
         size = int(c.place.numpy()[0])
         if size <= room:
@@ -201,30 +274,31 @@ def _first(stream: np.ndarray) -> tuple[int, bool]:
     return int(stream[0]) % _WHOLE, bool(stream[0] & _WHOLE)
 
 
-def _read(stream: np.ndarray, widths: str, launch: Callable[[coder.Coder], None]) -> None:
+def _read(stream: np.ndarray, what: str, launch: Callable[[coder.Coder], None]) -> None:
     """Reads a stream to its end.
 
     Raises:
         ValueError: It ends before or after what it should hold.
     """
-    c = _coder(stream[1:], False, widths)
+    c = _coder(stream[1:], False, what)
     launch(c)
     if int(c.place.numpy()[0]) != c.data.shape[0] + coder.AHEAD:
         raise ValueError(f"expected another length than {len(stream)} bytes")
 
 
-def _coder(data: np.ndarray, encode: bool, widths: str) -> coder.Coder:
+def _coder(data: np.ndarray, encode: bool, what: str) -> coder.Coder:
     """A coder before its first number."""
     c = coder.Coder()
-    c.logarithm, c.sigmoid, c.rate = tables()
+    c.logarithm, c.sigmoid, c.rate = _tables()
     c.encode = int(encode)
     c.data = wp.array(np.ascontiguousarray(data), dtype=wp.uint8, device="cpu")
     c.range = wp.zeros(3, dtype=wp.uint32, device="cpu")
     c.place = wp.zeros(1, dtype=int, device="cpu")
-    weights = np.full((coder.MIXTURES, 8, coder.INPUTS), coder.PREDICTION_WEIGHT)
+    size = _SIZES[what]
+    weights = np.full((size.mixtures, size.bits, coder.INPUTS), coder.PREDICTION_WEIGHT)
     weights[:, :, coder.PREDICTIONS] = coder.COUNT_WEIGHT
     c.weights = _array(weights)
-    c.widths = _array(np.full((coder.MIXTURES, coder.PREDICTIONS), 1024 * _WIDTHS[widths]))
-    c.chance = _array(np.full((coder.TREES, 512), 32768))
-    c.met = _array(np.full((coder.TREES, 512), coder.MET))
+    c.widths = _array(np.full((size.mixtures, coder.PREDICTIONS), 1024 * size.width))
+    c.chance = _array(np.full((size.trees, size.nodes), 32768))
+    c.met = _array(np.full((size.trees, size.nodes), coder.MET))
     return c

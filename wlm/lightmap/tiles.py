@@ -146,6 +146,12 @@ class TileKind(IntEnum):
     """The lightmap of each time as BC7, see `wlm.lightmap.frames`."""
     VIDEO = 5
     """The lightmaps of all times as a part of an AV1 stream, see `wlm.lightmap.video`."""
+    LEVELS = 6
+    """The lightmap of each time as levels that are coded without loss, see `wlm.lightmap.levels`."""
+
+
+UNPACKED = (TileKind.VIDEO, TileKind.LEVELS)
+"""Kinds whose levels of 10 bits are unpacked when a file is read: one for decoders, shaders and engines."""
 
 
 def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:

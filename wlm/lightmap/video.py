@@ -14,20 +14,25 @@ planes that are coded are luma, a green and an orange difference, in our own ari
 to 0.4 dB, and is no part of AV1's standard, which is exact to the bit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from wlm.formats.av1 import encode_av1
 from wlm.lightmap.frames import round_half
-from wlm.lightmap.tiles import TILE
+from wlm.lightmap.level_packing import STEPS
+from wlm.lightmap.levels import encode_tile, mean_psnr, steps_for, tile_psnr
+from wlm.lightmap.streams import load_kernels
 from wlm.lightmap.video_packing import EXTRA, MIDDLE, WHITE, Page, decode_levels
-from wlm.metrics import evaluate_frame
 from wlm.texels import fill_smoothly
+from wlm.workers import each
+from wlm_kernels.lightmap import level_coder
 
 TRIAL_SPEED = 6
 """Of encodings that only choose: beyond it libaom is of another kind, which takes a quality for another."""
 
+_DEAR = 1.0  # bits a valid texel and time, from which on levels are tried: below, AV1 is far ahead
 _STEP = 4  # of the quality, for another point on the curve of PSNR over size
 
 
@@ -50,27 +55,102 @@ def encode_levels(levels: np.ndarray, quality: int, speed: int, extra: str = EXT
     return encode_av1(planes, quality, speed, extra)
 
 
+@dataclass(frozen=True, eq=False)
+class EncodedPage:
+    """The tiles of a page as a stream of video, or as levels.
+
+    Attributes:
+        video: int, places of the tiles of video in the page, rising.
+        stream: Their stream; empty where there is none.
+        ranges: Of each of them half [n, T, 2], least and greatest.
+        levels: Of each other tile, by its place, its stream and its ranges as levels, see `wlm.lightmap.levels`.
+    """
+
+    video: np.ndarray
+    stream: bytes
+    ranges: np.ndarray
+    levels: dict[int, tuple[bytes, np.ndarray]]
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        levels = sum(len(stream) + ranges.nbytes for stream, ranges in self.levels.values())
+        return len(self.stream) + self.ranges.nbytes + levels
+
+
 def encode_page(
     page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
-) -> tuple[bytes, np.ndarray]:
-    """Encodes a page, with the ranges that yield more for their bytes: those of each time, or those of all times.
+) -> EncodedPage:
+    """Encodes a page as AV1; tiles as levels where these take fewer bytes at no lower PSNR.
 
-    Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
-    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
-    quality, which says what PSNR the smaller would have at the size of the larger.
+    What a tile takes of AV1's stream quick encodings of each tile alone say, which in sum are within 2% of one of all.
 
     Args:
         page: The page.
         colour: Of its tiles float32 [T, 128, 128, 3], in gamma space.
         valid: Of each bool [128, 128].
         gamma: Of that space.
-        quality, speed: As for `encode_levels`.
-
-    Returns:
-        The stream, and the ranges of the tiles, half [n, T, 2], least and greatest.
+        quality: 0 to 100; one of `STEPS`: all tiles are levels.
+        speed: Of AV1's encoder.
 
     Raises:
         WlmError: The encoder is missing.
+    """
+    tiles = list(zip(colour, valid, strict=True))
+    none = np.zeros(0, int), b"", np.zeros((0, len(colour[0]), 2), np.float16)
+    if quality in STEPS:
+        return EncodedPage(*none, dict(enumerate(_encoded_levels(tiles, [STEPS[quality]] * len(tiles)))))
+    stream, ranges = _encode_video(page, colour, valid, gamma, quality, speed)
+    alone = EncodedPage(np.arange(len(tiles)), stream, ranges, {})
+    if 8 * len(stream) < _DEAR * len(colour[0]) * sum(int(inside.sum()) for inside in valid):
+        return alone
+    decoded = _decoded(page, ranges, decode_levels(stream, len(colour[0]), *page.shape))
+    goals = [mean_psnr(tile, other, inside, gamma) for (tile, inside), other in zip(tiles, decoded, strict=True)]
+    steps = [steps_for(*tile, gamma, goal) for tile, goal in zip(tiles, goals, strict=True)]
+    levels = dict(enumerate(_encoded_levels(tiles, steps)))
+    worse = [i for i, goal in enumerate(goals) if tile_psnr(*tiles[i], gamma, steps[i]) < goal]
+    shares = np.array([_alone(page, i, tiles[i], ranges[i], quality, max(speed, TRIAL_SPEED)) for i in levels], float)
+    shares *= len(stream) / shares.sum()
+    dearer = [i for i, (own, bounds) in levels.items() if len(own) + bounds.nbytes >= shares[i] + ranges[i].nbytes]
+    choices = [alone]
+    if not worse:
+        choices.append(EncodedPage(*none, levels))
+    kept = sorted({*worse, *dearer})
+    if 0 < len(kept) < len(tiles):
+        rest = Page.of(page.numbers[kept], page.places[kept])
+        some = [colour[i] for i in kept], [valid[i] for i in kept], ranges[kept]
+        others = {i: own for i, own in levels.items() if i not in kept}
+        choices.append(EncodedPage(np.array(kept), _encoded(rest, *some, quality, speed), ranges[kept], others))
+    return min(choices, key=lambda choice: choice.size)
+
+
+def _alone(
+    page: Page, at: int, tile: tuple[np.ndarray, np.ndarray], ranges: np.ndarray, quality: int, speed: int
+) -> int:
+    """Bytes of one tile of a page as a stream of its own."""
+    own = Page.of(page.numbers[[at]], page.places[[at]])
+    return len(_encoded(own, [tile[0]], [tile[1]], ranges[None], quality, speed))
+
+
+def _encoded_levels(
+    tiles: Sequence[tuple[np.ndarray, np.ndarray]], steps: Sequence[float]
+) -> list[tuple[bytes, np.ndarray]]:
+    """Stream and ranges of each of some tiles, colour and valid texels, as levels."""
+    load_kernels(level_coder)
+    return list(each(lambda one: encode_tile(*one[0], one[1]), zip(tiles, steps, strict=True)))
+
+
+def _encode_video(
+    page: Page, colour: Sequence[np.ndarray], valid: Sequence[np.ndarray], gamma: float, quality: int, speed: int
+) -> tuple[bytes, np.ndarray]:
+    """Encodes a page as AV1, with the ranges that yield more for their bytes: those of each time, or of all times.
+
+    Where hours are alike, levels that are relative to one range follow from each other; where they differ much, dark
+    ones lose their levels to bright ones. Which is better quick encodings say: one of either, and one more of another
+    quality, which says what PSNR the smaller would have at the size of the larger.
+
+    Returns:
+        The stream, and the ranges of the tiles, half [n, T, 2], least and greatest.
     """
     by_time = np.stack([_range_of(tile[:, inside]) for tile, inside in zip(colour, valid, strict=True)])
     over_all = np.broadcast_to(np.stack([by_time[..., 0].min(1), by_time[..., 1].max(1)], 1)[:, None], by_time.shape)
@@ -122,6 +202,13 @@ def _encoded(
     return encode_levels(levels, quality, speed)
 
 
+def _decoded(page: Page, ranges: np.ndarray, levels: np.ndarray) -> Iterator[np.ndarray]:
+    """The colours of a page's tiles, float32 [T, 128, 128, 3] each."""
+    for bounds, window in zip(ranges.astype(np.float32), page.windows(), strict=True):
+        low, span = bounds[:, 0], (bounds[:, 1] - bounds[:, 0]) / np.float32(WHITE)
+        yield low[:, None, None, None] + levels[:, *window] * span[:, None, None, None]
+
+
 def _psnr(
     page: Page,
     colour: Sequence[np.ndarray],
@@ -131,12 +218,6 @@ def _psnr(
     gamma: float,
 ) -> float:
     """PSNR of a decoded page by the tiled protocol, dB; 0 where no tile has a score."""
-    scores = []
-    for tile, mask, (low, high), window in zip(
-        colour, valid, ranges.astype(np.float32).transpose(0, 2, 1), page.windows(), strict=True
-    ):
-        for t, original in enumerate(tile):
-            decoded = low[t] + levels[t, *window] * ((high[t] - low[t]) / np.float32(WHITE))
-            score = evaluate_frame(original**gamma, decoded**gamma, mask, TILE, ("psnr",)).psnr[0, 0]
-            scores.append(score)
+    tiles = zip(colour, _decoded(page, ranges, levels), valid, strict=True)
+    scores = [mean_psnr(*tile, gamma) for tile in tiles]
     return float(np.nanmean(scores)) if np.isfinite(scores).any() else 0.0

@@ -37,6 +37,18 @@ class Page:
     places: np.ndarray
     shape: tuple[int, int]
 
+    @classmethod
+    def of(cls, numbers: np.ndarray, places: np.ndarray) -> Page:
+        """The smallest page of some tiles.
+
+        Args:
+            numbers: int [n], rising, one at least.
+            places: int [n, 2], row and column of each in any rectangle.
+        """
+        first = places.min(0)
+        height, width = ((places.max(0) - first + 1) * TILE).tolist()
+        return cls(numbers, places - first, (height, width))
+
     def windows(self) -> list[tuple[slice, slice]]:
         """The texels of each tile."""
         return [tuple(slice(TILE * at, TILE * (at + 1)) for at in place) for place in self.places.tolist()]
@@ -59,9 +71,7 @@ def pages(kind: np.ndarray, columns: int, times: int) -> list[Page]:
     result = []
     for i in range(len(found)):
         chosen = page_of.ravel() == i
-        first = places[chosen].min(0)
-        height, width = ((places[chosen].max(0) - first + 1) * TILE).tolist()
-        result.append(Page(numbers[chosen], places[chosen] - first, (height, width)))
+        result.append(Page.of(numbers[chosen], places[chosen]))
     return result
 
 
@@ -110,9 +120,14 @@ def unpack_video(video: np.ndarray, sizes: np.ndarray, kind: np.ndarray, columns
         except ValueError as error:
             raise ValueError(f"part video: page {i}: {error}") from error
         for row, window in zip(np.searchsorted(numbers, page.numbers), page.windows(), strict=True):
-            red, green, blue = np.moveaxis(levels[:, *window].astype(np.uint32), 3, 0)
-            words[row] = red | green << 10 | blue << 20 | np.uint32(3 << 30)
+            words[row] = words_of(levels[:, *window])
     return words
+
+
+def words_of(levels: np.ndarray) -> np.ndarray:
+    """Words uint32 [...] of red, green and blue, uint16 [..., 3]; see `unpack_video`."""
+    red, green, blue = np.moveaxis(levels.astype(np.uint32), -1, 0)
+    return red | green << 10 | blue << 20 | np.uint32(3 << 30)
 
 
 def levels_of(words: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ _COLOURS = {
     TileKind.DYNAMIC: (1.0, 0.45, 0.1),
     TileKind.FRAMES: (0.65, 0.35, 0.9),
     TileKind.VIDEO: (0.95, 0.85, 0.2),
+    TileKind.LEVELS: (0.3, 0.85, 0.85),
 }
 _NAMED = {
     TileKind.EMPTY: "grey",
@@ -30,6 +31,7 @@ _NAMED = {
     TileKind.DYNAMIC: "orange",
     TileKind.FRAMES: "violet",
     TileKind.VIDEO: "yellow",
+    TileKind.LEVELS: "cyan",
 }
 
 

@@ -1,4 +1,4 @@
-"""An adaptive binary arithmetic coder of a tile's maps and network, in whole numbers: the same bits everywhere.
+"""An adaptive binary arithmetic coder of a tile's maps, network or levels, in whole numbers: the same bits everywhere.
 
 Each number is coded bit by bit, from its highest. The probability of a bit is a mixture, in the logistic domain, of
 what a few predictions of the number say and of how often the bit was met after the same higher bits (the mixing of PAQ:
@@ -53,8 +53,8 @@ class Coder:
     rate: wp.array[int]  # [LIMIT + 1] what a count moves by, in 65536ths
     weights: wp.array3d[int]  # [mixtures, bits, inputs] in 65536ths
     widths: wp.array2d[int]  # [mixtures, predictions] in 1024ths
-    chance: wp.array2d[int]  # [trees, 512] of a 1 at each node, in 65536ths
-    met: wp.array2d[int]  # [trees, 512] how often
+    chance: wp.array2d[int]  # [trees, nodes] of a 1 at each node, in 65536ths
+    met: wp.array2d[int]  # [trees, nodes] how often
 
 
 @wp.func
@@ -129,7 +129,7 @@ def number(c: Coder, value: int, bits: int, count: int, predicted: Row, widths: 
     Args:
         c: The coder.
         value: The number, where it is written.
-        bits: Of it, up to 8.
+        bits: Of it, up to 10, and as many as `Coder.weights` and the nodes of a tree have room for.
         count: Predictions.
         predicted: In 16ths.
         widths: The row of `Coder.widths` of each.

@@ -1,4 +1,4 @@
-"""Decoding tiles that are stored as video, once it is unpacked: levels of 10 bits between two bounds of their colour.
+"""Decoding tiles that are stored as video or levels, once unpacked: levels of 10 bits between two colours.
 
 Levels are `[N T, 128, 128]` of uint32, the T pictures of a tile one after another: red, green and blue from the lowest
 bit.
@@ -16,8 +16,8 @@ class StoredVideo:
     """N tiles with a picture at each of T times."""
 
     levels: wp.array3d[wp.uint32]  # [N T, 128, 128]
-    least: wp.array1d[float]  # [N T], colour of level 0
-    span: wp.array1d[float]  # [N T], that of level 1023 less it
+    least: wp.array1d[wp.vec3]  # [N T], colour of level 0
+    span: wp.array1d[wp.vec3]  # [N T], that of level 1023 less it
     times: int
     gamma: float
 
@@ -32,8 +32,7 @@ def video_colour(stored: StoredVideo, picture: int, y: int, x: int) -> wp.vec3:
     """The colour in gamma space of a texel of a picture."""
     word = stored.levels[picture, y, x]
     level = wp.vec3(level_of(word, 0), level_of(word, 10), level_of(word, 20))
-    least = stored.least[picture]
-    return wp.vec3(least, least, least) + stored.span[picture] * level
+    return stored.least[picture] + wp.cw_mul(stored.span[picture], level)
 
 
 VIDEO = image_kernels(StoredVideo, video_colour)

@@ -109,9 +109,9 @@ def decode(artifact: Artifact) -> LayeredModel:
             model.mask = models[sheets[holder]].mask
         unpacked += sum(value.nbytes for value in model.parts.values())
         check_growth("the file", stored, unpacked)
-        if len(model.video_ranges):
-            filmed += model.video_levels.nbytes
-            check_growth("the file's video", stored, filmed, VIDEO_GROWTH, VIDEO_BYTES)
+        if len(model.unpacked):
+            filmed += model.words.nbytes
+            check_growth("the file's video and levels", stored, filmed, VIDEO_GROWTH, VIDEO_BYTES)
         models[sheet] = model
     if len({model.period for model in models.values()}) > 1:
         raise ValueError("setting sheets: expected one period")
