@@ -132,6 +132,7 @@ TABLES: dict[str, dict[str, Figure]] = {
         "tiles_seconds": Figure("tiles", "s", ".2g"),  # of a scene, as the next but one
         "curves_seconds": Figure("curves", "s", ".2g"),
         "balance_seconds": Figure("balance", "s", ".2g"),
+        "apart_seconds": Figure("apart", "s", ".2g"),  # of a scene, the tiles of each state by themselves
         "allocate_seconds": Figure("allocate", "s", ".2g"),
         "solve_seconds": Figure("solve", "s", ".2g"),
         "cluster_seconds": Figure("cluster", "s", ".2g"),
