@@ -12,6 +12,7 @@ from builders.gltf_scene import Thing, box, write_scene
 
 import wlm
 from wlm.atlas.data import from_arrays
+from wlm.atlas.scene import sharing
 from wlm.atlas.scene.data import load_scene, scene_of
 from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.description import read_description
@@ -27,7 +28,7 @@ from wlm.atlas.scene.shader import scene_glsl
 from wlm.formats.exr import write_exr
 
 SIDE = 48
-QUICK = {"views": 2, "budget": 0.15}
+QUICK = {"views": 2, "budget": 0.08}
 
 
 def lights(shift: float, states: int = 3) -> np.ndarray:
@@ -79,7 +80,7 @@ def test_one_table_and_one_texture_for_all(scene, model):
     assert len(report.psnr_by_state) == len(report.peaks) == 3 and min(report.peaks) > 0.5
     # Bits go to what is seen large: the small crate has far fewer samples a tile than the room.
     samples = np.array(model.report["samples"]) / np.array(model.report["tiles"])
-    assert samples[2] < 0.5 * samples[0]
+    assert samples[2] < 0.6 * samples[0]
 
 
 def test_the_kernel_reads_what_the_reference_does(scene, model, device):
@@ -117,13 +118,14 @@ def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
         ("atlas-scene", [0.60438323, 0.86818969, 1.13199604]),  # one mixture, a layer for each component
         ("atlas-scene-mixed", [0.26424402, 0.60012102, 0.93599224]),
         ("atlas-scene-coarse", [0.26860335, 0.70232235, 0.89431477]),
+        ("atlas-scene-apart", [0.7223999, 0.6742418, 0.0]),
     ],
 )
 def test_kept_files(name, means, device):
     """They hold what they did for the version that wrote them."""
     model = wlm.load(Path(__file__).parents[1] / "files" / f"{name}.wlm")
     random = np.random.default_rng(0)
-    uv, sheet = random.random((2000, 2)).astype(np.float32), random.integers(0, len(model.table()), 2000)
+    uv, sheet = random.random((2000, 2)).astype(np.float32), random.integers(0, len(model.sheets + model.levels), 2000)
     points = torch.from_numpy(uv).to(device), torch.from_numpy(sheet).to(device)
     light = np.stack([model.decoder(device).read(*points, state).cpu().numpy() for state in range(3)])
     assert light.mean((1, 2)) == pytest.approx(means, rel=1e-5)
@@ -189,6 +191,55 @@ def test_coarse_components(model, device):
     without = pack_tiles(first, size, component, count - coarse, page, blocks)
     light, rest = (Decoder(dataclasses.replace(model, lut=lut), device).lightmap(0, 0) for lut in (model.lut, without))
     assert 0.01 < (light != rest).any(2).mean() < 0.99
+
+
+@pytest.fixture(scope="module")
+def unlike():
+    """A room and a crate under two smooth lights, each finely shadowed in another half, and in the dark."""
+    row, column = np.mgrid[:32, :32] / 32
+    fine = 0.4 + np.sign(np.sin(60 * column + 9 * np.sin(11 * row)))[..., None] * [0.3, 0.2, 0.3]
+    smooth = 1.0 + 0.2 * row[..., None] * [1.0, 0.5, 0.2]
+    left = np.where((column < 0.5)[..., None], fine, smooth)
+    frames = np.stack([left, left[:, ::-1] ** 2, np.zeros_like(left)]).astype(np.float32)
+    parts = [box((0, 0, 0), (6, 3, 5), inward=True), box((1, 0, 1), (2, 1, 2))]
+    meshes = [from_arrays(*part, frames[0], name=f"part {i}") for i, part in enumerate(parts)]
+    return scene_of(meshes, [frames, frames[:, ::-1]], name="unlike")
+
+
+def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_path, device):
+    """In the same bits they lose less so than with tiles in common."""
+    settings = {"views": 2, "budget": 0.3}
+    apart = compress_scene(unlike, mips=True, **settings)
+    states, stride = len(unlike.states), len(apart.sheets) + len(apart.levels)
+    assert apart.report["apart"] and apart.stride == stride and len(apart.rows) == states * stride
+    assert set(apart.report["components"]) == {"1"} and apart.report["components"]["1"] > sum(apart.report["tiles"])
+    assert apart.lut.shape[2] == 2 and 1.0 - apart.compression_ratio <= 0.3
+    monkeypatch.setattr(sharing, "_better", lambda together, *rest: together)
+    together = compress_scene(unlike, mips=True, **settings)
+    assert not together.later and not together.stride
+    psnr = [evaluate_scene(each, unlike, views=3, resolution=48).psnr for each in (apart, together)]
+    assert apart.report["expected gain of states apart"] > 1.0 and psnr[0] > psnr[1] + 1.0
+    # Read as the reference does, whole, kept in a file, and between states and levels.
+    random = np.random.default_rng(0)
+    uv, sheet = random.random((300, 2)).astype(np.float32), random.integers(0, stride, 300)
+    points = torch.from_numpy(uv).to(device), torch.from_numpy(sheet).to(device)
+    apart.save(tmp_path / "a.wlm")
+    decoder = wlm.load(tmp_path / "a.wlm").decoder(device)
+    lights = [decoder.read(*points, state) for state in range(states)]
+    for state, light in enumerate(lights):
+        expected = decode64(apart, uv, sheet, state)
+        np.testing.assert_allclose(light.cpu().numpy(), expected, rtol=1e-3, atol=1e-3)
+    assert not lights[2].any()  # black stays black
+    torch.testing.assert_close(decoder.read(*points, 0.25), 0.75 * lights[0] + 0.25 * lights[1], rtol=1e-5, atol=1e-6)
+    far = torch.full((300,), 9.0, device=device)
+    ends = [decoder.read(points[0], points[1] % 2, state, far) for state in (0.0, 1.0, 0.5)]
+    torch.testing.assert_close(ends[2], 0.5 * (ends[0] + ends[1]), rtol=1e-5, atol=1e-6)
+    assert float((ends[0] - ends[1]).abs().min()) > 0.01
+    bare = apart.without_levels()
+    near = (points[0], points[1] % 2)
+    assert torch.equal(Decoder(bare, device).read(*near, 1.0), decoder.read(*near, 1.0))
+    assert len(bare.rows) == states * len(apart.sheets) and not bare.levels and not bare.table()[:, 6].any()
+    assert not apart.without_levels().later[0].smaller and not together.without_levels().later
 
 
 def files(folder, states=("day", "night")):

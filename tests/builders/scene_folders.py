@@ -24,7 +24,10 @@ _SQUARES = {
 
 
 def scene_folder(folder, uv_set=1, states=STATES, **settings):
-    """Writes one, whose first page is black and nowhere read, and gives its model; of one state it has one page."""
+    """Writes one and gives its model.
+
+    Where states share tiles, as they do in few bits, its first page is black and nowhere read.
+    """
     folder.mkdir()
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
     things = []
@@ -47,7 +50,7 @@ def scene_folder(folder, uv_set=1, states=STATES, **settings):
     text = {"states": states, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
     scene = load_scene(path, folder / "lights.json")
-    model = compress_scene(scene, views=1, **{"budget": 0.4} | settings)
+    model = compress_scene(scene, views=1, **{"budget": 0.1} | settings)
     if model.lut.shape[2] == ENTRY:
         pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
         pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}

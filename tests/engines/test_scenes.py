@@ -27,15 +27,16 @@ def made(tmp_path_factory):
     return folder / "made", scene_folder(folder)
 
 
-@pytest.fixture(scope="module", params=["mixed", "rgb9e5", "short"])
+@pytest.fixture(scope="module", params=["mixed", "rgb9e5", "short", "apart"])
 def each_form(request, tmp_path_factory):
-    """The same of each way of storing colours; and of one state, which has short entries, with mips."""
+    """The same of each way of storing colours; of one state, which has short entries, with mips; of states apart."""
     if request.param == "mixed":
         return request.getfixturevalue("made")
     folder = tmp_path_factory.mktemp(request.param) / "scene"
-    settings = {"states": ("noon",), "mips": True} if request.param == "short" else {}
-    model = scene_folder(folder, colour="rgb9e5", **settings)
-    assert bool(model.levels) == (model.lut.shape[2] == SHORT_ENTRY) == (request.param == "short")
+    settings = {"short": {"states": ("noon",), "mips": True, "budget": 0.4}, "apart": {"budget": 0.4}}
+    model = scene_folder(folder, colour="rgb9e5", **settings.get(request.param, {}))
+    assert bool(model.levels) == (request.param == "short") and bool(model.later) == (request.param == "apart")
+    assert (model.lut.shape[2] == SHORT_ENTRY) == (request.param in settings)
     return folder / "made", model
 
 

@@ -347,7 +347,7 @@ READERS = (
     Reader(
         "atlas-scene",
         "a.wlm",
-        stored("atlas-scene.wlm", "atlas-scene-mixed.wlm", "atlas-scene-coarse.wlm"),
+        stored("atlas-scene.wlm", "atlas-scene-mixed.wlm", "atlas-scene-coarse.wlm", "atlas-scene-apart.wlm"),
         vary_artifact,
         _atlas_scene,
     ),

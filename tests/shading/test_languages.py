@@ -139,10 +139,11 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def random_scene(short: bool, mixed: bool) -> SceneModel:
+def random_scene(short: bool, mixed: bool, apart: bool) -> SceneModel:
     """Two sheets, the first with two smaller levels.
 
-    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks.
+    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks;
+    apart: each state has tiles of its own, which lie elsewhere in the table.
     """
     random = np.random.default_rng(1)
     texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
@@ -168,11 +169,18 @@ def random_scene(short: bool, mixed: bool) -> SceneModel:
     if short:
         factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
     parts = (sheets, factor, texels, lut, levels)
+    if apart:
+        rows = enumerate((*sheets, *levels) * 2)
+        second["later"] = tuple(
+            replace(row, row=(row.row + n) % 8, column=(row.column + n) % 5, smaller=row.smaller and row.smaller + at)
+            for n, row in rows
+            for at in [4 + 4 * (n // 4)]
+        )
     return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), *parts, **second)
 
 
-def scene(short, mixed, _) -> Subject:
-    model, random = random_scene(short, mixed), np.random.default_rng(2)
+def scene(short, mixed, apart, _) -> Subject:
+    model, random = random_scene(short, mixed, apart), np.random.default_rng(2)
     decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
     uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
     texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
@@ -365,9 +373,10 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
     "atlas mips": partial(mips, MIXED),
     "atlas cascade mips": partial(mips, "cascade"),
-    "scene": partial(scene, False, False),
-    "scene of one component": partial(scene, True, False),
-    "scene mixed": partial(scene, False, True),
+    "scene": partial(scene, False, False, False),
+    "scene of one component": partial(scene, True, False, False),
+    "scene mixed": partial(scene, False, True, False),
+    "scene apart": partial(scene, True, False, True),
     "smoke motion": smoke_motion,
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,

@@ -95,7 +95,9 @@ def compress(
         model = fit_tiles(grid, profile, seed, stages)
     if profile.fallback:
         with stages("compare"):
-            model = _better(grid, model, profile, seed)
+            # Other views than those of the fit, in which its error is less than elsewhere.
+            weight = None if model is None else weights(grid, profile, seed + 1)
+            model = with_fallback(grid, model, profile, weight)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))
     if profile.mips:
@@ -146,10 +148,16 @@ def open_checkpoint(
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, mesh.source, resume=resume, every=every)
 
 
-def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: int) -> AtlasModel:
+def with_fallback(
+    grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
+) -> AtlasModel:
     """The model, or a smaller lightmap of at most as many bits whose weighted error is no larger.
 
-    Without a model the smaller lightmap has the budget's bits, and a texel, or a block, at least.
+    Args:
+        grid: The mesh, with its lightmap, and the device.
+        model: None: the smaller lightmap has the budget's bits, and a texel, or a block, at least.
+        profile: `budget`, `colour` and `mips`.
+        weight: float64 [2 H, 2 W], how much each cell counts; of a model alone.
     """
     mesh, device = grid.mesh, grid.device
     height, width = mesh.mask.shape
@@ -168,13 +176,12 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
     plain = AtlasModel(mesh.name, mesh.source, profile, "plain", format, height, width, **textures)
     if model is None:
         return replace(plain, report={"why plain": "tiles do not fit the budget"})
-    # Other views than those of the fit, in which its error is less than elsewhere.
     image, decoders = torch.from_numpy(mesh.filled).to(device), [Decoder(each, device) for each in (model, plain)]
     errors = torch.zeros(2, dtype=torch.float64)
-    for points, weight in _cell_centres(grid, weights(grid, profile, seed + 1)):
+    for points, share in cell_centres(grid, weight):
         target = texture(image, points[0])
         for i, decoder in enumerate(decoders):
-            errors[i] += float(((decoder(*points) - target).double().square().sum(1) * weight).sum())
+            errors[i] += float(((decoder(*points) - target).double().square().sum(1) * share).sum())
     error, plain_error = errors.tolist()
     ratio = {"error against a plain lightmap of as many bits": error / plain_error if plain_error else None}
     if error < plain_error:
@@ -182,7 +189,7 @@ def _better(grid: FineGrid, model: AtlasModel | None, profile: Profile, seed: in
     return replace(plain, report=ratio | {"why plain": f"its error is no larger than that of {model.method}"})
 
 
-def _cell_centres(
+def cell_centres(
     grid: FineGrid, weight: torch.Tensor
 ) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]]:
     """Centres of cells that are in a triangle, as a decoder takes them, and their weights; some rows at a time.

@@ -18,7 +18,8 @@ import torch
 
 from wlm import interop
 from wlm.atlas import colour
-from wlm.atlas.layout import Size, composed, layout, sizes_of
+from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.layout import Layout, Size, composed, layout, sizes_of
 from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tail_bits, tile_counts
 from wlm.atlas.stages import Stages
 from wlm.atlas.weights import FineGrid, weights
@@ -88,24 +89,47 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     with stages("curves"):
         error = curves(tiles, sizes, stages.progress, stages.checkpoint)
     with stages("allocate"):
-        peak = float(np.ptp(mesh.filled[mesh.mask]))
-        least = peak**2 * _LEAST_GAIN / (height * width)
-        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least)
+        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(mesh))
         if packed is None:
             return None
     with stages("solve"):
         samples = solved(tiles, sizes, packed.chosen)
     with stages("write"):
-        (first, *second), lut = composed(samples, sizes, packed, tiles.index.cpu().numpy(), (rows, columns))
-        mixed = profile.colour == "mixed"
-        textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], grid.device)
-        if mixed:
-            blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], grid.device)
-            textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
+        return composed_model(mesh, profile, samples, sizes, packed, tiles.index.cpu().numpy(), grid.device)
+
+
+def composed_model(
+    mesh: LightmappedMesh,
+    profile: Profile,
+    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    sizes: list[Size],
+    packed: Layout,
+    index: np.ndarray,
+    device: str,
+) -> AtlasModel:
+    """The model of tiles whose samples are solved for.
+
+    Args:
+        mesh: The mesh, whose lightmap was cut.
+        profile: `colour` and `tile`.
+        samples: `solved`.
+        sizes: The sizes that there are.
+        packed: The tiles' sizes and places.
+        index: int64 [T], `Tiles.index`.
+        device: "cpu" or "cuda:N", where blocks are encoded.
+    """
+    height, width = mesh.mask.shape
+    counts = tile_counts(height, width, profile.tile)
+    (first, *second), lut = composed(samples, sizes, packed, index, counts)
+    mixed = profile.colour == "mixed"
+    textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], device)
+    if mixed:
+        blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], device)
+        textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
     chosen = [sizes[number] for number in packed.chosen]
     report = {
-        "tiles": len(tiles.index),
-        "of tiles": rows * columns,
+        "tiles": len(index),
+        "of tiles": counts[0] * counts[1],
         "samples": sum(size.nx * size.ny for size in chosen),
         "constant tiles": sum(size.nx * size.ny == 1 for size in chosen),
     }
@@ -113,6 +137,11 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
         report["tiles of blocks"] = sum(size.second for size in chosen)
     settings = (mesh.name, mesh.source, profile, "tiles", profile.colour, height, width)
     return AtlasModel(*settings, **textures, lut=lut, report=report)
+
+
+def least_gain(mesh: LightmappedMesh) -> float:
+    """The error that a bit must save to be allocated."""
+    return float(np.ptp(mesh.filled[mesh.mask])) ** 2 * _LEAST_GAIN / mesh.mask.size
 
 
 def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:

@@ -53,6 +53,7 @@ TABLES: dict[str, dict[str, Figure]] = {
         "psnr_max": Figure("most", "dB", ".2f"),
         "gain": Figure("gain", "dB", "+.3f"),  # of a PSNR over another method's
         "gain_min": Figure("least gain", "dB", "+.3f"),
+        "objects_ahead": Figure("objects ahead", "%", ".0f"),  # of what is seen of a scene, against its parts
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "texel_psnr_min": Figure("least", "dB", ".2f"),
@@ -128,7 +129,10 @@ TABLES: dict[str, dict[str, Figure]] = {
     },
     "Stages": {  # of an atlas' compression
         "weights_seconds": Figure("weights", "s", ".2g"),
+        "tiles_seconds": Figure("tiles", "s", ".2g"),  # of a scene, as the next but one
         "curves_seconds": Figure("curves", "s", ".2g"),
+        "balance_seconds": Figure("balance", "s", ".2g"),
+        "apart_seconds": Figure("apart", "s", ".2g"),  # of a scene, the tiles of each state by themselves
         "allocate_seconds": Figure("allocate", "s", ".2g"),
         "solve_seconds": Figure("solve", "s", ".2g"),
         "cluster_seconds": Figure("cluster", "s", ".2g"),

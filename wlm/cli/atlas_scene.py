@@ -71,6 +71,7 @@ def show_scene(path: Path, as_json: bool) -> None:
     rows.add_row("states", escape(", ".join(facts["states"])))
     rows.add_row("sheets", f"{len(facts['sheets']):,}")
     rows.add_row("smaller levels", f"{facts['levels']:,}")
+    rows.add_row("tiles", "of each state apart" if facts["apart"] else "shared by the states")
     rows.add_row("colour texture", _pages(*facts["colour_size"]))
     if facts["colour"] == "mixed":
         rows.add_row("texture of blocks", _pages(*facts["block_size"]))

@@ -206,6 +206,50 @@ def atlas(
     _finish(rows, command, device, json_path, plot_path, PANELS, [*plotted(beside), *plotted(rows)], baseline)
 
 
+@app.command("atlas-scene")
+def atlas_scene(
+    set_path: Annotated[
+        Path, typer.Option("--set", metavar="SET", help="A lightmap set with its mesh, which is cut into objects.")
+    ],
+    hours: Annotated[
+        list[float] | None, typer.Option("--hour", help="A state; default all times of the set. Several times.")
+    ] = None,
+    side: Annotated[
+        int | None, typer.Option(min=1, help="Texels that the lightmaps' longer side is made smaller to; a divisor.")
+    ] = None,
+    profiles: _Profiles = None,
+    budget: Annotated[float | None, typer.Option(help="Instead of the profile's.")] = None,
+    parts: Annotated[
+        bool, typer.Option("--parts/--no-parts", help="With each object and state by itself, in as many bits.")
+    ] = True,
+    quick: Annotated[bool, typer.Option("--quick", help="Few small views, for a check on a CPU.")] = False,
+    device: Device = "cpu",
+    json_path: _RowsFile = None,
+    baseline: _Baseline = None,
+) -> None:
+    """Lightmaps of whole scenes: PSNR of all objects and hours in one model, and of each by itself in as many bits."""
+    device = _prepare(device, json_path, None, baseline)
+    from wlm.bench.atlas_scene import run
+    from wlm.bench.scene_inputs import load
+
+    scene = load(set_path, hours or (), side)
+    views = {"views": 8, "resolution": 128} if quick else {}
+    options = {"budget": budget, "device": device, "parts": parts}
+    rows = run(scene, profiles or (), **options, **views, progress=note)
+    command = _command(
+        "atlas-scene",
+        set=set_path,
+        hour=hours,
+        side=side,
+        profile=profiles,
+        budget=budget,
+        no_parts=not parts,
+        quick=quick,
+        device=device,
+    )
+    _finish(rows, command, device, json_path, None, baseline=baseline)
+
+
 @app.command("atlas-ablation")
 def atlas_ablation(
     profile: Annotated[

@@ -3,7 +3,6 @@
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +66,7 @@ def export_scene(
     if not isinstance(objects, list) or not isinstance(uv_set, int):
         raise WlmError(f"{source / REPORT_FILE}: expected objects and uv_set; compress again")
     if engine != "raw":
-        model = replace(model, levels=())
+        model = model.without_levels()
     info: dict[str, Any] = {
         "format": FORMAT,
         "version": _VERSION,

@@ -34,7 +34,7 @@ class Allocated:
         first: int64 [T, 2], place of the first component's on the page.
         page: int64 [T].
         shapes: Pages, rows and columns of both textures.
-        error: Weighted, mean over the states.
+        error: float64 [T], weighted, mean over the states.
     """
 
     rank: np.ndarray
@@ -47,7 +47,7 @@ class Allocated:
     first: np.ndarray
     page: np.ndarray
     shapes: tuple[tuple[int, int, int], ...]
-    error: float
+    error: np.ndarray
 
 
 def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocated:
@@ -86,11 +86,11 @@ def allocated(tried: list[Tried], bits: float, profile: SceneProfile) -> Allocat
             component = begin[mixture.ravel()]
             pairs = (divmod(each, MOST_MIXTURES) for each in used.tolist())
             factors = np.concatenate([tried[r].mixtures.factors(g) for r, g in pairs])
-            left = float(error[chosen, tiles].sum())
+            left = error[chosen, tiles]
             coarse = np.array([choice.coarse for choice in choices])[chosen]
             places = (coarse, size, second, first, page, tuple(shapes))
             best = Allocated(rank, ranks[rank], component, factors, *places, left)
-            if found is None or left < found.error:
+            if found is None or left.sum() < found.error.sum():
                 found = best
             if area > _FULL * rest or total >= float(cost[error.argmin(0)].sum()):
                 return found

@@ -4,14 +4,17 @@ A mean of PSNRs is least where sum_v log E_v is, with E_v the mean squared error
 sum_v E_v / E'_v, with E'_v of the last allocation, has the same slope there and is a sum over tiles again: so each
 allocation gives the next one's weights, and the sum of logarithms falls (majorisation-minimisation, Hunter and Lange
 2004). A tile's errors are all in proportion to its weight, so they are solved for once.
+
+That mean of logarithms also says whether states are better kept apart.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, hstack
 
 from wlm.atlas.layout import allocate
 from wlm.atlas.scene.curves import SceneTiles, Tried, costs
@@ -34,6 +37,16 @@ class Seen:
 
     share: csr_array
     lost: np.ndarray
+
+    def by_state(self, states: int) -> "Seen":
+        """The same of tiles of each state, one state after the other: a view loses the mean of its states' errors."""
+        return replace(self, share=hstack([self.share] * states, "csr") / states)
+
+    def psnr(self, error: np.ndarray) -> float:
+        """dB, mean over the views, of errors of tiles over their weights [T]; the peak is 1."""
+        if not len(self.lost):
+            return -10.0 * math.log10(float(error.mean()) + FLOOR)
+        return float(-10.0 * np.log10(self.share @ error + FLOOR).mean())
 
 
 def tiles_seen(
@@ -82,8 +95,8 @@ def tiles_seen(
     return Seen(csr_array(parts, shape=shape), np.array(lost))
 
 
-def balance(tried: list[Tried], weight: np.ndarray, seen: Seen, profile: SceneProfile, bits: float) -> list[Tried]:
-    """The same tiles with errors in proportion to their new weights.
+def balance(tried: list[Tried], weight: np.ndarray, seen: Seen, profile: SceneProfile, bits: float) -> np.ndarray:
+    """What the tiles' weights are to be multiplied by, float64 [T]; the sum of all weights stays.
 
     Args:
         tried: The tiles with each number of components.
@@ -95,7 +108,7 @@ def balance(tried: list[Tried], weight: np.ndarray, seen: Seen, profile: ScenePr
     error, cost, tiles = np.concatenate([each.error for each in tried]), costs(tried), np.arange(len(weight))
     shown = np.asarray(seen.share.sum(0)).ravel() > 0
     if not shown.any():
-        return tried
+        return np.ones(len(weight))
 
     def counts(lost: np.ndarray) -> np.ndarray:
         result = seen.share.T @ (1.0 / lost)
@@ -106,4 +119,4 @@ def balance(tried: list[Tried], weight: np.ndarray, seen: Seen, profile: ScenePr
         chosen = allocate(error * factor, cost, bits, 0.0)
         factor = counts(seen.share @ (error[chosen, tiles] / weight) + FLOOR) / before
         factor *= float(weight.sum()) / float((factor * weight).sum())
-    return [replace(each, error=each.error * factor) for each in tried]
+    return factor

@@ -1,7 +1,7 @@
 """The artifact of a scene's model: one file.
 
 Parts: `colour` (uint32 [pages, Hp, Wp], RGB9E5), `lut` (uint16 [Hc, Wc, 2 or 4]), `factor` (float32 [M, C, 3]) and
-`sheets` (int32 [S + levels, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
+`sheets` (int32 [rows, 7], `SceneModel.table`); each a zlib stream where that is smaller, `wlm.atlas.streams`.
 Earlier files name no `entries`, the numbers of one, or no `coarse`, `wlm.atlas.scene.earlier`.
 """
 
@@ -34,6 +34,7 @@ def encode(model: SceneModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "sheets": [sheet.name for sheet in model.sheets],
         "entries": model.lut.shape[2],
         "coarse": True,
+        **({"apart": True} if model.later else {}),
         "profile": model.profile.changes(),
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
@@ -52,6 +53,7 @@ class _Header(Header):
     block_texels: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
     entries: Literal[2, 4] | None = None
     coarse: Literal[True] | None = None
+    apart: Literal[True] | None = None
     profile: SceneProfile
     report: dict[str, JsonValue]
     parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
@@ -101,13 +103,14 @@ def decode(artifact: Artifact) -> SceneModel:
     beyond |= page >= np.where(of_blocks, len(blocks), len(texels))
     if (beyond & (count > 0)).any() or (component + count >= factor.shape[1]).any():
         raise ValueError("part lut: a tile reaches beyond the colour texture or the factors")
-    if len(sheets) < len(names):
-        raise ValueError(f"part sheets: expected {len(names)}, found {len(sheets)}")
+    stride, rest = divmod(len(sheets), len(header.states) if header.apart else 1)
+    if rest or stride < len(names):
+        raise ValueError(f"part sheets: expected {len(names)} and levels for each state, found {len(sheets)}")
     places = []
-    names += [""] * (len(sheets) - len(names))
+    names = (names + [""] * (stride - len(names))) * (len(sheets) // stride)
     for number, row in enumerate(sheets.tolist()):
-        smaller = row[6]
-        if smaller and not max(number, len(header.sheets) - 1) < smaller < len(sheets):
+        smaller, first = row[6], number // stride * stride
+        if smaller and not max(number, first + len(header.sheets) - 1) < smaller < first + stride:
             raise ValueError(f"part sheets: {row}: expected a level after it")
         if smaller:
             names[smaller] = names[number]
@@ -129,10 +132,11 @@ def decode(artifact: Artifact) -> SceneModel:
         factor,
         texels,
         lut,
-        tuple(places[len(header.sheets) :]),
+        tuple(places[len(header.sheets) : stride]),
         header.report,
         blocks if len(blocks) else np.empty((0, 0, 16), np.uint8),
         _decoded(blocks, second),
+        tuple(places[stride:]),
     )
 
 

@@ -67,24 +67,38 @@ class Decoder:
         Raises:
             ValueError: The model has no mips.
         """
+        if lod is not None and not self.model.levels:
+            raise ValueError("lod: expected a model with mips")
+        factors = self.factors(state)
+        if not self.model.stride:
+            return self._read(uv, sheet, factors, lod)
+        before = int(state)
+        light = self._read(uv, sheet + before * self.model.stride, self.factors(before), lod)
+        if state == before:
+            return light
+        after = self._read(uv, sheet + (before + 1) * self.model.stride, self.factors(before + 1), lod)
+        return light + (state - before) * (after - light)
+
+    def _read(
+        self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Light of rows of the table, with a state's factors."""
         if lod is not None:
-            if not self.model.levels:
-                raise ValueError("lod: expected a model with mips")
-            return self._between(uv, sheet.long(), state, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
-        uv, sheet = uv.contiguous(), sheet.int().contiguous()
+            return self._between(uv, row.long(), factors, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
+        uv, row = uv.contiguous(), row.int().contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
-            factor = wp.array(self.factors(state), dtype=wp.vec3, device=self.device)
-            points = interop.to_warp(uv, wp.vec2), interop.to_warp(sheet)
+            factor = wp.array(factors, dtype=wp.vec3, device=self.device)
+            points = interop.to_warp(uv, wp.vec2), interop.to_warp(row)
             tile, result = self.model.profile.tile, interop.to_warp(out, wp.vec3)
             textures = self._texels, self._blocks, self._code
             kernels.read(*points, self._sheets, tile, factor, self._lut, *textures, result)
         return out
 
-    def _between(self, uv: torch.Tensor, sheet: torch.Tensor, state: float, level: torch.Tensor) -> torch.Tensor:
-        """Light between two levels, 0 the sheet's own."""
+    def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
+        """Light between two levels, 0 the row's own."""
         smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
-        near, far = sheet, torch.where(smaller[sheet] > 0, smaller[sheet], sheet)
+        near, far = row, torch.where(smaller[row] > 0, smaller[row], row)
         for number in range(1, 1 + len(self.model.levels)):
             on = (level >= number) & (near != far)
             if not bool(on.any()):
@@ -92,8 +106,8 @@ class Decoder:
             after = torch.where(smaller[far] > 0, smaller[far], far)
             near, far = torch.where(on, far, near), torch.where(on, after, far)
         share = (level - level.floor())[:, None]
-        below = self.read(uv, near, state)
-        return below + share * (self.read(uv, far, state) - below)
+        below = self._read(uv, near, factors)
+        return below + share * (self._read(uv, far, factors) - below)
 
     def lightmap(self, sheet: int, state: float) -> np.ndarray:
         """Decodes a lightmap in its own layout, float32 [H, W, 3]; in the gaps between charts it is anything."""

@@ -13,13 +13,13 @@ def decode64(model: SceneModel, uv: np.ndarray, sheet: np.ndarray, state: int) -
     Args:
         model: The model.
         uv: [N, 2], finite, in the sheets; clamped to [0, 1].
-        sheet: int [N], rows of `SceneModel.table`.
+        sheet: int [N], sheets, or levels: rows of `SceneModel.table` of the first state.
         state: Its number.
 
     Returns:
         float64 [N, 3].
     """
-    table = model.table()[np.asarray(sheet)].astype(np.int64)
+    table = model.table()[np.asarray(sheet) + state * model.stride].astype(np.int64)
     size, origin, tiles = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1]
     x = (np.asarray(uv, np.float64).clip(0.0, 1.0) * size - 0.5).clip(0, size - 1) / model.profile.tile
     tile = np.minimum(np.floor(x), tiles - 1).astype(np.int64)

@@ -63,7 +63,7 @@ def export_scene(
         WlmError: The folder holds something other than an earlier output, a file can't be written, or there are more
             sheets and levels than a texture has rows.
     """
-    rows = len(model.sheets) + len(model.levels)
+    rows = len(model.rows)
     if rows > MOST_SIDE:
         raise WlmError(f"{model.name}: expected at most {MOST_SIDE} sheets and levels, found {rows}")
     if model.source != scene.source:
@@ -99,7 +99,7 @@ def export_scene(
             "name": model.name,
             "source": model.source,
             "states": list(model.states),
-            "sheets": [dataclasses.asdict(sheet) for sheet in (*model.sheets, *model.levels)],
+            "sheets": [dataclasses.asdict(sheet) for sheet in model.rows],
             "objects": [dataclasses.asdict(each) for each in scene.objects],
             "uv_set": scene.uv_set,
             "cr": model.compression_ratio,
@@ -116,7 +116,7 @@ def export_scene(
 
 
 def sheet_texels(model: SceneModel) -> np.ndarray:
-    """The texture `sheets`, uint16 [S + levels, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
+    """The texture `sheets`, uint16 [rows, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
     table = model.table()
     texels = np.zeros((len(table), 2, 4), "<u2")
     texels[:, 0] = table[:, [1, 0, 3, 2]]
@@ -145,9 +145,9 @@ def describe_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Says what a scene's folder or model holds.
 
     Returns:
-        JSON's own types: name, bytes, states, sheets with their sizes, how many levels, the texture's width, height and
-        pages, the table's size, factors, compression ratios by eq. 9 and on disk, source, bytes by part, the model's
-        report and the profile.
+        JSON's own types: name, bytes, states, sheets with their sizes, how many levels, whether states are apart, the
+        texture's width, height and pages, the table's size, factors, compression ratios by eq. 9 and on disk, source,
+        bytes by part, the model's report and the profile.
 
     Raises:
         WlmError: It is another folder or file, or damaged.
@@ -162,6 +162,7 @@ def describe_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
         "states": list(model.states),
         "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
         "levels": len(model.levels),
+        "apart": bool(model.later),
         "colour": model.colour,
         "block_size": list(model.block_texels.shape[2::-1]),
         "colour_size": list(model.texels.shape[::-1]),

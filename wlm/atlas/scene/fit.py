@@ -4,11 +4,13 @@ The states' light is divided by how much it varies, so that each counts by its P
 mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), they
 count by what the views that show them lose (`balance`), and numbers and sizes are allocated to the tiles of all sheets
 at once (`allocation`): one more bit gains as much in every object.
+
+States that have little in common, a shadow mask and the light of a sky, lose by sharing sizes. So the same is done with
+the tiles of each state apart, and the better of the two is kept. Apart, all that an object and a state has by itself is
+there to be allocated: a scene is no worse than its parts.
 """
 
-import math
 import os
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,19 +18,13 @@ import torch
 
 from wlm import interop
 from wlm.atlas.colour import encode
-from wlm.atlas.layout import Size, place, texels_of
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, tile_counts
-from wlm.atlas.scene.allocation import NO_ROOM, Allocated, allocated
-from wlm.atlas.scene.balance import balance, tiles_seen
-from wlm.atlas.scene.curves import SceneTiles, Tried, candidates, sizes_of
+from wlm.atlas.layout import Size, texels_of
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS
+from wlm.atlas.scene.allocation import Allocated
+from wlm.atlas.scene.curves import SceneTiles, Tried
 from wlm.atlas.scene.data import LightmappedScene
 from wlm.atlas.scene.detail import peaks_of, scales, variation
 from wlm.atlas.scene.model import (
-    ENTRY,
-    NUMBER_BITS,
-    SHEET_BITS,
-    SHORT_ENTRY,
-    TEXEL_BITS,
     SceneModel,
     SceneProfile,
     SheetPlace,
@@ -36,38 +32,19 @@ from wlm.atlas.scene.model import (
     extent,
     pack_tiles,
 )
-from wlm.atlas.scene.packing import WIDTHS
-from wlm.atlas.scene.planes import Plane, planes_of
+from wlm.atlas.scene.planes import planes_of
 from wlm.atlas.scene.seen import scene_weights
+from wlm.atlas.scene.sharing import Layout, fitted
 from wlm.atlas.stages import Stages, one_thread
 from wlm.atlas.tiles import (
     Tiles,
-    patches,
     solved,
-    weighted,
 )
-from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.system import OnProgress
 
 _AT_ONCE = 1024  # tiles
 _BRIGHT = 1024.0  # what a component's largest texel becomes: RGB9E5 has as many octaves below it as above
-
-
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """Tables of sheets and levels.
-
-    Attributes:
-        grid: Rows and columns of tiles of each.
-        row, column: The first entry of each in T_c.
-        shape: Of T_c.
-    """
-
-    grid: list[tuple[int, int]]
-    row: list[int]
-    column: list[int]
-    shape: tuple[int, int]
 
 
 def compress_scene(
@@ -110,36 +87,19 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         weights = scene_weights(scene, varies, profile, seed, device)
         unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
         planes = planes_of(scene, weights, profile.mips, device)
-    layout = _laid_out(planes, profile.tile)
-    # One state has one component.
-    numbers = ENTRY if len(scene.states) > 1 else SHORT_ENTRY
-    bits = profile.budget * scene.source_bits - len(planes) * SHEET_BITS
-    room = bits - math.prod(layout.shape) * numbers * NUMBER_BITS
-    with stages("tiles"):
-        tiles = _tiles(planes, unit, profile.tile, device)
-    if room < len(tiles.index) * TEXEL_BITS:
-        raise WlmError(NO_ROOM.format(profile.budget))
-    sizes = sizes_of(profile)
-    with stages("curves"):
-        tried = candidates(tiles, sizes, profile, room, seed, stages)
-    with stages("balance"):
-        seen = tiles_seen(scene, varies, tiles, layout.grid[: len(scene.sheets)], profile, seed, device)
-        tried = balance(tried, tiles.weight.double().sum(1).cpu().numpy(), seen, profile, room)
-    with stages("allocate"):
-        given = allocated(tried, room, profile)
-        if numbers == SHORT_ENTRY and given.page.any():
-            numbers = ENTRY
-            given = allocated(tried, bits - math.prod(layout.shape) * ENTRY * NUMBER_BITS, profile)
+    kept = fitted(scene, planes, unit, varies, profile, seed, stages)
+    planes, layout, tiles, tried, given = kept.planes, kept.layout, kept.tiles, kept.tried, kept.given
+    stride = len(planes) // kept.apart
     with stages("solve"):
         texels, blocks, scale = _texels(tiles, tried, given)
-    lut = np.ascontiguousarray(_table(tiles, layout, given)[..., :numbers])
+    lut = np.ascontiguousarray(_table(tiles, layout, given)[..., : kept.numbers])
     rows = [
         SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
         for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
     ]
     sheets = len(scene.sheets)
     counts, samples, many = (
-        np.bincount(tiles.plane, each, len(planes))[:sheets]
+        np.bincount(tiles.plane % stride, each, stride)[:sheets]
         for each in (None, extent(given.size, given.count, given.coarse).prod(1), given.count)
     )
     report = {
@@ -149,56 +109,25 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         "samples": samples.astype(int).tolist(),
         "components by sheet": (many / np.maximum(counts, 1)).round(2).tolist(),
         "pages": len(texels),
+        "apart": kept.apart > 1,
+        "expected gain of states apart": kept.gain,
         "tiles of blocks": int(given.second.sum()),
         "coarse components": int(given.coarse.sum()),
         "error by components": {str(each.rank): each.left for each in tried},
         "units": unit.tolist(),
         "seconds": stages.seconds,
     }
+    # Apart, all states have the factors of one, times their units.
     factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
-    parts = (tuple(rows[:sheets]), np.ascontiguousarray(factor), texels, lut, tuple(rows[sheets:]), report)
+    levels = tuple(rows[sheets:stride])
+    parts = (tuple(rows[:sheets]), np.ascontiguousarray(factor), texels, lut, levels, report)
     second = {"blocks": blocks[0], "block_texels": blocks[1].astype(np.float16)} if blocks else {}
-    return SceneModel(scene.name, scene.source, profile, scene.states, *parts, **second)
-
-
-def _laid_out(planes: list[Plane], tile: int) -> _Layout:
-    """Places the tables of sheets and levels in one, on shelves."""
-    grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
-    across = np.array([(columns, rows) for rows, columns in grid])
-    best = None
-    for share in WIDTHS:
-        width = max(int(across[:, 0].max()), round(share * math.sqrt(across.prod(1).sum())))
-        first, height = place(across, width)
-        width = int((first[:, 0] + across[:, 0]).max())
-        if best is None or width * height < best[0]:
-            best = width * height, first, (height, width)
-    return _Layout(grid, best[1][:, 1].tolist(), best[1][:, 0].tolist(), best[2])
+    return SceneModel(scene.name, scene.source, profile, scene.states, *parts, **second, later=tuple(rows[stride:]))
 
 
 def _of_texels(weight: np.ndarray) -> np.ndarray:
     """Weights of texels [H, W] of those of their quarters [2 H, 2 W]."""
     return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
-
-
-def _tiles(planes: list[Plane], unit: np.ndarray, tile: int, device: str) -> SceneTiles:
-    """Cuts the light of all states into tiles."""
-    total = sum(float(plane.weight.sum()) for plane in planes)
-    texels, weights, numbers, owner = [], [], [], []
-    scale = torch.from_numpy(unit).float()[:, None]
-    for number, plane in enumerate(planes):
-        if not plane.weight.any():
-            continue
-        index, share = weighted(torch.from_numpy(plane.weight), tile)
-        columns = tile_counts(*plane.frames.shape[1:3], tile)[1]
-        # Texels first, then states.
-        frames = torch.from_numpy(plane.frames).permute(1, 2, 0, 3)
-        texels.append(patches(frames, index, columns, tile) / scale)
-        weights.append(share * (float(plane.weight.sum()) / total))
-        numbers.append(index.numpy())
-        owner.append(np.full(len(index), number))
-    return SceneTiles(
-        torch.cat(texels), torch.cat(weights), np.concatenate(owner), np.concatenate(numbers), tile, device
-    )
 
 
 def _texels(
@@ -241,7 +170,7 @@ def _texels(
     return pack_rgb9e5(first), blocks, scale.astype(np.float64)
 
 
-def _table(tiles: SceneTiles, layout: _Layout, given: Allocated) -> np.ndarray:
+def _table(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
     """T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
     columns = np.array([each[1] for each in layout.grid])[tiles.plane]
     row = tiles.index // columns + np.array(layout.row)[tiles.plane]

@@ -133,7 +133,8 @@ def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
 
 def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:
     """What is added to components so that they aren't negative, [K, 3]."""
-    if not len(texels):
+    # Of one state the one direction is the light itself, and black stays black.
+    if not len(texels) or space.shape[1] == 1:
         return np.zeros((space.shape[2], len(space)))
     parts = np.einsum("nmc,cmk->nkc", texels.reshape(-1, *texels.shape[2:]), space)
     low, high = np.percentile(parts, [_PERCENT, 100.0 - _PERCENT], axis=0)

@@ -9,9 +9,12 @@ a point in state m is
 with f a constant and a factor of each component, for each state and channel; what is negative is 0. Tiles whose light
 changes alike from state to state share a mixture (`mixture`). Between two states f is linear. With mips a sheet is
 followed by smaller ones, its levels, that are read in the same way.
+
+Where states have little in common they are kept *apart*: a sheet has tiles of its own in each state, of one component,
+and between two states light is linear.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -109,6 +112,7 @@ class SceneModel(Model):
         report: Facts about the compression, for people.
         blocks: uint8 [pages, B, 16], the second texture of "mixed", BC6H, row by row; [0, 0, 16] for none.
         block_texels: half [pages, Hb, Wb, 3], what they decode to, multiples of 4; [0, 0, 0, 3] for none.
+        later: Where states are apart the sheets and levels of the second state, then those of the third and so on.
     """
 
     SYSTEM: ClassVar[str] = "atlas-scene"
@@ -125,6 +129,23 @@ class SceneModel(Model):
     report: dict[str, Any] = field(default_factory=dict)
     blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 16), np.uint8))
     block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0, 3), np.float16))
+    later: tuple[SheetPlace, ...] = ()
+
+    @property
+    def rows(self) -> tuple[SheetPlace, ...]:
+        """All sheets and levels, as in `table`."""
+        return (*self.sheets, *self.levels, *self.later)
+
+    @property
+    def stride(self) -> int:
+        """How many rows after a sheet's in one state is its row in the next; 0: all states have one."""
+        return len(self.sheets) + len(self.levels) if self.later else 0
+
+    def without_levels(self) -> "SceneModel":
+        """The same without mips; what they read stays in the textures."""
+        kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
+        bare = (replace(row, smaller=0) for row in kept)
+        return replace(self, sheets=tuple(replace(s, smaller=0) for s in self.sheets), levels=(), later=tuple(bare))
 
     @property
     def colour(self) -> str:
@@ -135,7 +156,7 @@ class SceneModel(Model):
     def bits(self) -> int:
         """Bits of T_p, T_c, the factors and the sheets' rows."""
         texels = self.texels.size * TEXEL_BITS + self.blocks.size * 8 + self.lut.size * NUMBER_BITS
-        return texels + self.factor.size // 3 * FACTOR_BITS + (len(self.sheets) + len(self.levels)) * SHEET_BITS
+        return texels + self.factor.size // 3 * FACTOR_BITS + len(self.rows) * SHEET_BITS
 
     @property
     def compression_ratio(self) -> float:
@@ -144,11 +165,10 @@ class SceneModel(Model):
         return 1.0 - self.bits / source
 
     def table(self) -> np.ndarray:
-        """int32 [S + levels, 7], the sheets and then the levels as kernels and shaders read them: rows and columns of
-        texels, first row and column in T_c, rows and columns of tiles, row of the next smaller level."""
-        rows = [
-            (s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in (*self.sheets, *self.levels)
-        ]
+        """int32 [rows, 7], the sheets, then the levels, as kernels and shaders read them; apart, of one state after the
+        other: rows and columns of texels, first row and column in T_c, rows and columns of tiles, row of the next
+        smaller level."""
+        rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
 
 

@@ -21,7 +21,7 @@ _TEXT = """\
 {samplers}
 const float WLM_SCENE_TILE = {tile}.0; // texels of a lightmap along a tile
 
-vec3 wlm_scene(vec2 uv, int sheet, float state)
+vec3 {name}(vec2 uv, int sheet, float state)
 {{
     uvec4 place = texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0); // texels of its lightmap, first entry
     uvec4 tiles = texelFetch(WLM_SCENE_SHEETS, ivec2(1, sheet), 0);
@@ -97,7 +97,7 @@ _SHORT = {
 
 _GRAD = """
 // Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_scene(uv, sheet, state).
-vec3 wlm_scene_grad(vec2 uv, vec2 dx, vec2 dy, int sheet, float state)
+vec3 {name}(vec2 uv, vec2 dx, vec2 dy, int sheet, float state)
 {{
     vec2 size = vec2(texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0).xy); // of the lightmap, in texels
     float texels = max(length(dx * size), length(dy * size)); // along the pixel
@@ -113,12 +113,28 @@ vec3 wlm_scene_grad(vec2 uv, vec2 dx, vec2 dy, int sheet, float state)
         }}
     }}
     float share = level - float(steps);
-    vec3 light = wlm_scene(uv, near, state);
+    vec3 light = {read}(uv, near, state);
     if (share <= 0.0 || far == 0)
         return light;
-    return mix(light, wlm_scene(uv, far, state), share);
+    return mix(light, {read}(uv, far, state), share);
 }}
 """
+
+_APART = """
+// Each state has rows of sheets of its own.
+vec3 {name}({declared}, int sheet, float state)
+{{
+    int before = min(int(state), {last});
+    int after = min(before + 1, {last});
+    float share = state - float(before);
+    vec3 light = {row}({given}, sheet + {stride} * before, float(before));
+    if (share <= 0.0)
+        return light;
+    return mix(light, {row}({given}, sheet + {stride} * after, float(after)), share);
+}}
+"""
+_FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 dx, vec2 dy", "uv, dx, dy")}
+"""With the arguments before the sheet, as they are declared and given."""
 
 
 def scene_glsl(model: SceneModel) -> str:
@@ -132,7 +148,9 @@ def scene_glsl(model: SceneModel) -> str:
     sizes = {"code": FIRST_BLOCK_CODE, "side": BLOCK_SIDE, "last": BLOCK_SIDE - 1, "width": columns, "height": rows}
     short = model.lut.shape[2] == SHORT_ENTRY
     numbers = _SHORT if short else _LONG
+    names = {name: f"{name}_row" if model.later else name for name in _FUNCTIONS}
     text = _TEXT.format(
+        name=names["wlm_scene"],
         blocks=_BLOCKS.format(**sizes) if mixed else "",
         coarse=_COARSE.format(**sizes, **numbers) if mixed and not short else "",
         read=_READ_MIXED if mixed else _READ,
@@ -146,4 +164,12 @@ def scene_glsl(model: SceneModel) -> str:
         mask=(1 << SIDE_BITS) - 1,
         **numbers,
     )
-    return text + _GRAD.format(octaves=TAIL_OCTAVES - 1) if model.levels else text
+    if model.levels:
+        text += _GRAD.format(octaves=TAIL_OCTAVES - 1, name=names["wlm_scene_grad"], read=names["wlm_scene"])
+    if not model.later:
+        return text
+    states = {"last": len(model.states) - 1, "stride": model.stride}
+    for name, (declared, given) in _FUNCTIONS.items():
+        if name == "wlm_scene" or model.levels:
+            text += _APART.format(name=name, row=names[name], declared=declared, given=given, **states)
+    return text

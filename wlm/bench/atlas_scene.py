@@ -1,0 +1,167 @@
+"""A scene of many objects and states against its parts, each object and state by itself, in as many bits.
+
+Rows of method "scene", one for each profile: the file, the compression with its stages, and the error in views of the
+whole scene. After each a row of method "parts", `wlm.baselines.scene_parts` in the same bits or up to half a percent
+more, by the profile of one lightmap that has the same textures.
+
+"gain" is what the scene's mean over views and states is above the parts'; "least gain" that of the state in which it
+is least. "objects ahead" is the share of what is seen whose object has no larger squared error in the scene, by state:
+an object that is seen small gets fewer bits than it has alone, which is meant.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from wlm import interop
+from wlm.atlas.data import from_arrays
+from wlm.atlas.model import SOURCE_BITS
+from wlm.atlas.scene.data import LightmappedScene, scene_of
+from wlm.atlas.scene.detail import peaks_of, variation
+from wlm.atlas.scene.evaluation import RESOLUTION, VIEWS, SceneSampler, compare_scene
+from wlm.atlas.scene.fit import compress_scene
+from wlm.atlas.scene.model import SceneProfile
+from wlm.atlas.scene.seen import scene_weights
+from wlm.baselines.scene_parts import scene_parts
+from wlm.bench.rows import Row
+from wlm.bench.runner import Bench, Note
+from wlm.ops.raster import texture
+
+PROFILES = ("standard",)
+"""Profiles of a run."""
+
+_FIT_SEED, _SCORE_SEED = 1, 2  # of views: the parts' weights have others than the score of objects
+
+
+def run(
+    scene: LightmappedScene,
+    names: Sequence[str] = (),
+    *,
+    budget: float | None = None,
+    device: str,
+    parts: bool = True,
+    views: int = VIEWS,
+    resolution: int = RESOLUTION,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures a scene against its parts.
+
+    Args:
+        scene: The scene, as `wlm.bench.scene_inputs.load` cuts it.
+        names: Profiles of scenes; none: `PROFILES`.
+        budget: Instead of the profiles'.
+        device: "cpu" or "cuda:0".
+        parts: With the parts, which take most of the time.
+        views: Cameras around the scene, and as many from inside.
+        resolution: Pixels along a side.
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, profile by profile.
+
+    Raises:
+        WlmError: A profile or the device isn't there, or the budget is less than the smallest model takes.
+    """
+    profiles = [SceneProfile.load(name) for name in names or PROFILES]
+    if budget is not None:
+        profiles = [profile.override({"budget": budget}) for profile in profiles]
+    title = f"{scene.name}, {len(scene.sheets)} objects, {len(scene.states)} states"
+    bench = _SceneBench(title, scene, interop.check_device(device), (views, resolution), progress)
+    rows = []
+    for profile in profiles:
+        rows += bench.rows(profile, parts)
+    return rows
+
+
+class _SceneBench(Bench):
+    """A scene, and the views that it is scored in."""
+
+    def __init__(
+        self, title: str, scene: LightmappedScene, device: str, views: tuple[int, int], progress: Note | None
+    ) -> None:
+        super().__init__("atlas", device, progress, scene=title)
+        self._scene, self._views = scene, dict(zip(("views", "resolution"), views, strict=True))
+        self._varies = variation(scene, peaks_of(scene), device)
+
+    def rows(self, profile: SceneProfile, parts: bool) -> list[Row]:
+        """Of the scene and of its parts."""
+        scene, device = self._scene, self.device
+        self.note(f"{profile.name}: compiling")
+        compress_scene(_small(len(scene.states)), profile.override({"budget": 1.0, "views": 1}), device=device)
+        self.note(f"{profile.name}: compressing")
+        fit = self.fit(profile.name, lambda: compress_scene(scene, profile, device=device))
+        model = fit.model
+        stages = {f"{name}_seconds": seconds for name, seconds in fit.fitted.report["seconds"].items()}
+        decoders: dict[str, SceneSampler] = {"scene": model.decoder(device).read}
+        row = self.row(
+            "scene",
+            profile.name,
+            bytes=fit.bytes,
+            bpp=self._bpp(model.bits),
+            compression_ratio=model.compression_ratio,
+            encode_seconds=fit.seconds,
+            lightmaps=len(scene.sheets) * len(scene.states),
+            **stages,
+        )
+        rows = [row]
+        if parts:
+            self.note(f"{profile.name}: {len(scene.sheets) * len(scene.states)} parts")
+            alone = scene_parts(scene, self._weights(profile, _FIT_SEED), model.bits, profile.colour, device)
+            decoders["parts"] = alone.read
+            plain = sum(each.method == "plain" for of_sheet in alone.models for each in of_sheet)
+            share = alone.bits / scene.source_bits
+            notes = f"each object and state by itself, {plain} of them plain smaller lightmaps; no file"
+            rows.append(
+                self.row(
+                    "parts", f"bits of {profile.name}", notes, bpp=self._bpp(alone.bits), compression_ratio=1.0 - share
+                )
+            )
+        self.note("scoring")
+        scores = compare_scene(scene, decoders, device=device, **self._views)
+        for number, name in enumerate(scores):
+            figures = {each: getattr(scores[name], each) for each in ("psnr", "psnr_worst", "texel_psnr")}
+            rows[number] = rows[number].with_figures(**figures)
+        if parts:
+            gains = np.subtract(*(scores[name].psnr_by_state for name in ("scene", "parts")))
+            rows[0] = rows[0].with_figures(
+                gain=scores["scene"].psnr - scores["parts"].psnr,
+                gain_min=float(np.nanmin(gains)),
+                objects_ahead=self._ahead(decoders, self._weights(profile, _SCORE_SEED)),
+            )
+        return rows
+
+    def _bpp(self, bits: float) -> float:
+        """Bits for each texel and state."""
+        return SOURCE_BITS * bits / self._scene.source_bits
+
+    def _weights(self, profile: SceneProfile, seed: int) -> list[np.ndarray]:
+        return scene_weights(self._scene, self._varies, profile, seed, self.device)
+
+    def _ahead(self, decoders: dict[str, SceneSampler], weights: list[np.ndarray]) -> float:
+        """The share of what is seen that is of objects whose squared error is no larger in the scene than alone."""
+        ahead = total = 0.0
+        for number, (sheet, weight) in enumerate(zip(self._scene.sheets, weights, strict=True)):
+            row, column = np.nonzero(weight)
+            share = torch.from_numpy(weight[row, column]).to(self.device)
+            place = np.stack([(column + 0.5) / weight.shape[1], (row + 0.5) / weight.shape[0]], 1)
+            uv = torch.from_numpy(place).float().to(self.device)
+            which = torch.full((len(uv),), number, dtype=torch.int32, device=self.device)
+            for state, frame in enumerate(sheet.frames):
+                light = texture(torch.from_numpy(frame).to(self.device), uv)
+                scene, parts = (
+                    float(((decoders[name](uv, which, state) - light).double().square().sum(1) * share).sum())
+                    for name in ("scene", "parts")
+                )
+                seen = float(share.sum())
+                ahead, total = ahead + seen * (scene <= parts), total + seen
+        return ahead / total
+
+
+def _small(states: int) -> LightmappedScene:
+    """A square of so many states, to compile with."""
+    side = np.linspace(0.1, 1.0, 32)
+    image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
+    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
+    mesh = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
+    return scene_of([mesh], [np.stack([image ** (1 + state) for state in range(states)])])
