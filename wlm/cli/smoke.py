@@ -281,7 +281,8 @@ def shade(
                 raise WlmError(f"{smoke}: has no opacity: expected an alpha, or a third texture by a second --with")
             looks = shot.looks or plain
             given = lights or [settings.light() for settings in looks.lights]
-            extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time, "rule": rule}
+            extra = {"albedo": looks.albedo, "ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
+            extra["rule"] = rule
             shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(shot.number)
