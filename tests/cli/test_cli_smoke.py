@@ -189,7 +189,7 @@ def test_every_route_keeps_the_scene(tmp_path):
     """Lights, background, glow, obstacles and their shadows are those of the scene, whoever made the lightmaps."""
     lights = [{"toward": [1, 0, 1], "irradiance": [20, 2, 2]}, {"toward": [-1, 1, 0], "irradiance": [0, 0, 30]}]
     looks = {"lights": lights, "background": [0.0, 0.2, 0.0], "obstacles": [SPHERE | {"colour": [0.5, 0.5, 0.1]}]}
-    smoke = {"extinction": 8.0, "emission": 2.0, "glow": [[0, 0, 0, 0], [1, 3, 1, 0]]}
+    smoke = {"extinction": 8.0, "emission": 2.0, "glow": [[0, 0, 0, 0], [1, 3, 1, 0]], "albedo": [0.9, 0.5, 0.7]}
     folder = write_frames(tmp_path / "a", smoke=smoke, frames=2, **looks).path
     for number in (1, 2):
         save_volume(folder / f"frame_{number:04d}.npz", plume(number + 1, hot=True))
@@ -209,6 +209,11 @@ def test_every_route_keeps_the_scene(tmp_path):
     call("smoke", "predict", folder, "-o", tmp_path / "network", "--resolution", 20)
     six, kept = read_shaded(tmp_path / "network" / "six_0002.exr")
     assert kept == load_frames(folder).scene.looks(2) and bool((six.depth > 0).any())
+    assert kept.albedo == (0.9, 0.5, 0.7)
+    # What has light of all orders has its albedo.
+    words = ("--fit", "sphere", "--albedo", 0.8, "--step", 2, "--resolution", 20)
+    call("smoke", "bake", folder, "-o", tmp_path / "sphere", *words)
+    assert read_shaded(tmp_path / "sphere" / "six_0002.exr")[1] == kept.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
 
 
 def test_a_scenes_glow(tmp_path):

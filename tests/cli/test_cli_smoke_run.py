@@ -13,7 +13,7 @@ from PIL import Image
 from wlm.formats.film import film
 from wlm.smoke.codec import shipped
 
-HOT = {"extinction": 8.0, "emission": 3.0, "glow": [[0, 0, 0, 0], [0.5, 2, 0.5, 0]]}
+HOT = {"extinction": 8.0, "albedo": [0.9, 0.8, 0.6], "emission": 3.0, "glow": [[0, 0, 0, 0], [0.5, 2, 0.5, 0]]}
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def png(path):
 
 
 def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
-    text = call("smoke", "run", scene, "-o", tmp_path / "run", "--step", 1)
+    text = call("smoke", "run", scene, "-o", tmp_path / "run", "--orders", "single", "--step", 1)
     assert sorted(os.listdir(tmp_path / "run")) == [f"run_{n:04d}.png" for n in (1, 2, 3)]
     for stage in ("simulation", "lightmaps", "shadows and picture", "bytes", "writing"):
         assert stage in text
@@ -48,17 +48,41 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
         assert (error > 2).mean() < 0.02, number
     call("smoke", "run", scene, "-o", tmp_path / "net", "--network", shipped(), "--frames", 1)
     assert np.abs(png(tmp_path / "net" / "run_0001.png") - png(tmp_path / "run" / "run_0001.png")).mean() < 6
-    call("smoke", "run", scene, "-o", tmp_path / "one", "--frames", 1, "--resolution", 10, "--scale", 2)
-    assert png(tmp_path / "one" / "run_0001.png").shape == (10, 12, 3)
+
+
+def test_run_has_light_of_all_orders(scene, tmp_path):
+    """As `light` lights the frames of `simulate`; brighter than light that was scattered once."""
+    text = call("smoke", "run", scene, "-o", tmp_path / "run")
+    assert "light of all orders" in text and "shadows and picture" in text
+    call("smoke", "simulate", scene, "-o", tmp_path / "frames")
+    call("smoke", "light", tmp_path / "frames", "-o", tmp_path / "lit")
+    for number in (1, 2, 3):
+        made, staged = (png(tmp_path / f"{name}_{number:04d}.png") for name in ("run/run", "lit/light"))
+        # Frames on disk are half floats.
+        assert np.abs(made - staged).max() <= 3, number
+    call("smoke", "run", scene, "-o", tmp_path / "once", "--orders", "single")
+    call("smoke", "run", scene, "-o", tmp_path / "dark", "--albedo", "0.2", "--scale", 2, "--resolution", 10)
+    once, dark = (png(tmp_path / name / "run_0003.png") for name in ("once", "dark"))
+    assert made.mean() > once.mean() + 1 and dark.shape == (10, 12, 3) and dark.mean() < once.mean()
 
 
 def test_what_run_refuses(scene, tmp_path, monkeypatch):
     out = tmp_path / "a"
     assert "--white: expected a number above 0" in fails("smoke", "run", scene, "-o", out, "--white", 0)
+    for words, line in (
+        (("--orders", "two"), "--orders: expected all or single"),
+        (("--orders", "single", "--model", "a.npz"), "--model: expected --orders all"),
+        (("--orders", "all", "--network", "a.safetensors"), "--network: expected --orders single"),
+        (("--seed", 1), "--seed: expected --orders single"),
+        (("--albedo", "0.5,2,1"), "--albedo: expected numbers of 0 to 1"),
+        (("--model", "absent.npz"), "absent.npz"),
+    ):
+        assert line in fails("smoke", "run", scene, "-o", out, *words)
     both = ("--step", 1, "--network", tmp_path / "n.safetensors")
     assert "--step: expected no --network" in fails("smoke", "run", scene, "-o", out, *both)
     (tmp_path / "b.yaml").write_text(yaml.safe_dump(SCENE | {"camera": {"perspective": True}}))
-    assert "expected false for six-way lightmaps" in fails("smoke", "run", tmp_path / "b.yaml", "-o", out)
+    single = ("--orders", "single")
+    assert "expected false for six-way lightmaps" in fails("smoke", "run", tmp_path / "b.yaml", "-o", out, *single)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert "pip install 'wlm[film]'" in fails("smoke", "run", scene, "-o", tmp_path / "a.mp4", "--frames", 1)
     odd = ("--resolution", 9)

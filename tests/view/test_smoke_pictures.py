@@ -13,12 +13,16 @@ from wlm.errors import WlmError
 from wlm.smoke.baking import bake
 from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
+from wlm.smoke.shading import Light, Ramp, obstacle_visibility
+from wlm.smoke.transport.filtering import scatter
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.lights import PointLight
 from wlm.view.smoke import (
     contact_sheet,
     draw_obstacles,
     guide_pictures,
+    light_picture,
     picture,
     six_pictures,
     to_bytes,
@@ -197,3 +201,48 @@ def test_a_contact_sheet(tmp_path):
     with pytest.raises(ValueError, match="titles"):
         contact_sheet(tmp_path / "c.png", rows, ["a"])
     assert not (tmp_path / "c.png").exists()
+
+
+@pytest.mark.parametrize("orders", ["single", "all"])
+def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
+    """With fire in its colours, a point light and visibilities; then with an obstacle, put together by hand: it keeps
+    off the light of a direction, not that of a point."""
+    volume = replace(plume(hot=True, device=device), emission=8.0)
+    camera = make_camera(CameraSettings(resolution=20), volume.origin, volume.size)
+    half = torch.rand(20, 20, generator=torch.Generator().manual_seed(1)).to(device)
+    lights = [Light((1.0, 1.0, 1.0), (9.0, 4.0, 2.0), half), PointLight((0.4, 0.6, 0.6), (1.0, 2.0, 3.0))]
+    looks = {"background": (0.1, 0.2, 0.3), "ramp": Ramp((0.0, 1.0), ((0.0, 0.0, 0.0), (2.0, 0.5, 0.1)))}
+
+    def shaded(smoke, background, lights):
+        if orders == "single":
+            options = {"albedo": (0.9, 0.5, 0.0), "background": background, "ramp": looks["ramp"]}
+            return replace(smoke, lights=tuple(lights)).shade(**options)
+        moved = replace(smoke, lit=replace(smoke.lit, lights=tuple(lights)))
+        return moved.shade(background=background, ramp=looks["ramp"])
+
+    if orders == "single":
+        smoke = light_smoke(volume, camera, lights)
+        drawn, depth = light_picture(smoke, albedo=(0.9, 0.5, 0.0), **looks), smoke.depth
+    else:
+        smoke = scatter(volume, camera, lights, (0.9, 0.5, 0.0))
+        drawn, depth = light_picture(smoke, **looks), smoke.lit.depth
+        assert smoke.lit.thrown.any()
+    torch.testing.assert_close(drawn, shaded(smoke, looks["background"], lights))
+    ball = [_ball(0.1, 0.6, 0.25)]
+    points, triangles, _ = (torch.from_numpy(part).to(device) for part in obstacle_mesh(ball, 0.0))
+    solid, away = draw_obstacles(ball, 0.0, camera, lights[:1], device)
+    behind = torch.where(torch.isfinite(away)[..., None], solid, torch.tensor(looks["background"], device=device))
+    seen = obstacle_visibility(depth, camera, (1.0, 1.0, 1.0), points, triangles)
+    by_hand = shaded(smoke, behind, [replace(lights[0], visibility=seen), lights[1]])
+    by_hand = torch.where((away < depth)[..., None], solid, by_hand)
+    extra = {"albedo": (0.9, 0.5, 0.0)} if orders == "single" else {}
+    torch.testing.assert_close(light_picture(smoke, obstacles=ball, **looks, **extra), by_hand)
+    assert (seen < 0.5).any() and (away < depth).any() and not torch.equal(by_hand, drawn)
+
+
+def test_lightmaps_are_lit_from_directions_alone():
+    camera = _camera(8)
+    with pytest.raises(ValueError, match="expected directional lights"):
+        picture(_flat(camera, 0.5), [PointLight((0.0, 1.0, 0.0))])
+    half = picture(_flat(camera, 0.5, 0.4), [FRONT], albedo=(0.5, 1.0, 0.0))
+    torch.testing.assert_close(half, picture(_flat(camera, 0.5, 0.4), [FRONT]) * torch.tensor([0.5, 1.0, 0.0]))

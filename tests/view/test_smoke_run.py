@@ -8,25 +8,32 @@ from builders.smoke_plumes import SPHERE, plume
 
 from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
+from wlm.smoke.shading import Ramp
 from wlm.smoke.transport.filtering import scatter
-from wlm.view.smoke import picture
+from wlm.view.smoke import light_picture, picture
 from wlm.view.smoke_drawing import Drawing
-from wlm.view.smoke_run import Lighting
+from wlm.view.smoke_run import AllOrders, SixWays
 
 
-def test_a_graph_draws_each_frame(device):
+@pytest.mark.parametrize("lighting", [SixWays(step=1.0), AllOrders((0.95, 0.9, 0.8), step=1.0)])
+def test_a_graph_draws_each_frame(device, lighting):
     """Smoke that lies elsewhere each time, and an obstacle that moves; more often than it takes to be captured."""
     volumes = [plume(frame, hot=True, device=device) for frame in (1, 2, 3)]
     camera = make_camera(CameraSettings(resolution=24), volumes[0].origin, volumes[0].size)
     lights = [LightSettings(toward=toward).light() for toward in ((1, 1, 1), (-1, 0, 1))]
     parts = {"background": (0.1, 0.2, 0.3), "obstacles": [ObstacleSettings.model_validate(SPHERE)]}
-    drawing, lighting = Drawing(camera, lights, **parts, device=device), Lighting(step=1.0)
-    graph, seen = VolumeGraph(lambda volume: drawing(lighting(volume, camera, True)), device), []
-    for number, volume in enumerate(volumes + volumes):
+    parts["ramp"] = Ramp((0.0, 2.0), ((0.0, 0.0, 0.0), (1.0, 0.5, 0.1)))
+    drawing = Drawing(camera, lights, **parts, device=device)
+    graph, seen = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device), []
+    for number, volume in enumerate([*volumes, volumes[0]]):
         drawing.move(0.1 * number)
         graph(volume)
         seen.append(drawing.image.clone())
-        expected = picture(lighting(volume, camera, True), lights, **parts, time=0.1 * number)
+        made = lighting(volume, camera, lights)
+        if isinstance(lighting, SixWays):
+            expected = picture(made, lights, **parts, time=0.1 * number)
+        else:
+            expected = light_picture(made, **parts, time=0.1 * number)
         torch.testing.assert_close(seen[-1], expected)
     assert not torch.equal(seen[0], seen[3]) and not torch.equal(seen[1], seen[2])
 

@@ -281,7 +281,8 @@ def shade(
                 raise WlmError(f"{smoke}: has no opacity: expected an alpha, or a third texture by a second --with")
             looks = shot.looks or plain
             given = lights or [settings.light() for settings in looks.lights]
-            extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time, "rule": rule}
+            extra = {"albedo": looks.albedo, "ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
+            extra["rule"] = rule
             shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(shot.number)
@@ -319,6 +320,9 @@ def flipbook(
     motion: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity: write OUT_motion too.")
     ] = None,
+    depth: Annotated[
+        Path | None, typer.Option(metavar="SMOKE", help="The smoke itself: write OUT_depth too, for point lights.")
+    ] = None,
     shader: Annotated[
         bool, typer.Option("--shader", help="Write OUT.glsl, OUT.hlsl, OUT.metal and OUT.wgsl too.")
     ] = False,
@@ -335,13 +339,18 @@ def flipbook(
         raise WlmError(f"--gain: expected a number above 0, got {gain}")
     if mips is not None and padding:
         raise WlmError("--mips: expected without --padding, which it chooses")
-    if motion is not None and textures:
-        raise WlmError("--motion: expected lightmaps of bake or predict, or frames: a flip book's camera isn't known")
+    for option, given in (("motion", motion), ("depth", depth)):
+        if given is not None and textures:
+            reason = "expected lightmaps of bake or predict, or frames: a flip book's camera isn't known"
+            raise WlmError(f"--{option}: {reason}")
+    if depth is not None and not depth.exists():
+        raise WlmError(f"{depth}: expected the flip book's smoke, found none")
     quiet_warp()
     from wlm.formats.atomic import atomic_write
     from wlm.shading import ENDINGS
     from wlm.smoke.exporter import brightest_gain, channels, lay_out, write_flipbook, write_page
     from wlm.smoke.exporter import cells as cells_for
+    from wlm.smoke.flipbook_depth import encoded_depth, frames_depth
     from wlm.smoke.flipbook_motion import ZERO, encoded, frames_motion, mip_padding, open_motion, scale_of
     from wlm.smoke.shader import smoke_shader
 
@@ -349,6 +358,7 @@ def flipbook(
     source = _source(smoke, options, step, supersample, 0.5, book)
     # Before what takes long.
     air = None if motion is None else open_motion(motion, options.device)
+    deep = None if depth is None else options.open(depth)
     with running("flipbook") as progress:
         shots = list(_shots(source, progress, count))
         frames = [shot.six for shot in shots]
@@ -362,15 +372,21 @@ def flipbook(
     if mips is not None:
         padding = mip_padding(height, width, mips)
     placed = {"rows": rows_of_cells, "columns": columns, "gain": gain, "padding": padding}
-    scale, moving = None, output.with_name(f"{output.stem}_motion{output.suffix}")
+    numbers, scale, reach = [shot.number for shot in shots], None, None
+    moving, depths = (output.with_name(f"{output.stem}_{name}{output.suffix}") for name in ("motion", "depth"))
     if air is not None:
         with running("motion") as progress:
-            moved = frames_motion(air, [shot.number for shot in shots], frames, progress)
+            moved = frames_motion(air, numbers, frames, progress)
         scale = scale_of(moved)
         write_page(moving, lay_out(encoded(moved, scale), rows_of_cells, columns, padding, ZERO))
+    if deep is not None:
+        with running("depth") as progress:
+            away = frames_depth(deep, numbers, frames, progress)
+        reach = scale_of(away)
+        write_page(depths, lay_out(encoded_depth(away, reach), rows_of_cells, columns, padding, ZERO))
     clipped = write_flipbook(paths, frames, layout, **placed)
     if shader:
-        placed["motion"] = scale
+        placed |= {"motion": scale, "depth": reach}
         hot = any(frame.emission is not None for frame in frames)
         for language in ("glsl", "hlsl", "msl", "wgsl"):
             text = smoke_shader(language, layout, **placed, count=len(frames), size=(height, width), hot=hot)
@@ -380,12 +396,16 @@ def flipbook(
         rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(names))
     if scale is not None:
         rows.add_row(escape(str(moving)), f"{moving.stat().st_size:,}", "right up")
+    if reach is not None:
+        rows.add_row(escape(str(depths)), f"{depths.stat().st_size:,}", "depth")
     rows.add_section()
     around = f", {padding} around each" if padding else ""
     rows.add_row("frames", f"{len(frames):,}", f"{rows_of_cells} x {columns} cells of {width} x {height}{around}")
     rows.add_row("gain", f"{gain:.4g}", f"{clipped:,} numbers clipped")
     if scale is not None:
         rows.add_row("motion", f"{scale:.4g}", "of a frame, at most, to the next")
+    if reach is not None:
+        rows.add_row("depth", f"{reach:.4g}", "of a frame's height, at most, before or behind the billboard")
     show(rows)
 
 

@@ -8,7 +8,17 @@ import typer
 
 from wlm.cli.console import check_output, escape, exclusive, note, number, quiet_warp, running, show, table
 from wlm.cli.options import Seed, output_option
-from wlm.cli.smoke_options import SHEET, Input, SmokeOptions, outputs, place_and_colour, vector, with_smoke
+from wlm.cli.smoke_options import (
+    SHEET,
+    Albedo,
+    Input,
+    SmokeOptions,
+    given_albedo,
+    outputs,
+    place_and_colour,
+    vector,
+    with_smoke,
+)
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -27,9 +37,6 @@ _Points = Annotated[
     typer.Option("--point", metavar="X,Y,Z[:R,G,B]", help="A light's place and its intensity; repeat for more."),
 ]
 _Sky = Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")]
-_Albedo = Annotated[
-    str, typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, one number or three.")
-]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
 _White = Annotated[float, typer.Option(help="The light that becomes white.")]
 
@@ -49,7 +56,7 @@ def light(
     lights: _Lights = None,
     points: _Points = None,
     sky: _Sky = None,
-    albedo: _Albedo = "1",
+    albedo: Albedo = None,
     g: _G = 0.0,
     orders: Annotated[str, typer.Option(help="all: light that is scattered again too; single: once alone.")] = "all",
     model: Annotated[
@@ -72,7 +79,7 @@ def light(
         raise WlmError(f"--orders: expected all or single, got {orders!r}")
     if model is not None and orders == "single":
         raise WlmError("--model: expected --orders all beside it")
-    colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
+    colour, around = given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
     _check_white(white)
     own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
@@ -81,13 +88,12 @@ def light(
     from wlm.smoke.transport.filtering import load_orders, scatter
     from wlm.smoke.transport.lighting import light_smoke
     from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, to_bytes
-    from wlm.view.smoke_light import light_picture
+    from wlm.view.smoke import contact_sheet, light_picture, to_bytes
     from wlm_kernels.smoke.settings import March
 
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
-    lamps = own or _scene_lights(frames.scene)
+    lamps, colour = own or _scene_lights(frames.scene), colour or _scene_albedo(frames.scene)
     network = load_orders(model) if orders == "all" else None
     file = outputs(smoke, frames.single, output, "light", ".png")
     rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
@@ -130,7 +136,7 @@ def trace(
     lights: _Lights = None,
     points: _Points = None,
     sky: _Sky = None,
-    albedo: _Albedo = "1",
+    albedo: Albedo = None,
     g: _G = 0.0,
     samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths a pixel.")] = 64,
     orders: Annotated[
@@ -147,7 +153,7 @@ def trace(
     as well, which is grey. Obstacles of a scene absorb all light, and its background isn't drawn. An EXR has R, G and
     B, R.1, G.1 and B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
     """
-    colour, around = _albedo(albedo), None if sky is None else vector("--sky", sky)
+    colour, around = given_albedo(albedo), None if sky is None else vector("--sky", sky)
     _check_white(white)
     own = _lights(lights, points)
     quiet_warp()
@@ -160,6 +166,7 @@ def trace(
     frames = options.open(smoke)
     camera = options.camera(frames, orthographic=False, perspective=perspective)
     scene = frames.scene
+    colour = colour or _scene_albedo(scene)
     lamps = own or ([] if environment is not None else _scene_lights(scene))
     if frames.single:
         check_output(output, ".png", ".exr")
@@ -222,13 +229,6 @@ def _check_white(white: float) -> None:
         raise WlmError(f"--white: expected a number above 0, got {white}")
 
 
-def _albedo(text: str) -> tuple[float, float, float]:
-    values = vector("--albedo", text if "," in text else ",".join([text] * 3))
-    if not all(0 <= value <= 1 for value in values):
-        raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
-    return values
-
-
 def _checked(option: str, make: Callable[[], Any]) -> Any:
     """What is made of an option's values, or one line that names the option."""
     try:
@@ -267,3 +267,7 @@ def _scene_lights(scene: "Scene | None") -> "list[AnyLight]":
     from wlm.smoke.shading import Light
 
     return [Light((1.0, 1.0, 1.0))] if scene is None else [settings.light() for settings in scene.lights]
+
+
+def _scene_albedo(scene: "Scene | None") -> tuple[float, float, float]:
+    return (1.0, 1.0, 1.0) if scene is None else scene.smoke.albedo

@@ -25,6 +25,10 @@ SHEET = "sheet.png"
 SceneName = Annotated[
     str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
 ]
+Albedo = Annotated[
+    str | None,
+    typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, or one number; default the scene's."),
+]
 Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz, .nvdb or .vdb volume, or a folder of frames.")]
 
 
@@ -132,6 +136,16 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def given_albedo(text: str | None) -> tuple[float, float, float] | None:
+    """The numbers of `--albedo`, one for all colours or three; None: it isn't given."""
+    if text is None:
+        return None
+    values = vector("--albedo", text if "," in text else ",".join([text] * 3))
+    if not all(0 <= value <= 1 for value in values):
+        raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
+    return values
+
+
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> Callable[[int], Path]:
     """Checks where results go, a file or for frames a folder; returns the file of a frame, ready to be written."""
     from wlm.smoke.data import NumberedFiles
@@ -226,7 +240,7 @@ def write_lightmaps(
         camera: Before each.
         output: A file, or for frames a folder.
         make: Makes the lightmaps.
-        settings, resume: As for `march_frames`.
+        settings, resume: As for `march_frames`; with an "albedo" that isn't None the lightmaps have it already.
         errors: Whether they come with the error of their step.
     """
     from wlm.smoke.camera import axis_faults
@@ -237,6 +251,8 @@ def write_lightmaps(
 
     def write(frame: int, file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
         looks = frames.looks(frame)
+        if looks is not None and settings.get("albedo") is not None:
+            looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
         six = with_surface(make(volume, view), volume, looks)
         path = file()
         write_six_way(path, six, looks)

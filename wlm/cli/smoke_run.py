@@ -8,7 +8,7 @@ import typer
 
 from wlm.cli.console import check_output, exclusive, number, quiet_warp, running, show, table
 from wlm.cli.options import Device, Seed, output_option
-from wlm.cli.smoke_options import SceneName
+from wlm.cli.smoke_options import Albedo, SceneName, given_albedo
 from wlm.errors import WlmError
 
 _WARM = 2  # frames at the beginning that compile and fill caches, and don't count where there are others
@@ -30,12 +30,24 @@ def run(
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's.")
     ] = None,
+    orders: Annotated[
+        str | None,
+        typer.Option(
+            help="all: light that is scattered again too; single: once alone, by six-way lightmaps. Default all, or "
+            "single with --network."
+        ),
+    ] = None,
+    albedo: Albedo = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of all orders; default the one that comes with wlm.")
+    ] = None,
     step: Annotated[
         float | None,
         typer.Option(min=0.01, max=1000.0, help="Voxels, of the march; default 1/130 of the longest edge."),
     ] = None,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Make lightmaps by a network that train wrote.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Make six-way lightmaps by a network that train wrote."),
     ] = None,
     white: Annotated[float, typer.Option(help="The light that becomes white.")] = 1.0,
     seed: Seed = 0,
@@ -43,10 +55,21 @@ def run(
 ) -> None:
     """Simulate a scene, light it and draw it, frame by frame, without a file between.
 
-    The table has the median time of each stage; on a GPU the light of a frame becomes one graph after a few frames.
+    Its lights and its fire light the smoke with light of all orders of scattering. The table has the median time of
+    each stage; on a GPU the light of a frame becomes one graph after a few frames.
     """
     if not 0 < white < float("inf"):
         raise WlmError(f"--white: expected a number above 0, got {white}")
+    orders = orders or ("all" if network is None else "single")
+    if orders not in ("all", "single"):
+        raise WlmError(f"--orders: expected all or single, got {orders!r}")
+    if orders == "single" and model is not None:
+        raise WlmError("--model: expected --orders all beside it")
+    if orders == "all" and network is not None:
+        raise WlmError("--network: expected --orders single beside it: it makes six-way lightmaps")
+    if orders == "all" and seed:
+        raise WlmError("--seed: expected --orders single beside it: of all orders nothing is drawn at random")
+    colour = given_albedo(albedo)
     if network is not None and step is not None:
         raise WlmError("--step: expected no --network beside it: a network looks as it was trained to")
     film_file = output.suffix.lower() == ".mp4"
@@ -58,8 +81,9 @@ def run(
     from wlm.smoke.data import NumberedFiles
     from wlm.smoke.prediction import SmokePredictor
     from wlm.smoke.scene import load_scene
+    from wlm.smoke.transport.filtering import load_orders
     from wlm.view.atlas import save_png
-    from wlm.view.smoke_run import Lighting, write_all
+    from wlm.view.smoke_run import AllOrders, SixWays, write_all
     from wlm.view.smoke_run import run as frames_of
 
     device = check_device(device)
@@ -67,10 +91,15 @@ def run(
     if scale != 1.0:
         scene = scene.scaled(scale)
     camera = scene.camera if resolution is None else scene.camera.model_copy(update={"resolution": resolution})
-    if camera.perspective:
+    if camera.perspective and orders == "single":
         raise WlmError(f"{scene_name}: camera.perspective: expected false for six-way lightmaps, found true")
     scene = scene.model_copy(update={"camera": camera, "frames": frames or scene.frames})
-    lighting = Lighting(step, None if network is None else SmokePredictor(network, device), seed)
+    if colour is not None:
+        scene = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"albedo": colour})})
+    if orders == "all":
+        lighting = AllOrders(scene.smoke.albedo, load_orders(model), step)
+    else:
+        lighting = SixWays(step, None if network is None else SmokePredictor(network, device), seed)
     with running("run", unit="frame") as progress:
         made = frames_of(scene, lighting, white=white, device=device, progress=progress)
         if film_file:

@@ -82,15 +82,15 @@ def frames_motion(
         carried = wp.array(mean, dtype=wp.vec3, device=wp.device_from_torch(volume.device))
         # Forward: where the smoke of this frame will be, and not where that of the next was.
         moved = -motion(volume, carried, six.camera, reach=-float(apart)).cpu()
-        moved = _spread(moved, (moved != 0).any(0).float())
+        moved = spread_out(moved, (moved != 0).any(0).float())
         moved /= torch.tensor([six.camera.width, six.camera.height])[:, None, None]
         found.append(_agreeing(moved, six, book[i + 1]) if i + 1 < len(book) else moved)
         meter.report(i + 1)
     return torch.stack(found)
 
 
-def _spread(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Fills [2, H, W] where its weight [H, W] is 0, from what is around: of means over larger and larger squares."""
+def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Fills [C, H, W] where its weight [H, W] is 0, from what is around: of means over larger and larger squares."""
     sums, weights = [values[None] * weight], [weight[None, None]]
     while max(sums[-1].shape[2:]) > 1:
         for parts in (sums, weights):

@@ -61,6 +61,8 @@ _Direction = Annotated[_Vector, AfterValidator(_directed)]
 _Positive = Annotated[float, Field(gt=0.0, le=_LARGEST)]
 _NotNegative = Annotated[float, Field(ge=0.0, le=_LARGEST)]
 _Colour = tuple[_NotNegative, _NotNegative, _NotNegative]
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+_Albedo = tuple[_Share, _Share, _Share]
 _Count = Annotated[int, Field(ge=1, le=4096)]
 _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
@@ -152,6 +154,7 @@ class Smoke(_Settings):
 
     Attributes:
         extinction: Per metre, of density 1.
+        albedo: R, G, B, the share of light that a scattering leaves.
         emission: Light given off per metre at temperature 1.
         dissipation, cooling: Rates of decay of density and temperature, per second: exp(-rate t) is left.
         buoyancy: Metres per second squared, upwards, at temperature 1.
@@ -162,6 +165,7 @@ class Smoke(_Settings):
     """
 
     extinction: _Positive = 10.0
+    albedo: _Albedo = (1.0, 1.0, 1.0)
     emission: _NotNegative = 0.0
     dissipation: _NotNegative = 0.0
     cooling: _NotNegative = 0.0
@@ -322,13 +326,14 @@ class Looks(_Settings):
 
     Attributes:
         lights, background: As of a scene.
-        glow: As of a scene's smoke.
+        albedo, glow: As of a scene's smoke; lightmaps that have light of all orders have their albedo already.
         obstacles: As of a scene.
         time: Of the obstacles, seconds.
     """
 
     lights: tuple[LightSettings, ...]
     background: _Colour = (0.0, 0.0, 0.0)
+    albedo: _Albedo = (1.0, 1.0, 1.0)
     glow: _Glow = ()
     obstacles: tuple[ObstacleSettings, ...] = Field((), max_length=255)
     time: _Number = 0.0
@@ -386,7 +391,7 @@ class Scene(_Settings):
     def looks(self, frame: int) -> Looks:
         """What a picture of a frame shows."""
         parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
-        return Looks(**parts, glow=self.smoke.glow, time=self.time(frame))
+        return Looks(**parts, albedo=self.smoke.albedo, glow=self.smoke.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:
         """The same scene on a grid of a multiple of its cells along each axis, rounded; no axis gets fewer than one.

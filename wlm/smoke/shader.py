@@ -1,4 +1,4 @@
-"""The shader of a six-way flip book: where a frame lies, its light from a direction, its motion to the next frame."""
+"""The shader of a six-way flip book: where a frame lies, its light from a direction or a point, its motion."""
 
 from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
@@ -11,6 +11,8 @@ _TEXT = """\
 // Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
 //
 //     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
+//     and over lights at a point, of way = wlm_smoke_point(place, size, depth, position, radius),
+//             of intensity / (4 pi) * way.w * wlm_smoke_light(first, second, way.xyz)
 //     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
 
 // The texture's coordinates of a frame, from 0 on, at a place on the billboard: (0, 0) its top left, (1, 1) its bottom
@@ -35,6 +37,18 @@ float wlm_smoke_light(vec4 first, vec4 second, vec3 toward)
     return (toward.x * toward.x * x + toward.y * toward.y * y + toward.z * toward.z * z) * {factor};
 }}
 
+// Of a light at a point the direction from the smoke at a place, of length 1, and the falloff, its irradiance there
+// over its intensity: an engine's own may stand for that. The size is the billboard's width and height; the position is
+// from its middle, x to its right, y up, z to the viewer, in the unit of the size; within the radius, in that unit too,
+// the falloff is as at it. The depth is how far the smoke lies before the billboard, in its heights: 0 is flat.
+vec4 wlm_smoke_point(vec2 place, vec2 size, float depth, vec3 position, float radius)
+{{
+    vec3 smoke = vec3((place.x - 0.5) * size.x, (0.5 - place.y) * size.y, depth * size.y);
+    vec3 way = position - smoke;
+    float far = max(dot(way, way), {nearest});
+    return vec4(way / sqrt(far), 1.0 / max(far, radius * radius));
+}}
+
 float wlm_smoke_alpha(vec4 first, vec4 second)
 {{
     return {alpha};
@@ -50,6 +64,14 @@ float wlm_smoke_emission(vec4 first, vec4 second)
 float wlm_smoke_level(float texels)
 {{
     return clamp(log2(max(texels, 1.0)), 0.0, {levels:.1f});
+}}
+"""
+
+_DEPTH = """
+// The depth for wlm_smoke_point, of the depth texture's texel at wlm_smoke_uv; that is linear too.
+float wlm_smoke_depth(vec4 texel)
+{{
+    return (texel.x - {zero}) * {reach};
 }}
 """
 
@@ -81,6 +103,8 @@ vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
 }}
 """
 
+_NEAREST = 1e-12  # squared distance to a light below which it counts the same
+
 
 def smoke_shader(
     language: str,
@@ -94,6 +118,7 @@ def smoke_shader(
     gain: float = 1.0,
     hot: bool = True,
     motion: float | None = None,
+    depth: float | None = None,
 ) -> str:
     """Writes the shader of a flip book.
 
@@ -105,7 +130,7 @@ def smoke_shader(
         padding: Pixels around it.
         gain: The factor on the light in the textures.
         hot: Whether they have a channel of emission.
-        motion: The scale of its motion texture; None: it has none.
+        motion, depth: The scales of its textures of motion and of depth; None: it has none.
 
     Raises:
         ValueError: No such language or layout.
@@ -131,11 +156,14 @@ def smoke_shader(
         share_x=_literal(size[1] / width),
         share_y=_literal(size[0] / height),
         factor=_literal(1.0 / gain),
+        nearest=_literal(_NEAREST),
         levels=mip_levels(*size, padding),
         alpha=alpha,
         emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
         **places,
     )
+    if depth is not None:
+        text += _DEPTH.format(zero=_literal(ZERO), reach=_literal(2.0 * depth))
     if motion is not None:
         text += _MOTION.format(zero=_literal(ZERO), reach=_literal(2.0 * motion))
     return translate(text, language)

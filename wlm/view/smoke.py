@@ -16,6 +16,8 @@ from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings
 from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.transport.filtering import ScatteredSmoke
+from wlm.smoke.transport.lighting import LitSmoke
 from wlm.view.atlas import encode, save_png
 from wlm.view.smoke_drawing import Drawing
 
@@ -72,6 +74,7 @@ def picture(
     six: SixWay,
     lights: Sequence[Light],
     *,
+    albedo: Sequence[float] = (1.0, 1.0, 1.0),
     background: Sequence[float] = (0.0, 0.0, 0.0),
     ramp: Ramp | None = None,
     obstacles: Sequence[ObstacleSettings] = (),
@@ -86,6 +89,7 @@ def picture(
     Args:
         six: Lightmaps with their camera and transparency; with obstacles, with their depth too.
         lights: Any number.
+        albedo: R, G, B, the share of light that a scattering leaves.
         background: A linear colour.
         ramp: Colour of the emission.
         obstacles: They are drawn, and cast shadows on the smoke's surface.
@@ -100,10 +104,39 @@ def picture(
     """
     if six.camera is None:
         raise ValueError("six: expected lightmaps with their camera")
-    options = {"background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
+    options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
     drawing = Drawing(six.camera, lights, **options, device=device_name(six.lightmaps.device))
     drawing.move(time)
     return drawing(six)
+
+
+def light_picture(
+    smoke: LitSmoke | ScatteredSmoke,
+    *,
+    albedo: Sequence[float] = (1.0, 1.0, 1.0),
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    ramp: Ramp | None = None,
+    obstacles: Sequence[ObstacleSettings] = (),
+    time: float = 0.0,
+) -> torch.Tensor:
+    """Puts smoke that its own lights light and a scene's obstacles into one picture, as `picture` does.
+
+    Args:
+        smoke: Light scattered once, or of all orders, which has its albedo already.
+        albedo: R, G, B of light scattered once.
+        background: A linear colour.
+        ramp: Colour of the emission.
+        obstacles: They are drawn, and keep directional lights off the smoke's surface.
+        time: Of the obstacles, seconds.
+
+    Returns:
+        float32 [H, W, 3], linear.
+    """
+    lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
+    options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles}
+    drawing = Drawing(lit.camera, lit.lights, **options, device=device_name(lit.transparency.device))
+    drawing.move(time)
+    return drawing(smoke)
 
 
 def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:

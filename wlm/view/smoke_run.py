@@ -5,8 +5,10 @@ has a graph of its own.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -20,13 +22,15 @@ from wlm.smoke.prediction import SmokePredictor
 from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
+from wlm.smoke.transport.filtering import OrdersModel, ScatteredSmoke, scatter
+from wlm.smoke.transport.lights import AnyLight
 from wlm.system import Meter, OnProgress
 from wlm.view.smoke import to_bytes
 from wlm.view.smoke_drawing import Drawing
 from wlm_kernels.smoke.settings import March
 
-SIMULATION, LIGHTMAPS, DRAWING, GRAPH, BYTES = "simulation", "lightmaps", "shadows and picture", "one graph", "bytes"
-"""Stages of a frame. A graph is of the lightmaps and the picture; it is measured beside them, which come before it."""
+SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"
+"""Stages of a frame, beside a lighting's own. A graph is of that and the picture; it is measured after them."""
 
 MARCH = 130
 """Steps of the march along the longest edge, where none are given."""
@@ -35,27 +39,63 @@ _STAGED = 4  # frames of which each stage is measured before a graph takes over
 _SURFACE = March(step=2.0, jitter=0.0)  # of the depth at which shadows fall, where a network makes the lightmaps
 
 
+class Lighting(ABC):
+    """How the smoke of a frame is lit, and what its stage is called."""
+
+    stage: ClassVar[str]
+    in_graph = True
+    """Whether nothing in it waits for the device, so that a graph may capture it."""
+
+    @abstractmethod
+    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
+        """Lights it, on the smoke's device, with the depth of its surface."""
+
+
 @dataclass(frozen=True)
-class Lighting:
-    """How the lightmaps of a frame are made.
+class AllOrders(Lighting):
+    """Light of all orders of each light itself, and of fire.
+
+    Attributes:
+        albedo: R, G, B, the share of light that a scattering leaves.
+        model: The filter and its network; None: those that come with wlm.
+        step: Of the march, in voxels; None: that of `orders_march`.
+    """
+
+    albedo: Sequence[float] = (1.0, 1.0, 1.0)
+    model: OrdersModel | None = None
+    step: float | None = None
+    stage = "light of all orders"
+
+    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> ScatteredSmoke:
+        march = None if self.step is None else March(step=self.step, jitter=0.0)
+        return scatter(volume, camera, lights, self.albedo, march=march, model=self.model)
+
+
+@dataclass(frozen=True)
+class SixWays(Lighting):
+    """Light scattered once, by six-way lightmaps, as an engine shows it.
 
     Attributes:
         step: Of the march, in voxels; None: 1 / `MARCH` of the longest edge.
-        network: Makes them in place of the march; None: the march.
+        network: Makes the lightmaps in place of the march; None: the march.
         seed: Of the march's jitter.
     """
 
     step: float | None = None
     network: SmokePredictor | None = None
     seed: int = 0
+    stage = "lightmaps"
 
-    def __call__(self, volume: DensityVolume, camera: Camera, surface: bool) -> SixWay:
-        """Makes them, on the smoke's device; with the depth of the smoke's surface if it is asked for."""
+    @property
+    def in_graph(self) -> bool:
+        return self.network is None
+
+    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay:
         if self.network is None:
             longest = max(volume.shape)
             return march(volume, camera, March(longest / MARCH if self.step is None else self.step, seed=self.seed))
         six = self.network(volume, camera, self.seed)
-        return replace(six, depth=guide(volume, camera, _SURFACE).depth) if surface else six
+        return replace(six, depth=guide(volume, camera, _SURFACE).depth)
 
 
 @dataclass
@@ -75,7 +115,7 @@ class Frame:
 
 def run(
     scene: Scene,
-    lighting: Lighting = Lighting(),
+    lighting: Lighting | None = None,
     *,
     white: float = 1.0,
     device: str = "cpu",
@@ -84,8 +124,8 @@ def run(
     """Simulates a scene and draws each of its frames.
 
     Args:
-        scene: The scene; its camera is orthographic.
-        lighting: How lightmaps are made.
+        scene: The scene; for six ways its camera is orthographic.
+        lighting: How its smoke is lit; None: with light of all orders, of the scene's albedo.
         white: The light that becomes white.
         device: As `wlm.interop.check_device` returns it.
         progress: Called after each frame.
@@ -94,18 +134,19 @@ def run(
         The frames. Each stage waits for the device, so that its time is its own.
 
     Raises:
-        ValueError: The camera is in perspective.
+        ValueError: The camera is in perspective, for six ways.
         WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; the air blew up.
     """
+    lighting = AllOrders(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
     camera = make_camera(scene.camera, scene.grid.origin, scene.grid.size)
-    looks = scene.looks(1)
+    looks, lights = scene.looks(1), [light.light() for light in scene.lights]
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
-    drawing = Drawing(camera, [light.light() for light in looks.lights], **parts, device=device)
+    drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
     graph = None
-    if lighting.network is None and device != "cpu":
+    if lighting.in_graph and device != "cpu":
         # Frames before have loaded the kernels.
-        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, True)), device, warmup=1)
+        graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
         clock = _Clock(device)
@@ -118,9 +159,9 @@ def run(
             graph(volume)
             clock.stop(GRAPH)
         else:
-            six = lighting(volume, camera, bool(scene.obstacles))
-            clock.stop(LIGHTMAPS)
-            drawing(six)
+            made = lighting(volume, camera, lights)
+            clock.stop(lighting.stage)
+            drawing(made)
             clock.stop(DRAWING)
         pixels = to_bytes(drawing.image, white)
         clock.stop(BYTES)

@@ -1,6 +1,7 @@
-"""Pictures of smoke from its lightmaps: solid obstacles, and the smoke's light over them. Nothing is read back.
+"""Pictures of smoke from lightmaps, or from light of each lamp: solid obstacles, and the smoke's light over them.
 
-All light is linear. `wlm.smoke.lightmaps.SixWay.shade` is the same in torch, without obstacles.
+Nothing is read back. All light is linear. `wlm.smoke.lightmaps.SixWay.shade` and
+`wlm.smoke.transport.lighting.LitSmoke.compose` are the same in torch, without obstacles.
 """
 
 from dataclasses import dataclass
@@ -31,13 +32,13 @@ class Solids:
 
 @dataclass(frozen=True)
 class Lamps:
-    """Directional lights on a device, at least one array's worth of room even where there is none.
+    """Lights on a device, at least one array's worth of room even where there is none.
 
     Attributes:
         count: Of the lights.
-        toward: vec3 [L], directions to them in the world, of length 1.
-        irradiance: vec3 [L].
-        weights: float [L, 6], of the lightmaps.
+        toward: vec3 [L], directions to them in the world, of length 1; of a point light 0, which lights no obstacle.
+        irradiance: vec3 [L], of a point light its intensity.
+        weights: float [L, 6], of the lightmaps; of a point light 0.
         visibility: float [L, H, W], the share of each that reaches the smoke.
     """
 
@@ -125,17 +126,82 @@ def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count:
 
 
 @wp.kernel
+def _glow_of(
+    # in:
+    emission: wp.array2d(dtype=float),
+    stops: wp.array(dtype=float),
+    colours: wp.array(dtype=wp.vec3),
+    count: int,
+    # out:
+    glow: wp.array2d(dtype=wp.vec3),
+):
+    i, j = wp.tid()
+    glow[i, j] = _glow(stops, colours, count, emission[i, j])
+
+
+@wp.func
+def _behind(
+    i: int,
+    j: int,
+    background: wp.vec3,
+    solids: int,
+    surface: wp.array2d(dtype=float),
+    solid_light: wp.array2d(dtype=wp.vec3),
+    solid_depth: wp.array2d(dtype=float),
+) -> wp.vec4:
+    """What is behind the smoke, and whether it is before it."""
+    if solids != 0 and solid_depth[i, j] < wp.inf:
+        light = solid_light[i, j]
+        return wp.vec4(light[0], light[1], light[2], wp.where(solid_depth[i, j] < surface[i, j], 1.0, 0.0))
+    return wp.vec4(background[0], background[1], background[2], 0.0)
+
+
+@wp.kernel
 def _compose(
     # in:
     lightmaps: wp.array3d(dtype=float),
     transparency: wp.array2d(dtype=float),
-    emission: wp.array2d(dtype=float),
+    glow: wp.array2d(dtype=wp.vec3),
     hot: int,
-    stops: wp.array(dtype=float),
-    glow: wp.array(dtype=wp.vec3),
     lights: int,
     irradiance: wp.array(dtype=wp.vec3),
     weights: wp.array2d(dtype=float),
+    visibility: wp.array3d(dtype=float),
+    albedo: wp.vec3,
+    background: wp.vec3,
+    solids: int,
+    surface: wp.array2d(dtype=float),
+    solid_light: wp.array2d(dtype=wp.vec3),
+    solid_depth: wp.array2d(dtype=float),
+    # out:
+    image: wp.array2d(dtype=wp.vec3),
+):
+    i, j = wp.tid()
+    behind = _behind(i, j, background, solids, surface, solid_light, solid_depth)
+    if behind[3] > 0.0:
+        image[i, j] = wp.vec3(behind[0], behind[1], behind[2])
+        return
+    scattered = wp.vec3(0.0, 0.0, 0.0)
+    for lamp in range(lights):
+        grey = float(0.0)
+        for way in range(6):
+            grey += weights[lamp, way] * lightmaps[way, i, j]
+        scattered += (grey * visibility[lamp, i, j] / (4.0 * wp.pi)) * irradiance[lamp]
+    total = transparency[i, j] * wp.vec3(behind[0], behind[1], behind[2]) + wp.cw_mul(albedo, scattered)
+    if hot != 0:
+        total += glow[i, j]
+    image[i, j] = total
+
+
+@wp.kernel
+def _compose_lights(
+    # in:
+    planes: wp.array3d(dtype=wp.vec3),
+    transparency: wp.array2d(dtype=float),
+    glow: wp.array2d(dtype=wp.vec3),
+    hot: int,
+    lights: int,
+    irradiance: wp.array(dtype=wp.vec3),
     visibility: wp.array3d(dtype=float),
     background: wp.vec3,
     solids: int,
@@ -146,20 +212,15 @@ def _compose(
     image: wp.array2d(dtype=wp.vec3),
 ):
     i, j = wp.tid()
-    behind = background
-    if solids != 0 and solid_depth[i, j] < wp.inf:
-        behind = solid_light[i, j]
-        if solid_depth[i, j] < surface[i, j]:
-            image[i, j] = behind
-            return
-    total = transparency[i, j] * behind
+    behind = _behind(i, j, background, solids, surface, solid_light, solid_depth)
+    if behind[3] > 0.0:
+        image[i, j] = wp.vec3(behind[0], behind[1], behind[2])
+        return
+    total = transparency[i, j] * wp.vec3(behind[0], behind[1], behind[2])
     for lamp in range(lights):
-        grey = float(0.0)
-        for way in range(6):
-            grey += weights[lamp, way] * lightmaps[way, i, j]
-        total += (grey * visibility[lamp, i, j] / (4.0 * wp.pi)) * irradiance[lamp]
+        total += wp.cw_mul((visibility[lamp, i, j] / (4.0 * wp.pi)) * planes[lamp, i, j], irradiance[lamp])
     if hot != 0:
-        total += _glow(stops, glow, wp.where(hot > 1, stops.shape[0], 0), emission[i, j])
+        total += glow[i, j]
     image[i, j] = total
 
 
@@ -193,9 +254,25 @@ def light_solids(
     wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
 
 
+def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp.array) -> None:
+    """Colours an emission.
+
+    Args:
+        emission: float [H, W].
+        ramp: Stops float [S] and their colours vec3 [S]; None: grey, as it is.
+        glow: vec3 [H, W], written.
+    """
+    # In place of what there isn't, arrays that aren't read.
+    stops, colours = ramp or (emission.flatten(), glow.flatten())
+    inputs = [emission, stops, colours, 0 if ramp is None else stops.shape[0]]
+    wp.launch(_glow_of, emission.shape, inputs, [glow], device=glow.device)
+
+
 def compose(
-    planes: tuple[wp.array, wp.array, wp.array | None],
-    glow: tuple[wp.array, wp.array] | None,
+    lightmaps: wp.array,
+    transparency: wp.array,
+    glow: wp.array | None,
+    albedo: tuple[float, float, float],
     lamps: Lamps,
     background: tuple[float, float, float],
     solids: tuple[wp.array, wp.array, wp.array] | None,
@@ -204,19 +281,33 @@ def compose(
     """Puts the smoke's light over obstacles and a background.
 
     Args:
-        planes: Lightmaps float [6, H, W], transparency [H, W], and of hot smoke its emission [H, W].
-        glow: Stops float [S] and their colours vec3 [S]; None: grey.
+        lightmaps: float [6, H, W].
+        transparency: float [H, W].
+        glow: vec3 [H, W], the smoke's own light; None: it is cold.
+        albedo: R, G, B.
         lamps: The lights.
         background: A colour.
         solids: The smoke's surface float [H, W], and the obstacles' light and depth of `light_solids`; None: there are
             none.
         image: vec3 [H, W].
     """
-    lightmaps, transparency, emission = planes
-    hot = 0 if emission is None else 1 if glow is None else 2
-    # In place of what there isn't, arrays that aren't read.
-    stops, colours = glow or (transparency.flatten(), lamps.irradiance)
-    surface, light, depth = solids or (transparency, image, transparency)
-    inputs = [lightmaps, transparency, transparency if emission is None else emission, hot, stops, colours, lamps.count]
-    inputs += [lamps.irradiance, lamps.weights, lamps.visibility, wp.vec3(*background), int(solids is not None)]
-    wp.launch(_compose, image.shape, [*inputs, surface, light, depth], [image], device=image.device)
+    inputs = [lightmaps, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
+    inputs += [lamps.irradiance, lamps.weights, lamps.visibility, wp.vec3(*albedo), wp.vec3(*background)]
+    inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]
+    wp.launch(_compose, image.shape, inputs, [image], device=image.device)
+
+
+def compose_lights(
+    planes: wp.array,
+    transparency: wp.array,
+    glow: wp.array | None,
+    lamps: Lamps,
+    background: tuple[float, float, float],
+    solids: tuple[wp.array, wp.array, wp.array] | None,
+    image: wp.array,
+) -> None:
+    """`compose` of what smoke scatters of each lamp of irradiance, or intensity, 4 pi: vec3 [L, H, W]."""
+    inputs = [planes, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
+    inputs += [lamps.irradiance, lamps.visibility, wp.vec3(*background)]
+    inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]
+    wp.launch(_compose_lights, image.shape, inputs, [image], device=image.device)
