@@ -16,10 +16,10 @@ void wlm_smoke_texels(vec2 place, float time, float texels, out vec4 first, out 
 {{
     float frame = clamp(floor(time), 0.0, {last:.1f});
     float share = clamp(time - frame, 0.0, 1.0);
-    float level = wlm_smoke_level(texels);
+    float mip = wlm_smoke_level(texels);
 {between}
-    first = mix(textureLod(WLM_SMOKE_FIRST_MAP, early, level), textureLod(WLM_SMOKE_FIRST_MAP, late, level), share);
-    second = mix(textureLod(WLM_SMOKE_SECOND_MAP, early, level), textureLod(WLM_SMOKE_SECOND_MAP, late, level), share);
+    first = mix(textureLod(WLM_SMOKE_FIRST_MAP, early, mip), textureLod(WLM_SMOKE_FIRST_MAP, late, mip), share);
+    second = mix(textureLod(WLM_SMOKE_SECOND_MAP, early, mip), textureLod(WLM_SMOKE_SECOND_MAP, late, mip), share);
 }}
 
 // The light that the smoke throws to the viewer under a light of an irradiance, as of `toward` of wlm_smoke_light.
@@ -62,9 +62,9 @@ _FADE = """\
     vec2 late = wlm_smoke_uv(place, frame + 1.0);"""
 # The motion of what is here at this time, which was elsewhere in the first frame.
 _MOVE = """\
-    vec4 here = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(place, frame), level);
+    vec4 here = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(place, frame), mip);
     vec2 start = wlm_smoke_before(place, wlm_smoke_motion(here), share);
-    vec4 there = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(start, frame), level);
+    vec4 there = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(start, frame), mip);
     vec2 way = wlm_smoke_motion(there);
     vec2 early = wlm_smoke_uv(wlm_smoke_before(place, way, share), frame);
     vec2 late = wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0);"""
