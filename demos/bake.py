@@ -26,11 +26,12 @@ from wlm.view.sheet import before_after_error
 
 HERE = Path(__file__).resolve().parent
 ROOM, DATA = HERE / "cornell" / "room.yaml", HERE / "data" / "cornell"
-STEPS, SAMPLES, VIEWS = 1500, 2048, 6
+STEPS, SAMPLES, VIEWS = 600, 1024, 4
 KEY = "20"  # of the probes: the lamp is lit
 
-LEAST_DB = {"psnr": 0.0, "seen": 0.0}  # of the lightmaps' `Report`
-LEAST_PROBES_DB = 0.0
+# On the CPU seed 0 gave 44.8 dB, 46.7 as seen, and probes of 50.0 dB.
+LEAST_DB = {"psnr": 43.3, "seen": 45.0}  # of the lightmaps' `Report`
+LEAST_PROBES_DB = 49.0
 MOST_DIFFERENCE = 0.02  # of a new bake's mean light at an hour
 
 
