@@ -10,6 +10,7 @@ demo: $(STAMP)
 	$(BIN)/python demos/lightmap.py
 	$(BIN)/python demos/atlas.py
 	$(BIN)/python demos/probe.py
+	$(BIN)/python demos/bake.py
 	$(BIN)/python demos/smoke.py
 	$(BIN)/python demos/smoke_light.py
 	$(BIN)/python demos/smoke_network.py

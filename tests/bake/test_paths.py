@@ -1,6 +1,10 @@
-"""Light by Mitsuba against what theory says; without the extra `bake` and LLVM these are skipped."""
+"""Light by Mitsuba against what theory says; without the extra `bake` and LLVM these are skipped.
+
+WLM_BAKE_DEVICE=cuda runs them on the first GPU, which needs no LLVM.
+"""
 
 import math
+import os
 import shutil
 import sys
 from dataclasses import replace
@@ -20,8 +24,10 @@ from wlm.bake.work import open_checkpoint, open_task
 from wlm.errors import WlmError
 from wlm.lightmap.layers.data import load as load_layers
 
+DEVICE = os.environ.get("WLM_BAKE_DEVICE", "cpu")
+
 try:
-    start()
+    start(DEVICE)
 except WlmError as error:
     pytest.skip(str(error), allow_module_level=True)
 
@@ -152,7 +158,7 @@ def test_a_directional_bake_is_a_set_with_layers(tmp_path):
         " lamps: [{position: [0.3, 2, 0.2], intensity: [9, 9, 9]}]}"
     )
     task = open_task(tmp_path / "floor.yaml", directional=True)
-    baked = bake_lightmaps(task)
+    baked = bake_lightmaps(task, device=DEVICE)
     write_lightmaps(tmp_path / "set", task, baked)
     read = load_layers(tmp_path / "set")
     light, toward = (read.sheets[sheet].frames[0] for sheet in read.sheets if sheet.channels == ("R", "G", "B"))
@@ -190,22 +196,23 @@ def test_a_bake_goes_on_where_it_was_stopped(tmp_path):
         " lamps: [{material: lamp, radiance: [9, 9, 9], lit: [18, 23]}]}"
     )
     task, output = open_task(path), tmp_path / "set"
-    whole = bake_lightmaps(task)
+    whole = bake_lightmaps(task, device=DEVICE)
 
     def stop(progress):
         if progress.done > 100:  # the first hour is kept by now
             raise KeyboardInterrupt
 
+    checkpoint = open_checkpoint(output, task, "lightmaps", DEVICE)
     with pytest.raises(KeyboardInterrupt):
-        bake_lightmaps(task, checkpoint=open_checkpoint(output, task, "lightmaps", "cpu"), progress=stop)
-    again = open_checkpoint(output, task, "lightmaps", "cpu", resume=True)
+        bake_lightmaps(task, device=DEVICE, checkpoint=checkpoint, progress=stop)
+    again = open_checkpoint(output, task, "lightmaps", DEVICE, resume=True)
     assert again.resumed
-    resumed = bake_lightmaps(task, checkpoint=again)
+    resumed = bake_lightmaps(task, device=DEVICE, checkpoint=again)
     assert (resumed.light == whole.light).all() and (resumed.noise == whole.noise).all()
     # What lies under the boxes is within them, and has its neighbours' light.
     hidden = whole.back > 0.5
     assert hidden.any() and not whole.mask[hidden].any() and (whole.light[1, hidden].max(-1) > 0).all()
-    probes = bake_probes(task)
+    probes = bake_probes(task, device=DEVICE)
     inside = (np.abs(probes.position - [0.8, 0.4, 0.4]) < [0.2, 0.3, 0.2]).all(1)
     assert probes.values[1][~inside].any() and probes.values.shape == (2, len(probes.position), 9, 3)
 
@@ -214,10 +221,10 @@ def test_a_lamp_of_no_material_is_refused(tmp_path):
     shutil.copytree(ROOM, tmp_path / "room")
     path = tmp_path / "room" / "room.yaml"
     path.write_text("{geometry: room.gltf, lamps: [{material: bulb}]}")
+    task = open_task(path)
+    task = replace(task, scene=task.scene.model_copy(update={"probes": ProbeSettings()}))
     with pytest.raises(WlmError, match="room.yaml: lamps.0.material: expected one of box, green, lamp, red, white"):
-        bake_probes(
-            replace(open_task(path), scene=open_task(path).scene.model_copy(update={"probes": ProbeSettings()}))
-        )
+        bake_probes(task, device=DEVICE)
 
 
 def test_a_texture_lies_as_gltf_says():
@@ -238,4 +245,4 @@ def test_the_filter_is_named_where_it_is_missing(monkeypatch):
     task = open_task(ROOM / "room.yaml")
     assert task.scene.denoise
     with pytest.raises(WlmError, match="pyoidn is missing"):
-        bake_lightmaps(task)
+        bake_lightmaps(task, device=DEVICE)

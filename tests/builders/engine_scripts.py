@@ -85,14 +85,14 @@ class Script:
 
 def pixels_of(file):
     """A picture as Unreal has it: of bytes levels from 0 to 1."""
-    if file.endswith(".tga"):
+    if file.endswith((".tga", ".png")):
         return np.asarray(Image.open(file).convert("RGBA"))
     pixels, _ = read_exr(file)
     return np.pad(pixels, ((0, 0), (0, 0), (0, 4 - pixels.shape[2])))
 
 
-def node_gives(code, inputs, size, place, bound, folder, numbers=None):
-    """What a Custom node gives, float32 [*size, 3].
+def node_gives(code, inputs, size, place, bound, folder, numbers=None, channels=3):
+    """What a Custom node gives, float32 [*size, channels].
 
     Args:
         code, inputs: Of `Script.customs`.
@@ -101,6 +101,7 @@ def node_gives(code, inputs, size, place, bound, folder, numbers=None):
         bound: Textures by name; `points` is for the place alone.
         folder: For what the compiler reads and writes.
         numbers: The other inputs by name, declarations in HLSL.
+        channels: 3 or 4.
     """
     numbers = numbers or {}
     structure, _, body = code.partition("WlmNode wlm;")
@@ -110,5 +111,10 @@ def node_gives(code, inputs, size, place, bound, folder, numbers=None):
     declared += "".join(f"SamplerState {name}Sampler;\n" for name in textures if f"{name}Sampler" in body)
     constants = "".join(f"{each};\n" for each in numbers.values())
     # A structure within a function is beyond glslang.
-    text = f"{declared}{structure}float3 wlm_custom(float2 UV, int2 pixel)\n{{\n{constants}WlmNode wlm;{body}\n}}\n"
-    return run_hlsl(text, f"float4(wlm_custom({place}, pixel), 1.0)", size, bound, folder)[..., :3]
+    # Nor has a compute shader derivatives.
+    flat = "#define ddx(a) float2(0.0, 0.0)\n#define ddy(a) float2(0.0, 0.0)\n"
+    head = f"{flat}{declared}{structure}float{channels} wlm_custom(float2 UV, int2 pixel)"
+    text = f"{head}\n{{\n{constants}WlmNode wlm;{body}\n}}\n"
+    called = f"wlm_custom({place}, pixel)"
+    whole = called if channels == 4 else f"float4({called}, 1.0)"
+    return run_hlsl(text, whole, size, bound, folder)[..., :channels]

@@ -15,6 +15,8 @@ from builders.atlas_models import random_model as random_atlas
 from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
+from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames
+from builders.smoke_books import shown as shown_book
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
@@ -35,6 +37,7 @@ from wlm.probe.volume import Volume
 from wlm.probe.volume_export import export_volume
 from wlm.probe.volume_shader import volume_glsl
 from wlm.shading import LANGUAGES, translate
+from wlm.smoke.billboard import billboard_shader
 from wlm.smoke.camera import LAYOUTS, Camera
 from wlm.smoke.exporter import lay_out, pack
 from wlm.smoke.flipbook_depth import encoded_depth, from_point
@@ -328,6 +331,26 @@ vec4 shown(ivec2 pixel)
     return Subject(text, main, np.float32(np.column_stack(columns))[None], bound, "", 2e-5)
 
 
+def billboard(_) -> Subject:
+    """What `shade` shows of a flip book with motion and fire, at a place in each pixel, at and between frames."""
+    frames = random_frames()
+    book = random_book(frames, moving=True)
+    times = (0.0, 1.5, 3.25)
+    expected = np.concatenate([shown_book(frames, book, time) for time in times])
+    main = f"""
+vec4 shown(ivec2 pixel)
+{{
+    vec2 place = (vec2(float(pixel.x), float(pixel.y % 12)) + vec2(0.5, 0.5)) / vec2(16.0, 12.0);
+    float time = pixel.y < 12 ? {times[0]} : pixel.y < 24 ? {times[1]} : {times[2]};
+    return wlm_smoke_pixel(place, time, 1.0, vec3{TOWARD}, vec3{IRRADIANCE}, vec3{SKY});
+}}
+"""
+    levels = {f"wlm_smoke_{name}_map": np.uint8(np.rint(page * 255.0)) for name, page in book.pages.items()}
+    full = {name: np.pad(page, ((0, 0), (0, 0), (0, 4 - page.shape[2]))) for name, page in levels.items()}
+    # Eight bits of each of the textures, and of a filter's place between two texels.
+    return Subject(billboard_shader(book), main, np.float32(expected), full, "", 1.6 / 255)
+
+
 def volume(folder) -> Subject:
     random = np.random.default_rng(0)
     position = random.uniform(-1, 1, (400, 3)) * [9.0, 1.0, 9.0] + [4000.0, -30.0, 0.0]
@@ -427,6 +450,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "scene apart": partial(scene, True, False, True),
     "smoke motion": smoke_motion,
     "smoke point": smoke_point,
+    "smoke billboard": billboard,
     **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
     "volume": volume,
     "probes": probes,
@@ -492,6 +516,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
         "atlas mips",
         "scene",
         "smoke unity",
+        "smoke billboard",
         "volume",
         "probes",
         "probes of a transform",

@@ -63,6 +63,14 @@ def serve():
         def log_message(self, *words: object) -> None:
             """Says nothing."""
 
+        def do_GET(self) -> None:
+            """Chromium with a window asks for a page's icon, and calls its lack an error."""
+            if self.path == "/favicon.ico":
+                self.send_response(204)
+                self.end_headers()
+                return
+            super().do_GET()
+
     def start(folder: Path) -> str:
         (folder / "three").symlink_to(Path(THREE).resolve(), target_is_directory=True)
         server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))

@@ -1,4 +1,4 @@
-"""`wlm smoke`: make samples, train the network that lightmaps come from, use it, measure it, export it."""
+"""`wlm smoke`: make samples, train the network that lightmaps come from, use it, measure it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +42,7 @@ _Network = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Adds the commands to `wlm smoke`."""
-    for command in (train, predict, evaluate, export, dataset):
+    for command in (train, predict, evaluate, dataset):
         app.command()(command)
 
 
@@ -181,29 +181,6 @@ def evaluate(
 
         smoke_report(html_path, network.stem, model, comparisons)
     _show_comparisons(network, comparisons)
-
-
-def export(
-    output: Annotated[Path, output_option("FILE.onnx", "The file to write.")],
-    network: _Network = None,
-    resolution: Annotated[int, typer.Option(min=1, max=16384, help="Pixels along the image's edges.")] = 512,
-) -> None:
-    """Write a network as ONNX: encoded guiding maps to encoded lightmaps, of one size, in float32."""
-    check_output(output, ".onnx")
-    quiet_warp()
-    from wlm.smoke import onnx_file
-    from wlm.smoke.codec import shipped
-    from wlm.smoke.planes import GUIDES, PLANES
-    from wlm.system import load
-
-    network = network or shipped()
-    model: SmokeModel = load(network, "smoke-network")
-    size = onnx_file.export(model, output, height=resolution, width=resolution)
-    rows = table(str(network), ["", "planes"], text=["planes"])
-    rows.add_row("guide", " ".join(GUIDES[model.settings.guide]))
-    rows.add_row("lightmaps", " ".join(PLANES))
-    rows.add_row(escape(str(output)), f"{size:,} bytes, {resolution} x {resolution} pixels")
-    show(rows)
 
 
 @exclusive

@@ -7,6 +7,7 @@ _PLACES = {
     "export_atlas": "wlm.engines.atlas",
     "export_lightmap": "wlm.engines.lightmap",
     "export_scene": "wlm.engines.scene",
+    "export_smoke": "wlm.engines.smoke",
 }
 
 __all__ = sorted(_PLACES)

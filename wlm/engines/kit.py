@@ -12,7 +12,8 @@ ENGINES = ("three", "godot", "unity", "unreal")
 
 README_FILE = "README.md"
 
-_MOST_SIDE = {"unreal": 8192, "godot": 16384}  # texels along a side of a picture that the editor imports
+# Texels along a side of a picture that the editor imports, or that WebGL2 has on most machines.
+_MOST_SIDE = {"unreal": 8192, "godot": 16384, "unity": 16384, "three": 16384}
 
 _MARK = re.compile(r"@(\w+)@")
 _SAMPLER = re.compile(
@@ -31,7 +32,7 @@ def filled(asset: str, **parts: str) -> str:
 
 
 def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
-    """Checks that an engine's editor imports a picture; `name` is the model's.
+    """Checks that an engine takes a picture; `name` is the model's.
 
     Raises:
         WlmError: It is too large.
@@ -47,12 +48,12 @@ def _whole(read: re.Match[str]) -> str:
     return f"{'uint' if count == 1 else f'uvec{count}'}({read[0]})"
 
 
-def godot_uniforms(text: str) -> str:
+def godot_uniforms(text: str, *, mips: bool = False) -> str:
     """Our GLSL as Godot's shading language has it: textures with hints, and none of whole numbers.
 
-    Of a table of whole numbers Godot has floats, which hold them exactly.
+    Of a table of whole numbers Godot has floats, which hold them exactly. With `mips` it reads those of the textures.
     """
-    hints = "filter_linear, repeat_disable"
+    hints = f"filter_linear{'_mipmap' * mips}, repeat_disable"
     whole = [match[1] for match in _SAMPLER.finditer(text) if match[2] == "usampler2D"]
 
     def declared(match: re.Match[str]) -> str:

@@ -44,6 +44,7 @@ _EXPORTS = _PROBE_EXPORTS | {
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
     "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
     "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
+    "wlm-smoke-engine": "six-way smoke for one engine: a flip book of it and its shader",
     "wlm-lightmap-layers-engine": "layered lightmaps over time for one engine: a folder for each sheet of light",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",

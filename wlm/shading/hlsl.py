@@ -61,8 +61,8 @@ class HlslWriter(Writer):
         whole = "int4" if texture.type == "sampler2DArray" else "int3"
         return f"{texture.name}.Load({whole}({self.write(place)}, 0))"
 
-    def filtered(self, texture: Variable, place: Node) -> str:
-        return f"{texture.name}.SampleLevel({self.linear}, {self.write(place)}, 0.0)"
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
+        return f"{texture.name}.SampleLevel({self.linear}, {self.write(place)}, {level})"
 
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
         return f"{texture.name}.SampleGrad({self.linear}, {place}, {dx}, {dy})"

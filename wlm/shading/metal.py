@@ -71,11 +71,11 @@ class MetalWriter(Writer):
             return f"{texture.name}.read(uint2({at}.xy), uint({at}.z), 0)"
         return f"{texture.name}.read(uint2({self.write(place)}), 0)"
 
-    def filtered(self, texture: Variable, place: Node) -> str:
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
         at = self.inside(place)
         if texture.type == "sampler2DArray":
-            return f"{texture.name}.sample({self.linear}, {at}.xy, uint({at}.z), level(0))"
-        return f"{texture.name}.sample({self.linear}, {self.write(place)}, level(0))"
+            return f"{texture.name}.sample({self.linear}, {at}.xy, uint({at}.z), level({level}))"
+        return f"{texture.name}.sample({self.linear}, {self.write(place)}, level({level}))"
 
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
         return f"{texture.name}.sample({self.linear}, {place}, gradient2d({dx}, {dy}))"

@@ -134,11 +134,11 @@ class _NodeWriter(HlslWriter):
         read = f"{texture.name}.Load(int3({at}, 0))"
         return f"((uint4)({read} + 0.5))" if texture.type == "usampler2D" else read
 
-    def filtered(self, texture: Variable, place: Node) -> str:
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
         at = self.write(place)
         if texture.type == "sampler2DArray":
             at = f"float2({at}.x, ({at}.y + {at}.z) / {self.layers[texture.name][1]}.0)"
-        return f"{texture.name}.SampleLevel({self.linear}, {at}, 0.0)"
+        return f"{texture.name}.SampleLevel({self.linear}, {at}, {level})"
 
     def size(self, texture: Variable) -> str:
         return f"wlm_size({texture.name})"

@@ -101,10 +101,10 @@ class WgslWriter(Writer):
         where = f"{at}.xy, {at}.z" if texture.type == "sampler2DArray" else self.write(place)
         return f"textureLoad({texture.name}, {where}, 0)"
 
-    def filtered(self, texture: Variable, place: Node) -> str:
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
         at = self.inside(place)
         where = f"{at}.xy, i32({at}.z)" if texture.type == "sampler2DArray" else self.write(place)
-        return f"textureSampleLevel({texture.name}, {self.linear}, {where}, 0.0)"
+        return f"textureSampleLevel({texture.name}, {self.linear}, {where}, {level})"
 
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
         return f"textureSampleGrad({texture.name}, {self.linear}, {place}, {dx}, {dy})"

@@ -166,8 +166,9 @@ class Writer(ABC):
         name = node.text
         if name in ("texelFetch", "textureLod"):
             texture = self.bound[arguments[0].text]
-            read = self.fetch if name == "texelFetch" else self.filtered
-            return read(texture, arguments[1])
+            if name == "texelFetch":
+                return self.fetch(texture, arguments[1])
+            return self.filtered(texture, arguments[1], self.write(arguments[2]))
         if name == "textureGrad":
             return self.graded(self.bound[arguments[0].text], *(self.write(each) for each in arguments[1:]))
         if name == "textureSize":
@@ -189,8 +190,8 @@ class Writer(ABC):
         """A texel."""
 
     @abstractmethod
-    def filtered(self, texture: Variable, place: Node) -> str:
-        """Several, mixed."""
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
+        """Several of a level, mixed."""
 
     @abstractmethod
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
