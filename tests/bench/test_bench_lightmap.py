@@ -165,7 +165,7 @@ def test_qualities_of_video_are_profiles_of_their_own(monkeypatch):
     assert names[0] == [("video 75", "video", 75), ("video 50", "video", 50)]
     assert [name for name, *_ in names[1]] == ["M", "video 75"]
     with pytest.raises(WlmError, match="video_quality"):
-        run(quick=False, device="cpu", qualities=(101,))
+        run(quick=False, device="cpu", qualities=(106,))
 
 
 def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):

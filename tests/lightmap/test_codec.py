@@ -15,7 +15,7 @@ ARRAYS = [field.name for field in dataclasses.fields(LightmapModel) if field.typ
 
 
 @pytest.mark.parametrize(
-    "kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (0, 3), (4, 4), (4, 3, 1, 4), (5, 4, 3, 5)]
+    "kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (0, 3), (4, 4), (4, 3, 1, 4), (5, 4, 6, 5)]
 )
 @pytest.mark.parametrize("period", [24.0, None])
 def test_what_is_written_comes_back(tmp_path, kinds, period):
@@ -26,7 +26,7 @@ def test_what_is_written_comes_back(tmp_path, kinds, period):
 
 
 def test_the_arrays_are_all_tested():
-    assert len(ARRAYS) == 19 and {*ARRAYS} == {*random_model().parts, "times", "mask"}
+    assert len(ARRAYS) == 22 and {*ARRAYS} == {*random_model().parts, "times", "mask"}
 
 
 @pytest.mark.parametrize("times", [(0.0, 1e-9), (18.45, 18.55), (7.0,), (1e6, 1e6 + 1e-4)])

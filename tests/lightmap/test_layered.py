@@ -88,7 +88,8 @@ def test_video_of_all_sheets_together_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(codec, "VIDEO_GROWTH", 1)
     monkeypatch.setattr(codec, "VIDEO_BYTES", 300_000)
     text = error_of(wlm.load, tmp_path / "a.wlm")
-    assert "the file's video: expected at most" in text and "found a size of 524288" in text, "of either 262,144"
+    assert "the file's video and levels: expected at most" in text
+    assert "found a size of 524288" in text, "of either 262,144"
 
 
 def test_signed_values_keep_their_sign(fitted):

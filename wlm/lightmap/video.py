@@ -109,12 +109,14 @@ def encode_page(
     steps = [steps_for(*tile, gamma, goal) for tile, goal in zip(tiles, goals, strict=True)]
     levels = dict(enumerate(_encoded_levels(tiles, steps)))
     worse = [i for i, goal in enumerate(goals) if tile_psnr(*tiles[i], gamma, steps[i]) < goal]
-    shares = np.array([_alone(page, i, tiles[i], ranges[i], quality, max(speed, TRIAL_SPEED)) for i in levels], float)
-    shares *= len(stream) / shares.sum()
-    dearer = [i for i, (own, bounds) in levels.items() if len(own) + bounds.nbytes >= shares[i] + ranges[i].nbytes]
     choices = [alone]
     if not worse:
         choices.append(EncodedPage(*none, levels))
+    if len(tiles) == 1:
+        return min(choices, key=lambda choice: choice.size)
+    shares = np.array([_alone(page, i, tiles[i], ranges[i], quality, max(speed, TRIAL_SPEED)) for i in levels], float)
+    shares *= len(stream) / shares.sum()
+    dearer = [i for i, (own, bounds) in levels.items() if len(own) + bounds.nbytes >= shares[i] + ranges[i].nbytes]
     kept = sorted({*worse, *dearer})
     if 0 < len(kept) < len(tiles):
         rest = Page.of(page.numbers[kept], page.places[kept])
