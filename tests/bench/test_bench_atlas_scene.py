@@ -53,8 +53,16 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def rows(scene):
-    return run(scene, budget=0.12, device="cpu", views=2, resolution=48)
+def few(tmp_path_factory):
+    """The standard profile with few views."""
+    path = tmp_path_factory.mktemp("profile") / "few.yaml"
+    path.write_text("name: few\ncolour: mixed\ntile: 11\nviews: 1\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def rows(scene, few):
+    return run(scene, [few], budget=0.12, device="cpu", views=2, resolution=48)
 
 
 def test_objects_keep_their_light(scene):
@@ -105,13 +113,13 @@ def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
 
 
 def test_rows(scene, rows):
-    assert keys(rows) == [("scene", "standard"), ("parts", "bits of standard")]
+    assert keys(rows) == [("scene", "few"), ("parts", "bits of few")]
     whole, parts = rows
     assert whole.scene == "boxes, 2 objects, 2 states" and whole["lightmaps"] == 4
-    # Parts never have fewer bits, but for what plain lightmaps leave.
-    assert 0.85 <= parts["bpp"] / whole["bpp"] <= 1.02
+    # Four parts have few sizes.
+    assert 0.85 <= parts["bpp"] / whole["bpp"] <= 1.2
     assert whole["gain"] == pytest.approx(whole["psnr"] - parts["psnr"]) and whole["gain_min"] <= whole["gain"]
-    assert 0.0 <= whole["objects_ahead"] <= 1.0 and whole["curves_seconds"] > 0.0
+    assert whole["curves_seconds"] > 0.0 and whole["apart_seconds"] > 0.0
     assert min(whole["psnr"], parts["psnr"]) > 30.0
 
 
@@ -125,12 +133,15 @@ def test_parts_are_lightmaps_of_their_own(scene):
     assert scores["many"].psnr > scores["few"].psnr + 10.0 and min(scores["many"].psnr_by_state) > 30.0
 
 
-def test_a_scene_alone_and_its_rows_in_files(scene, rows, tmp_path):
-    (alone,) = run(scene, ["rgb9e5"], budget=0.12, device="cpu", parts=False, views=1, resolution=32)
-    assert alone.option == "rgb9e5" and "gain" not in alone.figures
+def test_rows_make_a_file_and_tables(rows, tmp_path):
     check_outputs(rows, tmp_path, (Panel("bpp"),))
-    with pytest.raises(WlmError, match="budget: .* is less than"):
-        compress_scene(scene, budget=1e-4)
+
+
+def test_a_scene_without_its_parts_and_one_that_has_no_room(scene, few):
+    (alone,) = run(scene, [few], budget=0.12, device="cpu", parts=False, views=1, resolution=32)
+    assert alone["psnr"] > 30.0 and "gain" not in alone.figures
+    with pytest.raises(WlmError, match=r"budget: .* is less than"):
+        compress_scene(scene, few, budget=1e-4)
 
 
 def test_the_command(scene, rows, tmp_path, monkeypatch):

@@ -77,7 +77,7 @@ def scene_parts(
     Args:
         scene: The scene.
         weights: For each sheet [2 H, 2 W], how much each quarter of a texel counts, `scene_weights`.
-        bits: Of all parts, which have that many at least, up to half a percent more, where their sizes allow.
+        bits: Of all parts, which have that many at least, but for plain ones, and as few more as their sizes allow.
         colour: Instead of that of `standard`.
         device: "cpu" or "cuda:N".
 
@@ -94,13 +94,15 @@ def _compressed(
     tiles, parts = _cut(scene, weights, profile, device)
     sizes = sizes_of(profile)
     error = torch.from_numpy(curves(tiles, sizes))
-    share = bits / scene.source_bits
+    share, tries = bits / scene.source_bits, []
     for _ in range(_TRIES):
         placed = [_placed(error[:, part.tiles], sizes, part, share, profile) for part in parts]
         taken = sum(_bits(each, part, share, profile) for each, part in zip(placed, parts, strict=True))
+        tries.append((taken < bits, abs(taken - bits), share, placed))
         if bits <= taken <= _CLOSE * bits:
             break
         share *= (1.0 + 0.5 * (_CLOSE - 1.0)) * bits / taken
+    *_, share, placed = min(tries, key=lambda each: each[:2])
     chosen = np.zeros(len(tiles.index), int)
     for each, part in zip(placed, parts, strict=True):
         if each is not None:
