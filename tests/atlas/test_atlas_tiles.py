@@ -238,7 +238,7 @@ def test_curves_and_solved():
         np.testing.assert_allclose(weight.ravel(), tiles.weight[i].numpy() @ interpolation**2, rtol=1e-4)
         tile = grid.Tiles(*(part[i : i + 1] for part in (tiles.index, tiles.light, tiles.weight)), tiles.size)
         # A curve takes fewer rounds.
-        exact = float(grid.errors(tile, torch.from_numpy(values)[None])[0])
+        exact = float(grid.errors(tile, values[None])[0])
         assert exact <= error[i % 3, i] * 1.01 + 1e-12 and exact >= error[i % 3, i] * 0.9 - 1e-9
     # A curve is of what the file holds.
     coarse = grid.curves(tiles, [Size(4, 4, "bc6h"), Size(4, 4, "rgb9e5"), Size(4, 4, "half")])

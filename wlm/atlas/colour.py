@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 from wlm.atlas.model import BLOCK_SIDE
 from wlm.errors import WlmError
@@ -33,12 +34,15 @@ def block_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def quantise(
-    texels: np.ndarray, colour: str, weight: np.ndarray | None = None, device: str = "cpu"
+    texels: np.ndarray | torch.Tensor,
+    colour: str,
+    weight: np.ndarray | torch.Tensor | None = None,
+    device: str = "cpu",
 ) -> dict[str, np.ndarray]:
     """Encodes T_p as it is stored.
 
     Args:
-        texels: numbers [H, W, 3], linear.
+        texels: numbers [H, W, 3], linear, on any device.
         colour: "half", "rgb9e5", "bc6h" or "astc".
         weight: numbers [H, W], for "bc6h": of each texel's squared error; None: all alike.
         device: Where BC6H is encoded.
@@ -49,12 +53,13 @@ def quantise(
     Raises:
         WlmError: A package is missing; the line names the extra.
     """
+    if colour in BLOCK_CODECS:
+        blocks, decoded = encode(texels, colour, weight, device)
+        return {"texels": decoded.astype(np.float16), "blocks": blocks}
+    texels = texels.cpu().numpy() if isinstance(texels, torch.Tensor) else texels
     if colour == "half":
         return {"texels": texels.clip(0.0, HALF_MAX).astype(np.float16)}
-    if colour == "rgb9e5":
-        return {"texels": unpack_rgb9e5(pack_rgb9e5(texels)).astype(np.float16)}
-    blocks, decoded = encode(texels, colour, weight, device)
-    return {"texels": decoded.astype(np.float16), "blocks": blocks}
+    return {"texels": unpack_rgb9e5(pack_rgb9e5(texels)).astype(np.float16)}
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
@@ -80,7 +85,7 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
         _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
         return _of_blocks(decoded, count, ny, nx)
     count, ny, nx, _ = samples.shape
-    _, decoded = encode(samples.cpu().numpy().reshape(count * ny, nx, 3), colour)
+    _, decoded = encode(samples.reshape(count * ny, nx, 3), colour, device=str(samples.device))
     return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
 
 
@@ -109,13 +114,16 @@ def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tens
 
 
 def encode(
-    texels: np.ndarray, codec: str, weight: np.ndarray | None = None, device: str = "cpu"
+    texels: np.ndarray | torch.Tensor,
+    codec: str,
+    weight: np.ndarray | torch.Tensor | None = None,
+    device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Encodes a texture.
 
     Args:
-        texels: numbers [H, W, 3], linear; clamped to [0, 65504], infinities too. Where H or W is no multiple of 4 the
-            last row or column is repeated.
+        texels: numbers [H, W, 3], linear, on any device; clamped to [0, 65504], infinities too. Where H or W is no
+            multiple of 4 the last row or column is repeated.
         codec: "bc6h" or "astc".
         weight, device: As for `quantise`.
 
@@ -126,24 +134,25 @@ def encode(
         ValueError: No such codec, a wrong shape, or a NaN texel.
         WlmError: A package is missing; the line names the extra.
     """
-    texels = np.asarray(texels)
+    light = _on(texels, device)
     if codec not in BLOCK_CODECS:
         raise ValueError(f"codec: expected one of {', '.join(BLOCK_CODECS)}, got {codec!r}")
-    if texels.ndim != 3 or texels.shape[2] != 3 or 0 in texels.shape:
-        raise ValueError(f"texels: expected [H, W, 3], none of them 0, got {texels.shape}")
-    if np.isnan(texels).any():
-        raise ValueError(f"texels: {np.count_nonzero(np.isnan(texels).any(axis=2))} are NaN")
-    height, width = texels.shape[:2]
-    margin = (0, -height % BLOCK_SIDE), (0, -width % BLOCK_SIDE)
-    light = np.pad(texels.clip(0.0, HALF_MAX), (*margin, (0, 0)), mode="edge").astype(np.float32)
+    if light.ndim != 3 or light.shape[2] != 3 or 0 in light.shape:
+        raise ValueError(f"texels: expected [H, W, 3], none of them 0, got {tuple(light.shape)}")
+    if count := int(light.isnan().any(2).sum()):
+        raise ValueError(f"texels: {count} are NaN")
+    height, width = light.shape[:2]
+    below, right = -height % BLOCK_SIDE, -width % BLOCK_SIDE
+    light = light.clamp(0.0, HALF_MAX).float()
+    light = torch.cat([light, light[-1:].expand(below, -1, -1)]) if below else light
+    light = torch.cat([light, light[:, -1:].expand(-1, right, -1)], 1) if right else light
     if codec == "bc6h":
-        weight = np.ones((height, width)) if weight is None else weight
-        padded = torch.from_numpy(np.pad(weight, margin).astype(np.float32))[None, ..., None]
-        cells = _by_block(torch.from_numpy(light)[None])
-        blocks, decoded = bc6h_blocks(cells.to(device), _by_block(padded)[..., 0].to(device))
+        weight = torch.ones((height, width), device=device) if weight is None else _on(weight, device)
+        padded = pad(weight.float(), (0, right, 0, below))[None, ..., None]
+        blocks, decoded = bc6h_blocks(_by_block(light[None]), _by_block(padded)[..., 0])
         whole = _of_blocks(decoded, 1, *light.shape[:2])[0, :height, :width]
         return blocks.cpu().numpy(), whole.cpu().numpy()
-    blocks = np.frombuffer(_astc().encode(light.astype(np.float16)), np.uint8).reshape(-1, 16).copy()
+    blocks = np.frombuffer(_astc().encode(light.half().cpu().numpy()), np.uint8).reshape(-1, 16).copy()
     return blocks, decode(blocks, height, width, codec)
 
 
@@ -180,6 +189,13 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
         row, column = np.argwhere(broken)[0] // BLOCK_SIDE
         raise WlmError(f"{codec}: expected blocks of the format, found none in row {row}, column {column}")
     return texels
+
+
+def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
+    """A tensor on the device; a copy of an array, which may be read backwards or not be written to."""
+    return (
+        values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
+    )
 
 
 def _astc() -> hdr_blocks.Astc:

@@ -152,29 +152,31 @@ def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
 
 
 def composed(
-    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
     sizes: list[Size],
     layout: Layout,
     index: np.ndarray,
     counts: tuple[int, int],
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    device: str,
+) -> tuple[list[tuple[torch.Tensor, torch.Tensor]], np.ndarray]:
     """The textures and the table.
 
     Args:
-        samples: Of some tiles of one size each: their rows in `layout`, int [n], float32 [n, ny, nx, 3], and the
-            weights of their squared errors [n, ny, nx].
+        samples: Of some tiles of one size each: their rows in `layout`, int [n], and on the device float32 [n, ny, nx,
+            3] and the weights of their squared errors [n, ny, nx].
         sizes: The sizes.
         layout: Of the tiles.
         index: int64 [T], the tiles' numbers in the grid.
         counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
+        device: "cpu" or "cuda:N": a large texture takes seconds to pass through the host.
 
     Returns:
-        Of each texture the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
+        Of each texture on the device the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
     """
-    textures = [(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)) for shape in layout.shapes]
+    textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
     for members, values, weight in samples:
         size = sizes[layout.chosen[members[0]]]
-        at = texels_of(layout.first[members], size.nx, size.ny)
+        at = tuple(torch.from_numpy(each).to(device) for each in texels_of(layout.first[members], size.nx, size.ny))
         texels, weights = textures[size.second]
         texels[at], weights[at] = values, weight
     total = counts[0] * counts[1]
@@ -183,7 +185,7 @@ def composed(
     side[index] = np.array([(size.nx, size.ny) for size in sizes])[layout.chosen]
     second[index] = np.array([size.second for size in sizes])[layout.chosen]
     lut = pack_entries(first, side, second).reshape(*counts, 2)
-    return [(texels.clip(max=HALF_MAX), weights) for texels, weights in textures], lut
+    return [(texels.clamp_(max=HALF_MAX), weights) for texels, weights in textures], lut
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:

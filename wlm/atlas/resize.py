@@ -60,22 +60,21 @@ def resize(
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
     if not (1 <= height <= lightmap.shape[0] and 1 <= width <= lightmap.shape[1]):
         raise ValueError(f"size: expected up to {lightmap.shape[:2]}, got {(height, width)}")
-    return resized(fill_gaps(lightmap, mask), mask, height, width, filter, device)
+    return resized(fill_gaps(lightmap, mask), mask, height, width, filter, device).cpu().numpy()
 
 
 def resized(
     filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
-) -> np.ndarray:
-    """As `resize`, of a lightmap whose gaps are filled, at an allowed size."""
-    filled = filled.astype(np.float64)
+) -> torch.Tensor:
+    """As `resize`, of a lightmap whose gaps are filled, at an allowed size, and on the device."""
+    light = torch.from_numpy(filled).to(device).double()
     if (height, width) == mask.shape:
-        return filled
+        return light
     weights = _WEIGHTS["box" if filter == "fit" else filter]
-    light = torch.from_numpy(filled).to(device)
     small = _along(weights(width, mask.shape[1]), _along(weights(height, mask.shape[0]), light))
     if filter == "fit":
         small = _fit(light, torch.from_numpy(mask).to(device), small)
-    return small.clamp(0.0, HALF_MAX).cpu().numpy()
+    return small.clamp(0.0, HALF_MAX)
 
 
 def box(image: torch.Tensor, height: int, width: int) -> torch.Tensor:

@@ -101,7 +101,7 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
 def composed_model(
     mesh: LightmappedMesh,
     profile: Profile,
-    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
     sizes: list[Size],
     packed: Layout,
     index: np.ndarray,
@@ -120,7 +120,7 @@ def composed_model(
     """
     height, width = mesh.mask.shape
     counts = tile_counts(height, width, profile.tile)
-    (first, *second), lut = composed(samples, sizes, packed, index, counts)
+    (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
     mixed = profile.colour == "mixed"
     textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], device)
     if mixed:
@@ -362,7 +362,7 @@ def curves(
     return result
 
 
-def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:
     """Solves for the samples of every tile at its own size.
 
     Args:
@@ -371,8 +371,8 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
         chosen: int [T], each tile's number in them.
 
     Returns:
-        For some tiles of one size each: their numbers, int [n], samples, float32 [n, ny, nx, 3], not negative, and the
-        weights of the samples' squared errors [n, ny, nx]; all tiles together.
+        For some tiles of one size each: their numbers, int [n], and on the tiles' device samples, float32 [n, ny, nx,
+        3], not negative, and the weights of the samples' squared errors [n, ny, nx]; all tiles together.
     """
     result = []
     for number in np.unique(chosen).tolist():
@@ -380,9 +380,8 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
         rows = torch.from_numpy(members).to(tiles.index.device)
         group = Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
         for part, piece in _pieces(group):
-            values = solve(piece, size.nx, size.ny).clamp(min=0.0).cpu().numpy()
-            weight = sample_weights(piece, size.nx, size.ny).cpu().numpy()
-            result.append((members[part], values, weight))
+            values = solve(piece, size.nx, size.ny).clamp(min=0.0)
+            result.append((members[part], values, sample_weights(piece, size.nx, size.ny)))
     return result
 
 

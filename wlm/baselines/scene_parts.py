@@ -18,6 +18,7 @@ from wlm.atlas.fit import with_fallback
 from wlm.atlas.layout import Layout, Size, layout, sizes_of
 from wlm.atlas.model import LUT_BITS, SOURCE_BITS, AtlasModel, Profile, compression_ratio, tile_counts
 from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.stages import one_thread
 from wlm.atlas.tiles import Tiles, composed_model, curves, cut, least_gain, solved
 from wlm.atlas.weights import FineGrid
 
@@ -76,24 +77,32 @@ def scene_parts(
     Args:
         scene: The scene.
         weights: For each sheet [2 H, 2 W], how much each quarter of a texel counts, `scene_weights`.
-        bits: Of all parts, which have that many at least, up to half a percent more, where their sizes allow.
+        bits: Of all parts, which have that many at least, but for plain ones, and as few more as their sizes allow.
         colour: Instead of that of `standard`.
         device: "cpu" or "cuda:N".
 
     Returns:
         The parts; one of them is a plain smaller lightmap where that is no worse, or where tiles don't fit its share.
     """
-    profile = Profile.load("standard").override({"colour": colour})
+    with one_thread(device):
+        return _compressed(scene, weights, bits, Profile.load("standard").override({"colour": colour}), device)
+
+
+def _compressed(
+    scene: LightmappedScene, weights: Sequence[np.ndarray], bits: float, profile: Profile, device: str
+) -> SceneParts:
     tiles, parts = _cut(scene, weights, profile, device)
     sizes = sizes_of(profile)
     error = torch.from_numpy(curves(tiles, sizes))
-    share = bits / scene.source_bits
+    share, tries = bits / scene.source_bits, []
     for _ in range(_TRIES):
         placed = [_placed(error[:, part.tiles], sizes, part, share, profile) for part in parts]
         taken = sum(_bits(each, part, share, profile) for each, part in zip(placed, parts, strict=True))
+        tries.append((taken < bits, abs(taken - bits), share, placed))
         if bits <= taken <= _CLOSE * bits:
             break
         share *= (1.0 + 0.5 * (_CLOSE - 1.0)) * bits / taken
+    *_, share, placed = min(tries, key=lambda each: each[:2])
     chosen = np.zeros(len(tiles.index), int)
     for each, part in zip(placed, parts, strict=True):
         if each is not None:
@@ -145,14 +154,15 @@ def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) ->
 
 
 def _by_part(
-    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]], parts: list[_Part]
-) -> list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]], parts: list[_Part]
+) -> list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]]:
     """What `solved` has of all tiles, for each part with its own numbers of tiles."""
     ends = np.array([part.tiles.stop for part in parts])
-    result: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = [[] for _ in parts]
+    result: list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]] = [[] for _ in parts]
     for members, values, weight in samples:
         owner = np.searchsorted(ends, members, side="right")
         for number in np.unique(owner).tolist():
-            at = owner == number
-            result[number].append((members[at] - parts[number].tiles.start, values[at], weight[at]))
+            at = np.flatnonzero(owner == number)
+            rows = torch.from_numpy(at).to(values.device)
+            result[number].append((members[at] - parts[number].tiles.start, values[rows], weight[rows]))
     return result

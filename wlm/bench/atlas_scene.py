@@ -1,18 +1,16 @@
 """A scene of many objects and states against its parts, each object and state by itself, in as many bits.
 
 Rows of method "scene", one for each profile: the file, the compression with its stages, and the error in views of the
-whole scene. After each a row of method "parts", `wlm.baselines.scene_parts` in the same bits or up to half a percent
-more, by the profile of one lightmap that has the same textures.
+whole scene. After each a row of method "parts", `wlm.baselines.scene_parts` in the same bits or few more, by the profile
+of one lightmap with the same textures.
 
 "gain" is what the scene's mean over views and states is above the parts'; "least gain" that of the state in which it
-is least. "objects ahead" is the share of what is seen whose object has no larger squared error in the scene, by state:
-an object that is seen small gets fewer bits than it has alone, which is meant.
+is least.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from wlm import interop
 from wlm.atlas.data import from_arrays
@@ -26,12 +24,11 @@ from wlm.atlas.scene.seen import scene_weights
 from wlm.baselines.scene_parts import scene_parts
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
-from wlm.ops.raster import texture
 
 PROFILES = ("standard",)
 """Profiles of a run."""
 
-_FIT_SEED, _SCORE_SEED = 1, 2  # of views: the parts' weights have others than the score of objects
+_SEED = 1  # of the views that the parts' weights are of
 
 
 def run(
@@ -97,6 +94,7 @@ class _SceneBench(Bench):
         row = self.row(
             "scene",
             profile.name,
+            "tiles of each state apart" if model.later else "tiles shared by the states",
             bytes=fit.bytes,
             bpp=self._bpp(model.bits),
             compression_ratio=model.compression_ratio,
@@ -107,7 +105,8 @@ class _SceneBench(Bench):
         rows = [row]
         if parts:
             self.note(f"{profile.name}: {len(scene.sheets) * len(scene.states)} parts")
-            alone = scene_parts(scene, self._weights(profile, _FIT_SEED), model.bits, profile.colour, device)
+            weights = scene_weights(scene, self._varies, profile, _SEED, device)
+            alone = scene_parts(scene, weights, model.bits, profile.colour, device)
             decoders["parts"] = alone.read
             plain = sum(each.method == "plain" for of_sheet in alone.models for each in of_sheet)
             share = alone.bits / scene.source_bits
@@ -127,35 +126,12 @@ class _SceneBench(Bench):
             rows[0] = rows[0].with_figures(
                 gain=scores["scene"].psnr - scores["parts"].psnr,
                 gain_min=float(np.nanmin(gains)),
-                objects_ahead=self._ahead(decoders, self._weights(profile, _SCORE_SEED)),
             )
         return rows
 
     def _bpp(self, bits: float) -> float:
         """Bits for each texel and state."""
         return SOURCE_BITS * bits / self._scene.source_bits
-
-    def _weights(self, profile: SceneProfile, seed: int) -> list[np.ndarray]:
-        return scene_weights(self._scene, self._varies, profile, seed, self.device)
-
-    def _ahead(self, decoders: dict[str, SceneSampler], weights: list[np.ndarray]) -> float:
-        """The share of what is seen that is of objects whose squared error is no larger in the scene than alone."""
-        ahead = total = 0.0
-        for number, (sheet, weight) in enumerate(zip(self._scene.sheets, weights, strict=True)):
-            row, column = np.nonzero(weight)
-            share = torch.from_numpy(weight[row, column]).to(self.device)
-            place = np.stack([(column + 0.5) / weight.shape[1], (row + 0.5) / weight.shape[0]], 1)
-            uv = torch.from_numpy(place).float().to(self.device)
-            which = torch.full((len(uv),), number, dtype=torch.int32, device=self.device)
-            for state, frame in enumerate(sheet.frames):
-                light = texture(torch.from_numpy(frame).to(self.device), uv)
-                scene, parts = (
-                    float(((decoders[name](uv, which, state) - light).double().square().sum(1) * share).sum())
-                    for name in ("scene", "parts")
-                )
-                seen = float(share.sum())
-                ahead, total = ahead + seen * (scene <= parts), total + seen
-        return ahead / total
 
 
 def _small(states: int) -> LightmappedScene:

@@ -53,7 +53,6 @@ TABLES: dict[str, dict[str, Figure]] = {
         "psnr_max": Figure("most", "dB", ".2f"),
         "gain": Figure("gain", "dB", "+.3f"),  # of a PSNR over another method's
         "gain_min": Figure("least gain", "dB", "+.3f"),
-        "objects_ahead": Figure("objects ahead", "%", ".0f"),  # of what is seen of a scene, against its parts
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "texel_psnr_min": Figure("least", "dB", ".2f"),

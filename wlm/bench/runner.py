@@ -135,7 +135,7 @@ class Bench:
             writing = time.perf_counter()
             size = model.save(path)
             written = time.perf_counter()
-            return Fit(option, load(path, self.system), model, size, fitted - start, written - writing)
+            return Fit(option, load(path, model.SYSTEM), model, size, fitted - start, written - writing)
 
     def replay(self, call: Callable[[], object]) -> StepGraph:
         """Captures a call in a graph on CUDA, so that gaps between launches do not count."""

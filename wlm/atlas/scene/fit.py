@@ -160,9 +160,9 @@ def _texels(
                     row, column = texels_of(given.first[at] + aside, nx, ny)
                     number = given.component[at] + 1 + k
                     place = given.page[at, None, None], row, column
-                    light[texture][place], owner[texture][place] = values, number[:, None, None]
-                    share[texture][place] = weights
-                    np.maximum.at(largest, number, values.max((1, 2)))
+                    light[texture][place], owner[texture][place] = values.cpu().numpy(), number[:, None, None]
+                    share[texture][place] = weights.cpu().numpy()
+                    np.maximum.at(largest, number, values.amax((1, 2)).cpu().numpy())
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
     pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
