@@ -1,5 +1,8 @@
 """Images of smoke: guiding maps, six-way lightmaps and their weights, each against a finer march, and a frame."""
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,9 +18,14 @@ from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.guiding import Guide, guide
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, load_scene, make_camera, obstacle_mesh
+from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, obstacle_visibility
 from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.transport.filtering import scatter
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.tracing import trace
+from wlm.view.smoke_drawing import Drawing
+from wlm.view.smoke_run import AllOrders, SixWays
 from wlm_kernels.smoke.settings import March
 
 _CLOUD = "cloud"
@@ -30,6 +38,8 @@ _PLUME = 14.0  # the plume's extinction, over its box
 _LIGHTS = 12
 _WEIGHT_STEP = 1.0
 _JITTER = 1.0
+_PATHS = 64  # a pixel, on a GPU
+_FEW_PATHS = 4
 
 
 def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
@@ -163,7 +173,8 @@ def weight_rows(bench: SmokeBench) -> list[Row]:
 
 
 def frame_rows(bench: SmokeBench) -> list[Row]:
-    """A frame of a scene by stages: the air alone, the whole simulation, the guiding map, shadows and shading."""
+    """A frame of a scene by stages: the air alone, the whole simulation, the guiding map, shadows and shading; all that
+    `wlm smoke run` does after the simulation; light of a point in the smoke, of fire, and of paths."""
     sizes, device = bench.sizes, bench.device
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     scene = scene.model_copy(
@@ -213,6 +224,10 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     times = bench.time(calls, few=device == "cpu")
     march = partial(bake, volume, camera, step=_HALF_SIX, estimate=False)
     times |= bench.time({"six ways by march": march}, few=True)
+    drawn = _drawn(scene, volume, camera, scene.time(sizes.frames), device)
+    times |= bench.time({name: bench.replay(call) for name, call in drawn.items()}, few=device == "cpu")
+    paths = _FEW_PATHS if device == "cpu" else _PATHS
+    times |= bench.time(_traced(volume, camera, paths), few=True)
     air_cells, voxels = ("x".join(map(str, shape)) for shape in (scene.grid.cells, scene.grid.shape))
     pixels = f"{camera.width}x{camera.height}"
     of = {
@@ -223,6 +238,8 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
         "obstacles' shadows": f"{len(lights)} lights",
         "weights and background": pixels,
         "six ways by march": f"{pixels}, step {_HALF_SIX:g}",
+        **dict.fromkeys(drawn, f"{pixels}, a graph on a GPU"),
+        **dict.fromkeys(_traced(volume, camera, paths), f"{pixels}, {paths} samples"),
     }
     rows = [bench.row("frame", name, of[name], scene="jet-sphere", timing=timing) for name, timing in times.items()]
     parts = ("simulation", "guide", "obstacles' shadows", "weights and background")
@@ -230,6 +247,36 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     figures = {"time_ms": total, "frame_rate": 1e3 / total}
     notes = "simulation, guide, shadows, weights"
     return [*rows, bench.row("frame", "all but the network", notes, scene="jet-sphere", **figures)]
+
+
+def _drawn(
+    scene: Scene, volume: DensityVolume, camera: Camera, time: float, device: str
+) -> dict[str, Callable[[], object]]:
+    """What lights a frame, by its name: pictures with shadows and obstacles, and light that is found by diffusion."""
+    lights = [settings.light() for settings in scene.lights]
+    parts = {"background": scene.background, "obstacles": scene.obstacles}
+    drawing = Drawing(camera, lights, albedo=scene.smoke.albedo, **parts, device=device)
+    drawing.move(time)
+    lamp = PointLight(tuple(map(float, volume.centre)))
+    hot = replace(volume, temperature=volume.density, emission=1.0)
+    six, every = SixWays(), AllOrders(scene.smoke.albedo)
+    return {
+        "six ways, drawn": lambda: drawing(six(volume, camera, lights)),
+        "all orders, drawn": lambda: drawing(every(volume, camera, lights)),
+        "all orders, no obstacle": lambda: every(volume, camera, lights).shade(background=scene.background),
+        "all orders of a point light": lambda: scatter(volume, camera, [lamp], scene.smoke.albedo),
+        "all orders of fire": lambda: scatter(hot, camera, [], scene.smoke.albedo),
+    }
+
+
+def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Callable[[], object]]:
+    """Six planes by path tracing, under lights along the camera's axes."""
+    six = [Light(tuple(map(float, sign * axis)), (4 * math.pi,) * 3) for axis in camera.axes for sign in (1.0, -1.0)]
+    settings = {"samples": paths, "orders": 0}
+    return {
+        "six planes by paths, one order": lambda: trace(volume, camera, six, highest=1, **settings),
+        "six planes by paths, all orders": lambda: trace(volume, camera, six, **settings),
+    }
 
 
 def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
