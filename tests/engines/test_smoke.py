@@ -118,7 +118,7 @@ def test_godots_billboard_shows_the_smoke(moving, frames, tmp_path):
     LIGHT = vec3{TOWARD}; LIGHT_COLOR = vec3{IRRADIANCE} / 0.5; ATTENUATION = 0.5; DIFFUSE_LIGHT = vec3(0.0);
     light_of(); light = vec4(DIFFUSE_LIGHT * ALBEDO + EMISSION, ALPHA);"""
     for time in TIMES:
-        uniforms = {"frame": time, "sky": (*SKY, 1.0)}
+        uniforms = {"wlm_frame": time, "wlm_sky": (*SKY, 1.0)}
         found = run_glsl(text, main, (12, 16), pages_of(tmp_path), uniforms=uniforms)
         np.testing.assert_allclose(found, shown(frames, book, time), atol=STEP)
 
@@ -131,6 +131,16 @@ def test_godots_billboard_faces_the_viewer(frames, tmp_path):
     VIEW_MATRIX = mat4(1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., -10., 1.);
     vertex(); light = MODELVIEW_MATRIX * vec4(0.5, 0.5, 0.0, 1.0);"""
     np.testing.assert_allclose(run_glsl(text, main, (1, 1), {})[0, 0], [6.0, 7.5, -3.0, 1.0], atol=1e-6)
+
+
+def test_names_of_godots_shader_have_one_meaning(frames, tmp_path):
+    """GLSL lets a parameter or a local hide a uniform; Godot's language doesn't."""
+    export_smoke(random_book(frames, moving=True), tmp_path, "godot")
+    text = re.sub(r"//.*", "", (tmp_path / "smoke.gdshader").read_text())
+    outer = set(re.findall(r"^(?:uniform|varying) \w+ (\w+)", text, re.MULTILINE))
+    within = re.sub(r"^(uniform|varying).*$", "", text, flags=re.MULTILINE)
+    inner = set(re.findall(r"\b(?:float|vec[234]|int|bool) (\w+)\b(?!\()", within))
+    assert len(outer) == 7 and {"frame", "place", "mip"} <= inner and not outer & inner
 
 
 def test_godots_script_and_imports_parse(frames, tmp_path):

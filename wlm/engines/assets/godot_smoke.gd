@@ -45,10 +45,10 @@ func set_time(seconds: float) -> void:
 		return
 	var frames: float = _info["frames"]
 	var frame: float = maxf(seconds, 0.0) * float(_info["rate"])
-	_material.set_shader_parameter("frame", fmod(frame, frames) if loop else minf(frame, frames - 1.0))
+	_material.set_shader_parameter("wlm_frame", fmod(frame, frames) if loop else minf(frame, frames - 1.0))
 
 
 func set_sky(colour: Color) -> void:
 	sky = colour
 	if _material != null:
-		_material.set_shader_parameter("sky", colour)
+		_material.set_shader_parameter("wlm_sky", colour)
