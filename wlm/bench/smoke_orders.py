@@ -102,7 +102,7 @@ class OrdersSizes:
 
 
 FULL = OrdersSizes(
-    plumes=24,
+    plumes=12,
     cells=128,
     voxels=400,
     pixels=512,
