@@ -8,13 +8,16 @@ import pytest
 import torch
 from builders.atlas_meshes import charts, constant, sheet, soft, triangle
 
+import wlm.atlas.layout
+import wlm.atlas.model
 import wlm.atlas.weights
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import compare
+from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.layout import layout, sizes_of
-from wlm.atlas.model import COLOUR_BITS, Profile, tile_counts, unpack_entries
+from wlm.atlas.model import COLOUR_BITS, NO_BLOCKS, Profile, tile_counts, unpack_entries
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 
@@ -52,7 +55,7 @@ def checked(model, mesh) -> np.ndarray:
     assert share == pytest.approx(1.0 - model.compression_ratio) and share <= model.profile.budget
     assert model.texels.dtype == np.float16 and np.isfinite(model.texels).all() and (model.texels >= 0).all()
     if model.method == "tiles":
-        first, size, blocks = unpack_entries(model.lut, model.colour)
+        first, size, blocks = unpack_entries(model.lut, model.first_block_code)
         last = np.where(blocks, model.block_texels.shape[1::-1], model.texels.shape[1::-1])
         assert (first + size <= last).all()
         assert model.lut.shape[:2] == tile_counts(*mesh.mask.shape, model.profile.tile)
@@ -318,6 +321,21 @@ def test_one_seed_gives_one_file(name: str, tmp_path):
     assert files[0] == files[1] != files[2]
 
 
+def test_tiles_in_a_large_texture_of_blocks(monkeypatch):
+    """As in a small one: only what its entries count in differs."""
+    mesh = sheet(height=90, width=70)
+    small = compress(mesh, "bc6h", **FEW)
+    assert small.first_block_code == NO_BLOCKS
+    for module in (wlm.atlas.layout, wlm.atlas.model):
+        monkeypatch.setattr(module, "MOST_SIZE", 32)
+    large = compress(mesh, "bc6h", **FEW)
+    assert large.first_block_code == 0 and max(large.texels.shape) > 32
+    np.testing.assert_array_equal(large.texels, small.texels)
+    uv = np.random.default_rng(0).random((500, 2), np.float32)
+    light = large.decoder("cpu").read(torch.from_numpy(uv)).numpy()
+    np.testing.assert_allclose(light, decode64(large, uv), atol=1e-5)
+
+
 @pytest.mark.parametrize("name", CODECS)
 def test_tiles_of_blocks(name: str):
     """No block holds two tiles; sizes are chosen by the error after the codec; `texels` are the decoded blocks."""
@@ -328,7 +346,7 @@ def test_tiles_of_blocks(name: str):
     decoded = colour.decode(model.blocks, *model.texels.shape[:2], name)
     np.testing.assert_array_equal(model.texels, decoded.astype(np.float16))
     assert psnr(model, mesh) > 30.0
-    first, size, _ = unpack_entries(model.lut, model.colour)
+    first, size, _ = unpack_entries(model.lut, model.first_block_code)
     assert not (first % 4).any() and not (size % 4).any()
     rows, columns = -(-model.texels.shape[0] // 4), -(-model.texels.shape[1] // 4)
     assert model.blocks.shape == (rows * columns, 16)

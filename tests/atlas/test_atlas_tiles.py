@@ -11,7 +11,17 @@ from wlm.atlas import tiles as grid
 from wlm.atlas.colour import quantise, stored
 from wlm.atlas.decode import Decoder
 from wlm.atlas.layout import Size
-from wlm.atlas.model import AtlasModel, Profile, pack_entries, tile_counts, unpack_entries
+from wlm.atlas.model import (
+    FIRST_BLOCK_CODE,
+    MOST_SIZE,
+    NO_BLOCKS,
+    AtlasModel,
+    Profile,
+    first_block_code,
+    pack_entries,
+    tile_counts,
+    unpack_entries,
+)
 
 RANDOM = np.random.default_rng(11)
 
@@ -324,10 +334,24 @@ def test_entries():
     first, size = np.array([[0, 4095], [17, 1]]), np.array([[1, 16], [16, 3]])
     entries = pack_entries(first, size)
     assert entries.dtype == np.uint16
-    np.testing.assert_array_equal(np.stack(unpack_entries(entries, "half")[:2]), np.stack([first, size]))
+    np.testing.assert_array_equal(np.stack(unpack_entries(entries, NO_BLOCKS)[:2]), np.stack([first, size]))
     for wrong in ((first - 1, size), (first + 1, size), (first, size - 1), (first, size + 1)):
         with pytest.raises(ValueError, match="an entry beyond a texture of 4096 texels or a tile of 16"):
             pack_entries(*wrong)
+
+
+@pytest.mark.parametrize("colour", ["bc6h", "astc"])
+def test_entries_of_large_textures_name_blocks(colour):
+    assert first_block_code(colour, (100, MOST_SIZE)) == first_block_code("half", (9999, 1)) == NO_BLOCKS
+    code = first_block_code(colour, (MOST_SIZE + 4, 100))
+    first, size = np.array([[0, 16380], [4, 8]]), np.array([[4, 16], [16, 4]])
+    entries = pack_entries(first, size, True, code)
+    unpacked = unpack_entries(entries, code)
+    np.testing.assert_array_equal(np.stack(unpacked[:2]), np.stack([first, size]))
+    assert unpacked[2].all()
+    for wrong in ((first + 1, size), (first, size + 4), (first + 4, size), (first, size - 1)):
+        with pytest.raises(ValueError, match="an entry"):
+            pack_entries(*wrong, True, code)
 
 
 def test_entries_of_two_textures():
@@ -335,7 +359,7 @@ def test_entries_of_two_textures():
     first, size = np.array([[0, 4095], [16380, 8], [17, 1]]), np.array([[1, 12], [16, 4], [12, 3]])
     blocks = np.array([False, True, False])
     entries = pack_entries(first, size, blocks)
-    for found, expected in zip(unpack_entries(entries, "mixed"), (first, size, blocks[:, None]), strict=True):
+    for found, expected in zip(unpack_entries(entries, FIRST_BLOCK_CODE), (first, size, blocks[:, None]), strict=True):
         np.testing.assert_array_equal(found, np.broadcast_to(expected, (3, 2)))
     for wrong in ((first + 1, size), (first, size + 1), (first, np.where(blocks[:, None], size, 13))):
         with pytest.raises(ValueError, match="an entry"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts
-from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import KINDS, MIXED, WIDE
 from builders.atlas_models import random_model as random_atlas
 from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
@@ -441,7 +441,7 @@ LONG = "probes of a transform"
 SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 6, 0), folder, gelu="exact", period=None, hidden=10),
-    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
+    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED, WIDE)},
     "atlas mips": partial(mips, MIXED),
     "atlas cascade mips": partial(mips, "cascade"),
     "scene": partial(scene, False, False, False),

@@ -230,7 +230,7 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
         if kind == "tiles":
             wide, high, left, top = map(int, re.search(r"(\d+) × (\d+) texels at (\d+), (\d+)", text).groups())
             entry = model.lut[min(row // 7, len(model.lut) - 1), min(column // 7, len(model.lut[0]) - 1)]
-            first, size, _ = unpack_entries(entry, model.colour)
+            first, size, _ = unpack_entries(entry, model.first_block_code)
             assert [left, top] == first.tolist() and [wide, high] == size.tolist()
         assert ("tile" in text) == (kind == "tiles")
     assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"

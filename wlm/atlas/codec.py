@@ -26,6 +26,7 @@ from wlm.atlas.model import (
     check_area,
     compression_ratio,
     disk_ratio,
+    first_block_code,
     tail_blocks,
     tail_shapes,
     tile_counts,
@@ -187,10 +188,13 @@ def _checked(
     if header.method == "cascade" and not lut.size:
         raise ValueError("part lut is empty")
     if header.method == "tiles":
-        first, size, of_blocks = unpack_entries(lut, header.colour)
+        code = first_block_code(header.colour, texels)
+        first, size, of_blocks = unpack_entries(lut, code)
         if (of_blocks[..., 0] != of_blocks[..., 1]).any():
             raise ValueError("part lut: a tile is of both textures")
-        if max(texels) > MOST_SIZE or ((first + size) > np.where(of_blocks, second[::-1], texels[::-1])).any():
+        most = MOST_SIZE if code else MOST_SIZE * BLOCK_SIDE
+        in_second = of_blocks & (header.colour == "mixed")
+        if max(texels) > most or ((first + size) > np.where(in_second, second[::-1], texels[::-1])).any():
             raise ValueError("part lut: a tile reaches beyond the colour texture")
     check_area((height, width), (1, math.prod(texels) + math.prod(second)), lut.shape[:2])
     fields = {

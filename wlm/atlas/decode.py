@@ -7,7 +7,7 @@ import warp as wp
 from wlm import interop
 from wlm.atlas.data import LightmappedMesh
 from wlm.atlas.mips import Tail
-from wlm.atlas.model import FIRST_BLOCK_CODE, LUT_STEPS, TAIL_OCTAVES, AtlasModel, tail_codec
+from wlm.atlas.model import LUT_STEPS, TAIL_OCTAVES, AtlasModel, tail_codec
 from wlm.atlas.views import corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
@@ -40,10 +40,10 @@ class Decoder:
             # As stored: two bytes per number.
             self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.vec3h, device=self.device)
             self._lut = wp.array(np.ascontiguousarray(lut), dtype=wp.uint16, device=self.device)
-            self._second = {}
+            self._second = {"first_block_code": model.first_block_code}
             if model.colour == "mixed":
                 blocks = wp.array(np.ascontiguousarray(model.block_texels), dtype=wp.vec3h, device=self.device)
-                self._second = {"blocks": blocks, "first_block_code": FIRST_BLOCK_CODE}
+                self._second["blocks"] = blocks
         else:
             self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
             self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)

@@ -30,8 +30,8 @@ def _tiles(model: AtlasModel, texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
     last = np.array([model.width, model.height]) - 1
     x = (uv * (last + 1) - 0.5).clip(0, last) / model.profile.tile
     tile = np.minimum(np.floor(x), np.array(model.lut.shape[1::-1]) - 1).astype(np.int64)
-    first, size, blocks = unpack_entries(model.lut[tile[:, 1], tile[:, 0]], model.colour)
-    place, blocks = first + (x - tile) * (size - 1), blocks[:, 0]
+    first, size, blocks = unpack_entries(model.lut[tile[:, 1], tile[:, 0]], model.first_block_code)
+    place, blocks = first + (x - tile) * (size - 1), blocks[:, 0] & (model.colour == "mixed")
     light = np.empty((len(uv), 3))
     for texture, part in ((texels, ~blocks), (model.block_texels.astype(np.float64), blocks)):
         light[part] = _between(texture, first[part], (first + size - 1)[part], place[part])

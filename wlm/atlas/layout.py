@@ -20,6 +20,7 @@ from wlm.atlas.model import (
     SIDE_BITS,
     TEXELS,
     Profile,
+    first_block_code,
     pack_entries,
 )
 from wlm.errors import WlmError
@@ -118,7 +119,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
             width, shape = _narrowest(_Kinds.of(sides[members], counts[members]), texture.step)
             widths.append(width)
             shapes.append(shape)
-            most = MOST_SIZE * BLOCK_SIDE if texture.second else MOST_SIZE
+            most = MOST_SIZE * texture.step
             if max(shape) > most:
                 raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
@@ -180,11 +181,16 @@ def composed(
         texels, weights = textures[size.second]
         texels[at], weights[at] = values, weight
     total = counts[0] * counts[1]
-    first, side, second = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
+    mixed = any(size.second for size in sizes)
+    code = first_block_code("mixed" if mixed else sizes[0].format, layout.shapes[0])
+    first, side, blocks = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
+    if not code:
+        side[:], blocks[:] = BLOCK_SIDE, True
     first[index] = layout.first
     side[index] = np.array([(size.nx, size.ny) for size in sizes])[layout.chosen]
-    second[index] = np.array([size.second for size in sizes])[layout.chosen]
-    lut = pack_entries(first, side, second).reshape(*counts, 2)
+    if mixed:
+        blocks[index] = np.array([size.second for size in sizes])[layout.chosen]
+    lut = pack_entries(first, side, blocks, code).reshape(*counts, 2)
     return [(texels.clamp_(max=HALF_MAX), weights) for texels, weights in textures], lut
 
 

@@ -44,13 +44,14 @@ LUT_STEPS = 65535.0
 # An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
-"""Most texels of T_p along an axis for method "tiles"; of the blocks of colour "mixed", most blocks."""
+"""Most places along an axis that entries of method "tiles" can name: texels of T_p, or blocks."""
 
 TAIL_OCTAVES = 2
 """Of mips: how much smaller than the lightmap the tail's first level is, a power of two."""
 
-FIRST_BLOCK_CODE = 12
-"""Of colour "mixed": the size's code from which on an entry names blocks, 1 to 4 along an axis, and not texels."""
+FIRST_BLOCK_CODE, NO_BLOCKS = 12, 1 << SIDE_BITS
+"""Of colour "mixed": the size's code from which on an entry names blocks, 1 to 4 along an axis, and not texels; a code
+that no entry has."""
 
 
 class Profile(Settings):
@@ -177,6 +178,11 @@ class AtlasModel(Model):
         textures = (self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
         return compression_ratio(*textures, self.block_texels.shape[:2], len(self.tail))
 
+    @property
+    def first_block_code(self) -> int:
+        """That of the entries of T_c, `first_block_code`."""
+        return first_block_code(self.colour, self.texels.shape[:2])
+
 
 def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, int]) -> None:
     """Checks that a lightmap is no larger than its textures can make plausible: a few bytes must not claim gigabytes.
@@ -276,54 +282,61 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
     return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
 
 
-def pack_entries(first: np.ndarray, size: np.ndarray, blocks: np.ndarray | bool = False) -> np.ndarray:
+def first_block_code(colour: str, shape: tuple[int, ...]) -> int:
+    """The size's code from which on an entry of T_c names blocks, and not texels; `NO_BLOCKS` if none does.
+
+    Args:
+        colour: How T_p is stored, as in `Profile`.
+        shape: Rows and columns of T_p. Of BC6H and ASTC all entries name blocks where it has more than `MOST_SIZE`
+            texels along a side: of lightmaps above some 5,000 x 5,000.
+    """
+    if colour == "mixed":
+        return FIRST_BLOCK_CODE
+    return 0 if colour in ("bc6h", "astc") and max(shape) > MOST_SIZE else NO_BLOCKS
+
+
+def pack_entries(
+    first: np.ndarray, size: np.ndarray, blocks: np.ndarray | bool = False, code: int = FIRST_BLOCK_CODE
+) -> np.ndarray:
     """Encodes entries of T_c for tiles.
 
     Args:
         first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, of blocks below four times that.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
-        blocks: bool [...], where an entry is of the second texture of "mixed": first texel and size are multiples of 4,
-            and sizes of the first texture are at most `FIRST_BLOCK_CODE`.
+        blocks: bool [...], where an entry names blocks: first texel and size are multiples of 4, and sizes of other
+            entries are at most `code`.
+        code: `first_block_code`.
 
     Returns:
         uint16 [..., 2]: the first texel shifted left by 4, plus the size less 1. Of blocks, their numbers in place of
-        texels', and the code is `FIRST_BLOCK_CODE` more.
+        texels', and the size's part is `code` more.
 
     Raises:
         ValueError: A number is out of range.
     """
     first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
-    if (np.where(blocks, first | size, 0) % BLOCK_SIDE).any() or (blocks.any() and (size > _most(blocks)).any()):
+    most = np.where(blocks, 1 << SIDE_BITS, code)
+    if (np.where(blocks, first | size, 0) % BLOCK_SIDE).any() or (blocks.any() and (size > most).any()):
         raise ValueError("an entry that isn't of whole blocks, or beyond the sizes beside them")
-    code = np.where(blocks, FIRST_BLOCK_CODE + size // BLOCK_SIDE, size) - 1
+    steps = np.where(blocks, code + size // BLOCK_SIDE, size) - 1
     first = np.where(blocks, first // BLOCK_SIDE, first)
     if (first < 0).any() or (first >= MOST_SIZE).any() or (size < 1).any() or (size > 1 << SIDE_BITS).any():
         raise ValueError(f"an entry beyond a texture of {MOST_SIZE} texels or a tile of {1 << SIDE_BITS}")
-    return ((first << SIDE_BITS) + code).astype(np.uint16)
+    return ((first << SIDE_BITS) + steps).astype(np.uint16)
 
 
-def unpack_entries(lut: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decodes `pack_entries`.
 
     Args:
         lut: uint16 [..., 2].
-        colour: How T_p is stored, as in `Profile`.
+        code: `first_block_code`.
 
     Returns:
-        First texels and sizes, int64 [..., 2] each, and whether they are of the second texture of "mixed", bool
-        [..., 2]: the same along both axes.
+        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2]: of a sound file the
+        same along both axes.
     """
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
-    if colour != "mixed":
-        return first, size, np.zeros(lut.shape, bool)
-    blocks = size > FIRST_BLOCK_CODE
-    return (
-        np.where(blocks, first * BLOCK_SIDE, first),
-        np.where(blocks, (size - FIRST_BLOCK_CODE) * BLOCK_SIDE, size),
-        blocks,
-    )
-
-
-def _most(blocks: np.ndarray) -> np.ndarray:
-    return np.where(blocks, 1 << SIDE_BITS, FIRST_BLOCK_CODE)
+    blocks = size > code
+    return np.where(blocks, first * BLOCK_SIDE, first), np.where(blocks, (size - code) * BLOCK_SIDE, size), blocks

@@ -97,6 +97,12 @@ _BLOCKS = """\
     }}
 """
 
+_WHOLE_BLOCKS = """\
+    // Both count blocks of {side} texels a side.
+    first *= {side}u;
+    steps = steps * {side}u + uvec2({last}u, {last}u);
+"""
+
 _CASCADE = """
 vec3 wlm_atlas(vec2 uv)
 {
@@ -150,7 +156,8 @@ def atlas_glsl(model: AtlasModel) -> str:
         text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")
     body = _PLAIN
     if tiles:
-        blocks = _BLOCKS.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1) if mixed else ""
+        lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
+        blocks = lines.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1)
         body = _TILES.format(
             width=model.width,
             height=model.height,

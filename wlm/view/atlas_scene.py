@@ -84,7 +84,7 @@ class _AtlasScene(SurfaceScene):
         return self.light
 
     def tile_colours(self) -> np.ndarray:
-        _, size, _ = unpack_entries(self.model.lut, self.model.colour)
+        _, size, _ = unpack_entries(self.model.lut, self.model.first_block_code)
         side = self.model.profile.tile
         share = size.prod(-1) / (side + 1) ** 2
         rows, columns = (
@@ -103,7 +103,7 @@ class _AtlasScene(SurfaceScene):
         y, x = (
             min(place // side, count - 1) for place, count in zip((row, column), self.model.lut.shape, strict=False)
         )
-        entries = unpack_entries(self.model.lut, self.model.colour)
+        entries = unpack_entries(self.model.lut, self.model.first_block_code)
         (left, top), (wide, high), (blocks, _) = (part[y, x] for part in entries)
         text = f"tile {x}, {y}: {wide} × {high} texels{' of blocks' * bool(blocks)} at {left}, {top}"
         return text + f"   {outside}" * bool(outside)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.atlas.exporter import geometry, read_folder
-from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, AtlasModel
+from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS, AtlasModel
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
@@ -62,7 +62,7 @@ def folder_page(
             "tile": model.profile.tile,
             "size_bits": SIDE_BITS,
             "block_side": BLOCK_SIDE,
-            "first_block_code": FIRST_BLOCK_CODE if model.colour == "mixed" else 1 << SIDE_BITS,
+            "first_block_code": model.first_block_code,
         },
         **box,
     }

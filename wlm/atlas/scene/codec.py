@@ -12,7 +12,17 @@ import numpy as np
 from pydantic import Field, JsonValue
 
 from wlm.atlas.colour import decode as decode_blocks
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, MOST_SIZE, TEXELS, check_area, tile_counts, unpack_entries
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    FIRST_BLOCK_CODE,
+    MOST_SIZE,
+    NO_BLOCKS,
+    TEXELS,
+    check_area,
+    tile_counts,
+    unpack_entries,
+)
 from wlm.atlas.scene.earlier import side_by_side, without_coarse
 from wlm.atlas.scene.model import ENTRY, SHORT_ENTRY, SceneModel, SceneProfile, SheetPlace, extent, unpack_tiles
 from wlm.atlas.streams import deflated, inflated
@@ -94,7 +104,7 @@ def decode(artifact: Artifact) -> SceneModel:
         lut = without_coarse(lut)
     colour = "mixed" if len(blocks) else TEXELS
     first, size, component, count, page, of_blocks, coarse = unpack_tiles(lut, colour)
-    if colour == "mixed" and (unpack_entries(lut[..., :2], colour)[2][..., 1] != of_blocks).any():
+    if colour == "mixed" and (unpack_entries(lut[..., :2], FIRST_BLOCK_CODE)[2][..., 1] != of_blocks).any():
         raise ValueError("part lut: a tile is of both textures")
     if (coarse > np.where(of_blocks, count, 0)).any():
         raise ValueError("part lut: expected coarse components of tiles of blocks alone, at most all of them")
@@ -153,7 +163,7 @@ def _of_earlier(
     pages, rest = divmod(len(texels), count)
     if count > _MOST_EARLIER or rest:
         raise ValueError(f"part colour: expected pages of {count} layers, found {texels.shape}")
-    first, size, _ = unpack_entries(lut, TEXELS)
+    first, size, _ = unpack_entries(lut, NO_BLOCKS)
     if ((first + size) > texels.shape[:0:-1]).any():
         raise ValueError("part lut: a tile reaches beyond the colour texture")
     page = np.full(lut.shape[:2], -1)

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.model import FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
+from wlm.atlas.model import FIRST_BLOCK_CODE, NO_BLOCKS, TAIL_OCTAVES
 from wlm.atlas.scene.model import SceneModel
 from wlm_kernels.atlas import scene as kernels
 
@@ -34,7 +34,7 @@ class Decoder:
         mixed = model.colour == "mixed"
         blocks = model.block_texels if mixed else np.zeros((1, 1, 1, 3), np.float16)
         self._blocks = wp.array(np.ascontiguousarray(blocks), dtype=wp.vec3h, device=self.device)
-        self._code = FIRST_BLOCK_CODE if mixed else 1 << SIDE_BITS
+        self._code = FIRST_BLOCK_CODE if mixed else NO_BLOCKS
         self._sheets = wp.array(model.table(), dtype=int, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:

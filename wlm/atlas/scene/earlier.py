@@ -4,7 +4,7 @@ don't say which components are coarse."""
 import numpy as np
 
 from wlm.atlas.layout import texels_of
-from wlm.atlas.model import TEXELS, unpack_entries
+from wlm.atlas.model import NO_BLOCKS, unpack_entries
 from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, MOST_PAGES, pack_tiles
 from wlm.atlas.scene.packing import packed
 
@@ -24,7 +24,7 @@ def side_by_side(texels: np.ndarray, lut: np.ndarray, count: int, page: np.ndarr
     Raises:
         ValueError: The tiles have more texels than their pages.
     """
-    first, size, _ = unpack_entries(lut, TEXELS)
+    first, size, _ = unpack_entries(lut, NO_BLOCKS)
     of = np.flatnonzero(page.ravel() >= 0)
     keys = np.concatenate([page.reshape(-1, 1), first.reshape(-1, 2), size.reshape(-1, 2)], 1)[of]
     tiles, number = np.unique(keys, axis=0, return_inverse=True)
