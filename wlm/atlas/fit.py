@@ -43,6 +43,7 @@ from wlm.system import OnProgress
 from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
+_VIEWS_OF_ONE = 4  # of a profile that so many are to one of comparing the model with a plain lightmap
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 _PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # of the extra, by method and colour
 
@@ -95,8 +96,9 @@ def compress(
         model = fit_tiles(grid, profile, seed, stages)
     if profile.fallback:
         with stages("compare"):
-            # Other views than those of the fit, in which its error is less than elsewhere.
-            weight = None if model is None else weights(grid, profile, seed + 1)
+            # Other views than those of the fit, in which its error is less than elsewhere; fewer tell which is larger.
+            fewer = profile.model_copy(update={"views": -(-profile.views // _VIEWS_OF_ONE)})
+            weight = None if model is None else weights(grid, fewer, seed + 1)
             model = with_fallback(grid, model, profile, weight)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *mesh.mask.shape[::-1]))

@@ -1,8 +1,8 @@
 """A scene of many objects and states against its parts, each object and state by itself, in as many bits.
 
 Rows of method "scene", one for each profile: the file, the compression with its stages, and the error in views of the
-whole scene. After each a row of method "parts", `wlm.baselines.scene_parts` in the same bits or few more, by the
-profile of one lightmap with the same textures.
+whole scene. After each a row of method "parts", `wlm.baselines.scene_parts` in the same bits or few more, by `standard`
+of one lightmap with the same textures.
 
 "gain" is what the scene's mean over views and states is above the parts'; "least gain" that of the state in which it
 is least.
