@@ -31,8 +31,7 @@ PIXELS, SAMPLES = 96, 64
 ALBEDO = (0.97, 0.95, 0.92)  # of each scattering: what is scattered often turns warmer
 SIDES = (0.0, 90.0, 180.0, 270.0)  # degrees round the plume; 0 is behind the camera's back
 
-# Of pictures in sRGB, dB, the mean over the four sides: 23.3 dB for light scattered once, 37.6 for all orders
-# (39.9 against twice the paths).
+# Of pictures in sRGB, dB, the mean over the four sides: 23.3 dB for light scattered once, 37.2 for all orders.
 LEAST_ALL, LEAST_GAIN = 35.0, 12.0
 
 
