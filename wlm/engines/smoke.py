@@ -106,7 +106,7 @@ def _facts(book: Book, name: str) -> dict[str, str]:
     cells = f"{book.rows} x {book.columns} cells of {width} x {height} pixels, {book.padding} around each"
     moving = "" if book.scale is None else f", motion of at most {book.scale:.4g} of a frame"
     facts = f"{book.count} frames at {book.rate:.4g} a second, in {cells};\nlight times {book.gain:.4g}{moving}."
-    mips = f"The shader reads {book.levels} levels of the textures' mips." if book.levels else _NO_MIPS
+    mips = f"The shader reads the textures' mips down to level {book.levels}." if book.levels else _NO_MIPS
     return {"NAME": name, "FACTS": facts, "MIPS": mips}
 
 
