@@ -242,6 +242,17 @@ def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_p
     assert not apart.without_levels().later[0].smaller and not together.without_levels().later
 
 
+def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatch):
+    monkeypatch.setattr(sharing, "_SAMPLES", 6)
+    near = compress_scene(unlike, views=1, budget=0.3, components=1)
+    assert near.later and near.report["expected gain of states apart"] > 0.0
+    # All states are one light, brighter and darker.
+    sheet = unlike.sheets[0]
+    alike = scene_of([sheet.mesh], [np.stack([share * sheet.frames[0] for share in (1.0, 0.5, 0.2)])])
+    far = compress_scene(alike, views=1, budget=0.1, components=1)
+    assert not far.later and far.report["expected gain of states apart"] is None
+
+
 def files(folder, states=("day", "night")):
     position, triangle, uv = box((0, 0, 0), (2, 2, 2))
     half = uv * [0.5, 1.0]
