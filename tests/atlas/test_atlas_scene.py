@@ -132,9 +132,9 @@ def test_kept_files(name, means, device):
     np.testing.assert_allclose(light[2], decode64(model, uv, sheet, 2), rtol=1e-3, atol=1e-3)
 
 
-def test_mips(scene, device):
+def test_mips(scene, model, device):
     """Smaller levels: means of charts, in the budget, without a step from one to the next."""
-    model = compress_scene(scene, views=1, budget=0.3, mips=True)
+    bare, model = model, compress_scene(scene, views=1, budget=0.3, mips=True)
     assert model.compression_ratio >= 0.7 and [each.width for each in model.levels] == [12, 6, 3, 1] * 3
     decoder = model.decoder(device)
     row, column = np.mgrid[:12, :12].reshape(2, -1)
@@ -154,7 +154,7 @@ def test_mips(scene, device):
     assert float(light.diff(dim=0).abs().max()) < 0.03 * float(light.max())
     assert torch.equal(light[0], decoder.read(uv[:1], torch.zeros(1, device=device), 1.0)[0])
     with pytest.raises(ValueError, match="lod: expected a model with mips"):
-        compress_scene(scene, views=1, budget=0.3).decoder().read(uv[:1].cpu(), torch.zeros(1), 0, torch.zeros(1))
+        bare.decoder().read(uv[:1].cpu(), torch.zeros(1), 0, torch.zeros(1))
 
 
 def test_views_of_the_scene_decide(scene):
@@ -240,6 +240,17 @@ def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_p
     assert torch.equal(Decoder(bare, device).read(*near, 1.0), decoder.read(*near, 1.0))
     assert len(bare.rows) == states * len(apart.sheets) and not bare.levels and not bare.table()[:, 6].any()
     assert not apart.without_levels().later[0].smaller and not together.without_levels().later
+
+
+def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatch):
+    monkeypatch.setattr(sharing, "_SAMPLES", 6)
+    near = compress_scene(unlike, views=1, budget=0.3, components=1)
+    assert near.later and near.report["expected gain of states apart"] > 0.0
+    # All states are one light, brighter and darker.
+    sheet = unlike.sheets[0]
+    alike = scene_of([sheet.mesh], [np.stack([share * sheet.frames[0] for share in (1.0, 0.5, 0.2)])])
+    far = compress_scene(alike, views=1, budget=0.1, components=1)
+    assert not far.later and far.report["expected gain of states apart"] is None
 
 
 def files(folder, states=("day", "night")):
