@@ -85,7 +85,7 @@ def test_an_obstacle_is_lit_from_where_the_light_is(device):
     assert not light[~seen].any()
     side, _ = draw_obstacles([_ball()], 0.0, camera, [Light((1.0, 0.0, 0.0), (1.0,) * 3)], device)
     row = side[16, seen[16]][:, 0]
-    assert row[-1] > row[0] and row[0] == pytest.approx(0.2)
+    assert row[-1] > row[0] and float(row[0]) == pytest.approx(0.2)
     # The nearer one of two hides the other, whatever their order.
     for order in (1, -1):
         both = [_ball(z=0.25, radius=0.1), ObstacleSettings(radius=0.2, path=((0.0, 0, 0, 0),), colour=(0.0, 0.0, 1.0))]
@@ -120,7 +120,7 @@ def test_an_obstacle_before_and_behind_smoke(device):
     surface = float(np.dot(np.subtract(camera.position, 0), camera.toward))
     level = torch.full_like(six.transparency, surface)
     shadow = picture(replace(six, depth=level), [side], obstacles=[_ball(0.3, 0, 0, 0.1)])
-    assert shadow[16, 5, 0] < 0.05 and shadow[5, 5, 0] == pytest.approx(0.5)
+    assert float(shadow[16, 5, 0]) < 0.05 and float(shadow[5, 5, 0]) == pytest.approx(0.5)
 
 
 def test_without_obstacles_it_is_smoke_over_a_colour(device):
