@@ -1,7 +1,9 @@
 """Seconds that the stages of an atlas' profiles take at any size, and those of the clustering of many triangles.
 
-    python benchmarks/atlas_speed.py atlas-speed.json --side 8192 --device cuda:0 --profile standard --profile bc6h
+    python benchmarks/atlas_speed.py atlas-speed.json --side 8192 --times 1 --device cuda:0 --profile standard
     python benchmarks/atlas_speed.py atlas-speed.json --triangles 1000000 --device cuda:0
+
+Each call is a set of the file, with the command; a set that is there is replaced.
 
 A lightmap of the size is the demo's room enlarged, times noise of many scales, so that tiles vary at each. A profile is
 run once before, on 128 x 128 texels, so that kernels are compiled, and then as often as `--times` says: the least total
@@ -11,6 +13,8 @@ counts. Triangles are those of a bumpy sheet under a lightmap of 2048 x 2048 tex
 import argparse
 import json
 import math
+import shlex
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -94,15 +98,19 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, help="instead, of the clustering of so many")
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
-    result = {"environment": describe_environment(args.device, f"atlas_speed.py --side {args.side}"), "seconds": {}}
+    title = f"{args.triangles} triangles" if args.triangles else str(args.side)
+    command = shlex.join(["python", "benchmarks/atlas_speed.py", args.out.name, *sys.argv[2:]])
+    measured = {"name": title, "environment": describe_environment(args.device, command), "methods": {}}
+    known = json.loads(args.out.read_text())["sets"] if args.out.exists() else []
+    sets = [each for each in known if each["name"] != title]
 
     def done(name: str, seconds: dict[str, float]) -> None:
-        result["seconds"][name] = seconds
+        measured["methods"][name] = seconds
         print(name, " ".join(f"{stage} {value:.3g}" for stage, value in seconds.items()), flush=True)
-        atomic_write(args.out, (json.dumps(result, indent=1) + "\n").encode())
+        atomic_write(args.out, (json.dumps({"sets": [*sets, measured]}, indent=1) + "\n").encode())
 
     if args.triangles:
-        done(f"clustering of {args.triangles}", clustered(args.triangles, args.device))
+        done("clustering", clustered(args.triangles, args.device))
         return
     room = load_mesh(DATA / "room.glb", DATA / "room.exr")
     mesh, small = enlarged(room, args.side), enlarged(room, WARM_SIDE)

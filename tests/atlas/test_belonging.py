@@ -7,6 +7,7 @@ import pytest
 from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 
+from wlm.atlas import belonging
 from wlm.atlas.data import from_arrays, load
 from wlm.atlas.evaluation import compare
 from wlm.formats.exr import write_exr
@@ -51,7 +52,12 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
     assert len(load(scene, tmp_path / "grey.exr").parts) == 3
 
 
-def test_an_upside_down_lightmap_is_noticed(tmp_path):
+@pytest.mark.parametrize("band", [None, 8])
+def test_an_upside_down_lightmap_is_noticed(tmp_path, monkeypatch, band):
+    """By all of its texels, and as a large one by bands of rows."""
+    if band is not None:
+        monkeypatch.setattr(belonging, "_LOOKED_AT", 0)
+        monkeypatch.setattr(belonging, "_BAND", band)
     position, triangle, uv = box((0, 0, 0), (1, 1, 1))
     uv = shifted(uv)
     light = baked(uv)

@@ -22,6 +22,7 @@ _STEP = 3.0  # octaves: a larger step counts as this, as does one to NaN or infi
 _DARK = 0.02  # of the median light, added before a step is measured: darkness has no steps
 # Measured on 15 lightmaps, both ways up: the right one has at most 0.82 of the other's roughness.
 _BETTER = 0.85
+_LOOKED_AT, _BAND = 1 << 22, 16  # texels of a lightmap, in bands of so many rows: enough to tell, in a second
 _LEAST, _FEWEST = 0.005, 1024  # octaves; texels in charts, of which the mean says something
 _SHARED = 0.02  # of the texels under several meshes: fewer are the rounding of neighbours in one atlas
 _BRIGHT, _PERCENTILE = 16.0, 99.5  # times this percentile of a chart's light, and in a speck: no light
@@ -105,24 +106,38 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
     """The mean step, in octaves, between neighbouring texels of one chart; infinite where there are none.
 
+    Of a large lightmap it is that of evenly spread bands of rows, of `_LOOKED_AT` texels in all.
+
     Args:
         lightmap: float [H, W, 3]; NaN and infinity are steps.
         chart: int [H, W], `chart_map`.
     """
+    bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
-        light = lightmap.astype(np.float64).mean(axis=2)
-    finite = np.isfinite(light)
-    lit = light[finite & (light > 0)]
+        greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
+    lit = np.concatenate([grey[np.isfinite(grey) & (grey > 0)] for grey in greys])
     if not lit.size:
         return float("inf")
-    octave = np.log2(np.where(finite, light.clip(0.0), 0.0) + _DARK * np.median(lit))
+    floor = _DARK * np.median(lit)
     total, count = 0.0, 0
-    for axis in (0, 1):
-        (a, b), (c, d), (e, f) = (_neighbours(values, axis) for values in (octave, chart, finite))
-        inside = (c == d) & (c >= 0)
-        step = np.where(e & f, np.minimum(np.abs(a - b), _STEP), _STEP)
-        total, count = total + float(step[inside].sum()), count + int(inside.sum())
+    for band, grey in zip(bands, greys, strict=True):
+        finite = np.isfinite(grey)
+        octave = np.log2(np.where(finite, grey.clip(0.0), 0.0) + floor)
+        for axis in (0, 1):
+            (a, b), (c, d), (e, f) = (_neighbours(values, axis) for values in (octave, chart[band], finite))
+            inside = (c == d) & (c >= 0)
+            step = np.where(e & f, np.minimum(np.abs(a - b), _STEP), _STEP)
+            total, count = total + float(step[inside].sum()), count + int(inside.sum())
     return total / count if count else float("inf")
+
+
+def _bands(height: int, width: int) -> list[slice]:
+    """Rows of a lightmap that are looked at: all, or bands of them."""
+    count = max(_LOOKED_AT // (_BAND * width), 4)
+    if count * _BAND >= height:
+        return [slice(0, height)]
+    first = np.linspace(0, height - _BAND, count).astype(int).tolist()
+    return [slice(row, row + _BAND) for row in first]
 
 
 def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
