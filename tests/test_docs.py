@@ -83,7 +83,9 @@ def test_figures_are_those_of_the_benchmarks(document):
 
 def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
     monkeypatch.chdir(ROOT)
-    for name, page in pages(["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md").items():
+    for name, page in pages(
+        ["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md"
+    ).items():
         assert (ROOT / "docs" / name).read_text(encoding="utf-8") == page, name
 
 

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,8 +15,8 @@ from builders.atlas_models import random_model as random_atlas
 from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
-from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames
-from builders.smoke_books import shown as shown_book
+from builders.shader_subjects import POINTS, Subject, points_of
+from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
@@ -37,51 +37,6 @@ from wlm.probe.volume import Volume
 from wlm.probe.volume_export import export_volume
 from wlm.probe.volume_shader import volume_glsl
 from wlm.shading import LANGUAGES, translate
-from wlm.smoke.billboard import billboard_shader
-from wlm.smoke.camera import LAYOUTS, Camera
-from wlm.smoke.exporter import lay_out, pack
-from wlm.smoke.flipbook_depth import encoded_depth, from_point
-from wlm.smoke.flipbook_motion import ZERO
-from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.shader import smoke_shader
-from wlm.smoke.shading import Light
-from wlm.smoke.transport.lights import PointLight
-
-
-@dataclass
-class Subject:
-    """A shader, and what it should show.
-
-    Attributes:
-        text: The functions, in GLSL.
-        main: `vec4 shown(ivec2 pixel)`, which calls them.
-        expected: [rows, columns, 1 to 4].
-        bound: Textures and buffers by name.
-        exact: The macro that fetches rather than filters; "": there is none.
-        tolerance: Of what is fetched; None of the other: it is what the filters allow.
-        filtered: Tolerance where the sampler filters; llvmpipe's has 8 bits of a place between two texels.
-        as_textures: In GLSL, macros that read buffers from textures.
-        version: Of GLSL.
-    """
-
-    text: str
-    main: str
-    expected: np.ndarray
-    bound: dict[str, np.ndarray]
-    exact: str
-    tolerance: float
-    filtered: float | None = None
-    as_textures: str = ""
-    version: int = 330
-
-
-def points_of(values: np.ndarray) -> np.ndarray:
-    """Places as a texture of fours, one row."""
-    values = np.asarray(values, np.float32)
-    return np.pad(values, ((0, 0), (0, 4 - values.shape[1])))[None]
-
-
-POINTS = "uniform sampler2D u_points;\n"
 
 
 def lightmap(kinds, folder, **settings) -> Subject:
@@ -214,143 +169,6 @@ def scene(short, mixed, apart, _) -> Subject:
     return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
 
 
-def smoke(layout, _) -> Subject:
-    """What `shade` makes of the frames that the textures hold, and where they are."""
-    random = np.random.default_rng(5)
-    maps = torch.tensor(random.uniform(0, 1, (5, 8, 6, 9)), dtype=torch.float32)
-    frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
-    camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
-    first, second = pack(frames, layout, rows=2, columns=3, gain=0.5, padding=2)
-    text = smoke_shader("glsl", layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
-    asked, way, expected = [], [], []
-    for n, frame in enumerate(frames):
-        for row, column in ((0, 0), (3, 7), (5, 8)):
-            texel = n // 3 * 10 + 2 + row, n % 3 * 13 + 2 + column
-            for toward in ((0.6, 0.0, 0.8), (-0.6, 0.8, 0.0), (0.48, -0.6, -0.64)):
-                light = replace(frame, camera=camera, emission=None).shade([Light(toward)])[row, column, 0]
-                asked.append([(column + 0.5) / 9, (row + 0.5) / 6, n])
-                way.append(toward)
-                alpha = 1 - frame.transparency[row, column]
-                expected.append([*texel[::-1], light, 2 * alpha + 4 * frame.emission[row, column]])
-    main = (
-        POINTS
-        + """uniform sampler2D u_ways;
-uniform sampler2D u_first;
-uniform sampler2D u_second;
-vec4 shown(ivec2 pixel)
-{
-    vec4 asked = texelFetch(u_points, pixel, 0);
-    vec2 at = wlm_smoke_uv(asked.xy, asked.z);
-    ivec2 texel = ivec2(floor(at * vec2(textureSize(u_first, 0))));
-    vec4 a = texelFetch(u_first, texel, 0);
-    vec4 b = texelFetch(u_second, texel, 0);
-    float light = wlm_smoke_light(a, b, texelFetch(u_ways, pixel, 0).xyz);
-    return vec4(vec2(texel), light, 2.0 * wlm_smoke_alpha(a, b) + 4.0 * wlm_smoke_emission(a, b));
-}
-"""
-    )
-    pages = {"u_first": np.float32(first), "u_second": np.float32(second)}
-    bound = {"u_points": points_of(asked), "u_ways": points_of(way), **pages}
-    return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 2e-5)
-
-
-def smoke_point(_) -> Subject:
-    """A frame under lights at a point, by its texture of depth, as `from_point` has it; one lies in the smoke."""
-    random = np.random.default_rng(6)
-    maps = torch.tensor(random.uniform(0, 1, (8, 6, 9)), dtype=torch.float32)
-    camera = Camera.look_at((1, 2, 8), (1, 2, 3), extent=3.0, height=6, width=9)
-    frame, depth = SixWay(maps[:6], maps[6], None, camera), torch.tensor(random.uniform(-1, 1, (6, 9)))
-    first, second = pack([frame], "unity", rows=1, columns=1, padding=1)
-    book = {"rows": 1, "columns": 1, "count": 1, "size": (6, 9), "padding": 1, "hot": False}
-    text = smoke_shader("glsl", "unity", **book, depth=0.4)
-    away = lay_out(encoded_depth(depth[None] / 3.0, 0.4), 1, 1, 1)
-    asked, way, expected = [], [], []
-    for position in ((0.2, 0.1, 0.3), (-2.0, 1.5, 0.0), (0.5, -3.0, -4.0)):
-        lamp = PointLight(tuple(np.add(position, (1, 2, 3)).tolist()), (4 * np.pi,) * 3, radius=0.7)
-        shown = from_point(frame, depth, lamp, (1, 2, 3))[..., 0]
-        for row, column in ((0, 0), (3, 4), (5, 8), (2, 5)):
-            asked.append([(column + 0.5) / 9, (row + 0.5) / 6, 0])
-            way.append(position)
-            expected.append([shown[row, column]])
-    main = (
-        POINTS
-        + """uniform sampler2D u_ways;
-uniform sampler2D u_first;
-uniform sampler2D u_second;
-uniform sampler2D u_depth;
-vec4 shown(ivec2 pixel)
-{
-    vec4 asked = texelFetch(u_points, pixel, 0);
-    vec2 at = wlm_smoke_uv(asked.xy, asked.z);
-    ivec2 texel = ivec2(floor(at * vec2(textureSize(u_first, 0))));
-    float depth = wlm_smoke_depth(texelFetch(u_depth, texel, 0));
-    vec4 way = wlm_smoke_point(asked.xy, vec2(4.5, 3.0), depth, texelFetch(u_ways, pixel, 0).xyz, 0.7);
-    float light = wlm_smoke_light(texelFetch(u_first, texel, 0), texelFetch(u_second, texel, 0), way.xyz);
-    return vec4(light * way.w, 0.0, 0.0, 0.0);
-}
-"""
-    )
-    pages = {"u_first": np.float32(first), "u_second": four(second), "u_depth": four(away)}
-    bound = {"u_points": points_of(asked), "u_ways": points_of(way), **pages}
-    return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 1e-4)
-
-
-def four(page: np.ndarray) -> np.ndarray:
-    """A texture of three channels with a fourth."""
-    return np.pad(np.float32(page), ((0, 0), (0, 0), (0, 1)))
-
-
-def smoke_motion(_) -> Subject:
-    """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
-    random = np.random.default_rng(7)
-    size, scale = {"rows": 2, "columns": 3, "count": 5, "size": (24, 24), "padding": 4}, 0.07
-    text = smoke_shader("glsl", "unity", **size, motion=scale)
-    asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
-    way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
-    way[0, :2] = ZERO
-    moved = (way[:, :2] - ZERO) * 2.0 * scale * [1.0, -1.0]
-    before = np.clip(asked[:, :2] - asked[:, 2:] * moved, 0.0, 1.0)
-    after = np.clip(asked[:, :2] + (1.0 - asked[:, 2:]) * moved, 0.0, 1.0)
-    level = np.clip(np.log2(np.maximum(way[:, 2], 1.0)), 0.0, 3.0)
-    main = (
-        POINTS
-        + """uniform sampler2D u_ways;
-vec4 shown(ivec2 pixel)
-{
-    vec4 asked = texelFetch(u_points, pixel, 0);
-    vec4 way = texelFetch(u_ways, pixel, 0);
-    vec2 moved = wlm_smoke_motion(way);
-    vec2 before = wlm_smoke_before(asked.xy, moved, asked.z);
-    vec2 after = wlm_smoke_after(asked.xy, moved, asked.z);
-    return vec4(before.x - 2.0 * before.y, after.x - 2.0 * after.y, moved.y, wlm_smoke_level(way.z));
-}
-"""
-    )
-    columns = [before @ [1.0, -2.0], after @ [1.0, -2.0], moved[:, 1], level]
-    bound = {"u_points": points_of(asked), "u_ways": points_of(way)}
-    return Subject(text, main, np.float32(np.column_stack(columns))[None], bound, "", 2e-5)
-
-
-def billboard(_) -> Subject:
-    """What `shade` shows of a flip book with motion and fire, at a place in each pixel, at and between frames."""
-    frames = random_frames()
-    book = random_book(frames, moving=True)
-    times = (0.0, 1.5, 3.25)
-    expected = np.concatenate([shown_book(frames, book, time) for time in times])
-    main = f"""
-vec4 shown(ivec2 pixel)
-{{
-    vec2 place = (vec2(float(pixel.x), float(pixel.y % 12)) + vec2(0.5, 0.5)) / vec2(16.0, 12.0);
-    float time = pixel.y < 12 ? {times[0]} : pixel.y < 24 ? {times[1]} : {times[2]};
-    return wlm_smoke_pixel(place, time, 1.0, vec3{TOWARD}, vec3{IRRADIANCE}, vec3{SKY});
-}}
-"""
-    levels = {f"wlm_smoke_{name}_map": np.uint8(np.rint(page * 255.0)) for name, page in book.pages.items()}
-    full = {name: np.pad(page, ((0, 0), (0, 0), (0, 4 - page.shape[2]))) for name, page in levels.items()}
-    # Eight bits of each of the textures, and of a filter's place between two texels.
-    return Subject(billboard_shader(book), main, np.float32(expected), full, "", 1.6 / 255)
-
-
 def volume(folder) -> Subject:
     random = np.random.default_rng(0)
     position = random.uniform(-1, 1, (400, 3)) * [9.0, 1.0, 9.0] + [4000.0, -30.0, 0.0]
@@ -448,10 +266,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "scene of one component": partial(scene, True, False, False),
     "scene mixed": partial(scene, False, True, False),
     "scene apart": partial(scene, True, False, True),
-    "smoke motion": smoke_motion,
-    "smoke point": smoke_point,
-    "smoke billboard": billboard,
-    **{f"smoke {layout}": lambda folder, layout=layout: smoke(layout, folder) for layout in LAYOUTS},
+    **smoke_subjects(),
     "volume": volume,
     "probes": probes,
     LONG: transformed_probes,
