@@ -102,6 +102,7 @@ def test_an_unknown_row(requests):
     assert not requests
 
 
+@pytest.mark.slow
 def test_rows(requests, device, tmp_path):
     lengths = []
     rows = run_rows(SIZES, BASE, device=device, done=lambda rows: lengths.append(len(rows)))
