@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from wlm.atlas.model import BLOCK_SIDE, SOURCE_BITS, first_block_code, pack_entries, unpack_entries
+from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, NO_BLOCKS, SOURCE_BITS, pack_entries, unpack_entries
 from wlm.system import Model, Settings
 
 TEXEL_BITS = 32
@@ -200,7 +200,7 @@ def pack_tiles(
 
 def unpack_tiles(lut: np.ndarray, colour: str) -> tuple[np.ndarray, ...]:
     """Decodes `pack_tiles`, to int64, and `blocks` to bool [...], in its order; of short entries, too."""
-    first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], first_block_code(colour, (0, 0)))
+    first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], FIRST_BLOCK_CODE if colour == "mixed" else NO_BLOCKS)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
         return first, size, zeros, zeros + 1, zeros, blocks[..., 0], zeros
