@@ -20,7 +20,7 @@ from wlm.probe.day import DayModel
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform
 from wlm.smoke.learn.pool import load_pool
-from wlm.smoke.transport.filtering import load_orders
+from wlm.smoke.transport.orders import load_orders
 from wlm.smoke.velocity import read_velocity, write_velocity
 from wlm.system import Meter
 
@@ -109,8 +109,8 @@ def _shipped_orders() -> Sequence[bytes]:
 
 def _orders(path: Path) -> None:
     model = load_orders(path)
-    check_finite(**model.arrays)
-    assert (model.arrays["spread"] > 0).all(), "accepted a spread of 0"
+    check_finite(weights=model.weights, known=model.known)
+    assert model.known[0] < model.known[1], "accepted an empty range"
 
 
 @functools.cache

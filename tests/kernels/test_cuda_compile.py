@@ -52,9 +52,9 @@ MODULES = (
     "raster.rasterize",
     "raster.rays",
     "raster.texture",
-    "smoke.diffusion",
+    "smoke.fluence",
+    "smoke.orders",
     "smoke.picture",
-    "smoke.scales",
     "smoke.shadow",
     "smoke.single_scatter",
 )
@@ -174,7 +174,7 @@ def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
 def test_lights_and_paths(dtype: type, tmp_path: Path):
     """The march to lights, light from points by diffusion, and the path tracer."""
     _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
-    _compile_all(diffusion.point_kernels(dtype), tmp_path / "points")
+    _compile_all(diffusion.light_kernels(dtype), tmp_path / "points")
     for solid in (False, True):
         _compile_all(vars(path.path_kernels(dtype, solid)).values(), tmp_path / f"path{solid}")
 

@@ -11,9 +11,9 @@ from wlm.smoke.baking import bake
 from wlm.smoke.camera import weights
 from wlm.smoke.data import read_six_way
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import half_sphere
+from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.sphere import bake_sphere
 from wlm_kernels.smoke.settings import March
 

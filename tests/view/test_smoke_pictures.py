@@ -15,9 +15,9 @@ from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility
-from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.orders import scatter
 from wlm.view.smoke import (
     contact_sheet,
     draw_obstacles,

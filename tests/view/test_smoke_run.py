@@ -9,7 +9,7 @@ from builders.smoke_plumes import SPHERE, plume
 from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
 from wlm.smoke.shading import Ramp
-from wlm.smoke.transport.filtering import scatter
+from wlm.smoke.transport.orders import scatter
 from wlm.view.smoke import light_picture, picture
 from wlm.view.smoke_drawing import Drawing
 from wlm.view.smoke_run import AllOrders, SixWays

@@ -1,8 +1,8 @@
-"""What the network of light of all orders adds to the filter, on grids of every size: on no light should it take.
+"""What the learned mix of light of all orders adds to diffusion, on grids of every size: on no light should it take.
 
-Each row, "filter, network" of "gain by grid", is of one grid: plumes and clouds that it hasn't learned from, of
-extinctions in and out of the training's, under single lights, from any side. A gain is the network's PSNR less the
-filter's, in sRGB against path tracing, of one light at one albedo.
+Each row of "gain by grid" is of one grid: plumes and clouds that it hasn't learned from, of extinctions in and out of
+the training's, under single lights, from any side. A gain is the mix's PSNR less that of single scattering and
+diffusion, which are its input, in sRGB against path tracing, of one light at one albedo.
 """
 
 from collections.abc import Iterator
@@ -15,13 +15,13 @@ from wlm.bench.rows import Row
 from wlm.bench.runner import Bench
 from wlm.bench.smoke_light import make_cloud
 from wlm.fluid.volume import DensityVolume
+from wlm.interop import stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import ambient, make_inputs, orders_march
-from wlm.smoke.transport.filtering import OrdersModel, load_orders
+from wlm.smoke.transport.features import make_inputs, orders_march
 from wlm.smoke.transport.learning import psnr
-from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.orders import OrdersModel, load_orders
 from wlm.smoke.transport.tracing import trace
 
 METHOD = "gain by grid"
@@ -63,9 +63,9 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
     rows = []
     for cells in sizes.grids:
         bench.note(f"grid of {cells}^3")
-        filtered, corrected = (np.array(part) for part in zip(*_scores(bench.device, sizes, cells, model), strict=True))
-        gains = corrected - filtered
-        figures = {"psnr": corrected.mean(), "psnr_min": corrected.min(), "gain": gains.mean(), "gain_min": gains.min()}
+        diffused, mixed = (np.array(part) for part in zip(*_scores(bench.device, sizes, cells, model), strict=True))
+        gains = mixed - diffused
+        figures = {"psnr": mixed.mean(), "psnr_min": mixed.min(), "gain": gains.mean(), "gain_min": gains.min()}
         note = f"{len(gains)} lights, gains within {np.quantile(gains, 0.05):+.3f} and {gains.max():+.3f} dB"
         settings = {"voxels": cells, "pixels": sizes.pixels, "samples": sizes.samples}
         rows.append(bench.row(METHOD, f"{cells} voxels", note, scene="single lights", **figures, **settings))
@@ -73,20 +73,22 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
 
 
 def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> Iterator[tuple[float, float]]:
-    """Of each light at each albedo the PSNR of the filter and of the filter with the network."""
+    """Of each light at each albedo the PSNR of diffusion and of the mix."""
     for number, (density, extinction) in enumerate(_smoke(device, sizes, cells)):
         random = np.random.default_rng([cells, number])
         volume = DensityVolume(density, extinction, 1.0 / cells)
         camera = Camera.around(volume, toward=random.normal(size=3), pixels=sizes.pixels)
         lights = [Light(tuple(map(float, random.normal(size=3)))) for _ in range(_LIGHTS)]
         traced = trace(volume, camera, lights, samples=sizes.samples, orders=_ORDERS, seed=number)
-        lit = light_smoke(volume, camera, lights, orders_march(volume))
-        inputs = make_inputs(volume, lit, ambient(volume, camera))
-        for albedo in _ALBEDOS:
-            truth = (traced if albedo == 1.0 else traced.with_albedo((albedo,) * 3)).planes.sum(1)[..., 0]
-            for each, wanted in zip(inputs, truth, strict=True):
-                both = (model.light(each, (albedo,) * 3, network=network)[..., 0] for network in (False, True))
-                yield tuple(psnr(made, wanted) for made in both)
+        with stream(device):
+            _, inputs = make_inputs(volume, camera, lights, _ALBEDOS, orders_march(volume))
+            for albedo in _ALBEDOS:
+                known = inputs.at(albedo)
+                diffused = albedo * known.single + albedo**2 * known.diffused[:, 0]
+                mixed = model.light(known, (albedo,) * 3)[..., 0]
+                truth = (traced if albedo == 1.0 else traced.with_albedo((albedo,) * 3)).planes.sum(1)[..., 0]
+                for one, other, wanted in zip(diffused, mixed, truth, strict=True):
+                    yield psnr(one, wanted), psnr(other, wanted)
 
 
 def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Tensor, float]]:

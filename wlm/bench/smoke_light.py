@@ -21,8 +21,8 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, obstacle_visibility
 from wlm.smoke.simulation import make_solver, volume_of
-from wlm.smoke.transport.filtering import scatter
 from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke_drawing import Drawing
 from wlm.view.smoke_run import AllOrders, SixWays

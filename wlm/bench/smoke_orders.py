@@ -9,34 +9,36 @@ The methods, each a row; a picture's PSNR and FLIP are in sRGB, against path tra
 
 - "single scattering", and "single x gain", a factor on it;
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
-- "diffusion" on a grid of 32^3 beside single scattering;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
-- "filter", and "filter, network", which is what `wlm.smoke.transport.scatter` does.
+- "diffusion" on a grid of 32^3 beside single scattering, which is a part of
+- "learned mix", what `wlm.smoke.transport.scatter` does.
 
 The gain and the weights of the fitted octaves are those nearest to the very references that they are scored by: other
 smoke would give no better ones. A reference is the mean of two traced apart: "path tracing" is its own noise, which
 their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible, after
 the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
 
-Rows of what the network adds, light by light on grids of every size, are those of `smoke_grids`.
+Rows of what the mix adds to diffusion, light by light on grids of every size, are those of `smoke_grids`; of other
+phase functions, point lights in the smoke and fire those of `smoke_other_light`.
 
 A time is of a whole picture, from the smoke to the shaded image: on CUDA one graph, but for the path tracer and the
 denoiser, which are calls.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from wlm.baselines.smoke_orders import CELLS, FITTED, diffused, octaves, three_octaves
+from wlm.baselines.smoke_orders import FITTED, octaves, three_octaves
 from wlm.bench.path_tracer import denoised_picture, denoiser_device, has_denoiser
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
 from wlm.bench.smoke_grids import GridSizes, grid_rows
+from wlm.bench.smoke_other_light import other_rows
 from wlm.bench.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.flip import flip_display
@@ -47,10 +49,11 @@ from wlm.smoke.planes import to_srgb
 from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import advance, make_solver, volume_of
+from wlm.smoke.transport.diffusion import diffused
 from wlm.smoke.transport.features import orders_march
-from wlm.smoke.transport.filtering import FAINT, scatter
-from wlm.smoke.transport.learning import psnr
+from wlm.smoke.transport.learning import FAINT, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
+from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.samples import draw_view
 from wlm.smoke.transport.tracing import trace
 
@@ -61,10 +64,10 @@ ALBEDOS = (0.9, 1.0)
 
 _SEED = 8  # of views that nothing was fitted to
 _LIGHTS = 3
-_POWERS = 3  # of the cosine between light and camera, by which octaves are fitted: the filter has as many
+_POWERS = 3  # of the cosine between light and camera, by which octaves are fitted
 _FOUR_PI = 4.0 * math.pi
 _KEPT = 40  # orders that an albedo below 1 is made of: at 0.9 what is left out is less than a thousandth
-_CURVE = 1.16  # as the filter's fit weighs errors
+_CURVE = 1.16  # as the mix's fit weighs errors
 _RIDGE = 1e-6
 _VISIBLE = 0.05  # opacity
 _OF_MEAN = 20.0 * math.log10(2.0)  # dB, by which the mean of two has less noise than their difference
@@ -83,9 +86,9 @@ class OrdersSizes:
         samples: Paths a pixel of a reference.
         scale, frames: Of the scene `jet-sphere`: cells as a multiple of its own, and frames before the first seen.
         sides: From which it is seen.
-        diffusion: Cells along the longest edge of the grid of diffusion.
         repeats: Samples of a time.
         single: Of the rows of `smoke_grids`.
+        other: Arguments of `smoke_other_light.other_rows`, by name.
     """
 
     plumes: int
@@ -96,9 +99,9 @@ class OrdersSizes:
     scale: float
     frames: int
     sides: int
-    diffusion: int
     repeats: int
     single: GridSizes
+    other: Mapping[str, int] = field(default_factory=dict)
 
 
 FULL = OrdersSizes(
@@ -106,11 +109,10 @@ FULL = OrdersSizes(
     cells=128,
     voxels=400,
     pixels=512,
-    samples=768,
+    samples=3072,
     scale=1.0,
     frames=60,
     sides=4,
-    diffusion=CELLS,
     repeats=10,
     single=GridSizes((32, 64, 128, 256, 400, 512), extinctions=(2.5, 8.0, 25.0, 80.0), pixels=192, samples=512),
 )
@@ -121,11 +123,10 @@ QUICK = OrdersSizes(
     cells=None,
     voxels=None,
     pixels=32,
-    samples=384,
+    samples=1536,
     scale=0.12,
     frames=40,
     sides=2,
-    diffusion=CELLS,
     repeats=2,
     single=GridSizes((32, 64, 128), extinctions=(8.0, 25.0), pixels=24, samples=256),
 )
@@ -177,7 +178,7 @@ def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -
     rows = []
     for name, shots in (("plumes", plumes), ("jet", jet)):
         rows += _scored(bench, name, shots, sizes)
-    return rows + grid_rows(bench, sizes.single)
+    return rows + grid_rows(bench, sizes.single) + other_rows(bench, **sizes.other)
 
 
 def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
@@ -192,7 +193,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
         opacity.append(1.0 - once.transparency)
         fitted = _octaves_by_angle(shot)
         for albedo in ALBEDOS:
-            pictures = {way: make(shot, albedo) for way, make in _ways(sizes.diffusion).items()}
+            pictures = {way: make(shot, albedo) for way, make in _ways().items()}
             for way, picture in (pictures | {_GAIN: once.shade()[None], _OCTAVES: fitted}).items():
                 found[albedo].setdefault(way, []).append(picture)
     bench.note(f"{name}: times")
@@ -218,14 +219,13 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
     return rows
 
 
-def _ways(cells: int) -> dict[str, Callable[[Shot, float], torch.Tensor]]:
+def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
     """What makes a picture of a shot at an albedo, float32 [H, W, 3], with nothing to be fitted first."""
     ways = {
         "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
         "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
-        "diffusion": lambda shot, albedo: diffused(shot.volume, shot.camera, shot.lights, albedo, cells=cells),
-        "filter": lambda shot, albedo: _scatter(shot, albedo, False),
-        "filter, network": lambda shot, albedo: _scatter(shot, albedo, True),
+        "diffusion": _diffused,
+        "learned mix": lambda shot, albedo: scatter(shot.volume, shot.camera, shot.lights, (albedo,) * 3).shade(),
     }
     return ways | ({_DENOISED: _denoised} if has_denoiser() else {})
 
@@ -234,8 +234,8 @@ def _once(shot: Shot) -> LitSmoke:
     return light_smoke(shot.volume, shot.camera, shot.lights, orders_march(shot.volume))
 
 
-def _scatter(shot: Shot, albedo: float, network: bool) -> torch.Tensor:
-    return scatter(shot.volume, shot.camera, shot.lights, (albedo,) * 3, network=network).shade()
+def _diffused(shot: Shot, albedo: float) -> torch.Tensor:
+    return diffused(shot.volume, shot.camera, shot.lights, albedo, orders_march(shot.volume))
 
 
 def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
@@ -277,7 +277,7 @@ def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> 
 
 def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
     """The time of one picture by each way; on CUDA as a graph, where nothing on the way waits for the device."""
-    ways, albedo = _ways(sizes.diffusion), ALBEDOS[0]
+    ways, albedo = _ways(), ALBEDOS[0]
     calls = {way: lambda make=make: make(shot, albedo) for way, make in ways.items()}
     calls[_OCTAVES] = lambda: octaves(shot.volume, shot.camera, shot.lights)
     waiting = {way: calls.pop(way) for way in (_DENOISED,) if way in calls}
@@ -285,7 +285,7 @@ def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
         calls = {way: bench.replay(call) for way, call in calls.items()}
     times = bench.time(calls) | (bench.time(waiting, few=True) if waiting else {})
     times[_GAIN] = times["single scattering"]
-    order = ("single scattering", _GAIN, "three octaves", _OCTAVES, "diffusion", _DENOISED, "filter", "filter, network")
+    order = ("single scattering", _GAIN, "three octaves", _OCTAVES, _DENOISED, "diffusion", "learned mix")
     return {way: times[way] for way in order if way in times}
 
 

@@ -16,8 +16,8 @@ from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings
 from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.transport.filtering import ScatteredSmoke
 from wlm.smoke.transport.lighting import LitSmoke
+from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm.view.atlas import encode, save_png
 from wlm.view.smoke_drawing import Drawing
 

@@ -13,9 +13,9 @@ from wlm.smoke.camera import Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
-from wlm.smoke.transport.filtering import ScatteredSmoke
 from wlm.smoke.transport.lighting import LitSmoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
+from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm_kernels.smoke import picture as kernels
 
 _AMBIENT = 0.2  # of an obstacle's colour, so that its dark side stands out from a black background

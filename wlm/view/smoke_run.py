@@ -22,8 +22,8 @@ from wlm.smoke.prediction import SmokePredictor
 from wlm.smoke.replay import VolumeGraph
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.transport.filtering import OrdersModel, ScatteredSmoke, scatter
 from wlm.smoke.transport.lights import AnyLight
+from wlm.smoke.transport.orders import OrdersModel, ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
 from wlm.view.smoke import to_bytes
 from wlm.view.smoke_drawing import Drawing
@@ -57,7 +57,7 @@ class AllOrders(Lighting):
 
     Attributes:
         albedo: R, G, B, the share of light that a scattering leaves.
-        model: The filter and its network; None: those that come with wlm.
+        model: The learned mix; None: the one that comes with wlm.
         step: Of the march, in voxels; None: that of `orders_march`.
     """
 

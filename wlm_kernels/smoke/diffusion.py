@@ -1,30 +1,25 @@
-"""Light that smoke scatters on and on, spread by diffusion over a grid of few cells, and what a camera sees of it.
+"""Light that smoke scatters on and on, on a grid of few cells: what cells stop of a light, and what is seen of it.
 
-In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q, where q is the light that
-comes straight from its source and ends there, D = 1 / (3 s + |grad f| / f) so that no more light flows than there is
-(Wilson's sum), and at the box's faces half of the fluence leaves (Marshak's condition). Rounds of successive
-over-relaxation, on the cells of one colour of a chequerboard and then on the others, solve it for the D of the f
-before.
-
-Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
+How light goes from cell to cell between the two is in `fluence`. Lengths are in voxels; cell (0, 0, 0) begins at the
+grid's corner.
 """
 
 import functools
+import math
 from typing import Any
 
 import warp as wp
 
 from wlm_kernels.smoke.march import Medium, View, absorbed, clip, marched_ray, size_of
 from wlm_kernels.smoke.march_coarse import by_bricks
+from wlm_kernels.smoke.march_lights import Lattice, depths_at
 
 _OPTIONS = {"enable_backward": False}
 wp.set_module_options(_OPTIONS)
 _WAYS = 4096  # from a point light
-_OVER = wp.constant(1.8)  # of over-relaxation
-_ROUNDS, _SWEEPS = 4, 24
 _LEAST = 1e-5  # of a way's light, of which no more is followed
-_TINY = 1e-12
 _TURN = wp.constant(2.399963229728653)  # the golden angle
+_PARTS = 4  # of a cell along each axis at most, at whose middles light that comes straight from far is known
 
 
 @wp.func
@@ -47,127 +42,9 @@ def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
         wp.atomic_add(out, a, b, c, share * light)
 
 
-@wp.kernel
-def _reach(
-    # in:
-    extinction: wp.array3d[float],
-    light: wp.array4d[float],
-    cell: wp.vec3,
-    # out:
-    reach: wp.array4d[float],
-):
-    """D, by central differences of a grid that goes on alike outside."""
-    n, i, j, k = wp.tid()
-    nx = light.shape[1]
-    ny = light.shape[2]
-    nz = light.shape[3]
-    x = light[n, wp.min(i + 1, nx - 1), j, k] - light[n, wp.max(i - 1, 0), j, k]
-    y = light[n, i, wp.min(j + 1, ny - 1), k] - light[n, i, wp.max(j - 1, 0), k]
-    z = light[n, i, j, wp.min(k + 1, nz - 1)] - light[n, i, j, wp.max(k - 1, 0)]
-    steep = 0.5 * wp.length(wp.cw_div(wp.vec3(x, y, z), cell)) / wp.max(light[n, i, j, k], _TINY)
-    # No steeper than a grid can tell, and light goes no farther than through the box.
-    steep = wp.min(steep, 2.0 / wp.min(cell))
-    farthest = (cell[0] + cell[1] + cell[2]) * float(wp.max(wp.max(nx, ny), nz))
-    reach[n, i, j, k] = 1.0 / wp.max(3.0 * extinction[i, j, k] + steep, 1.0 / farthest)
-
-
-@wp.func
-def _flow(one: float, other: float, size: float) -> float:
-    """Between neighbours of a D each, per volume and difference of fluence."""
-    return 2.0 * one * other / ((one + other) * size * size)
-
-
-@wp.func
-def _lost_outside(own: float, size: float) -> float:
-    return 1.0 / (size * (2.0 + 0.5 * size / own))
-
-
-@wp.kernel
-def _couple(
-    # in:
-    extinction: wp.array3d[float],
-    reach: wp.array4d[float],
-    cell: wp.vec3,
-    albedos: wp.vec3,
-    each: int,
-    # out:
-    flows: wp.array4d[wp.vec4],
-):
-    """What flows to the next cells along the axes, 0 at the box's faces, and over all that a cell loses 1."""
-    n, i, j, k = wp.tid()
-    nx = reach.shape[1]
-    ny = reach.shape[2]
-    nz = reach.shape[3]
-    own = reach[n, i, j, k]
-    lost = (1.0 - albedos[n % each]) * extinction[i, j, k]
-    x = float(0.0)
-    y = float(0.0)
-    z = float(0.0)
-    if i + 1 < nx:
-        x = _flow(own, reach[n, i + 1, j, k], cell[0])
-        lost += x
-    else:
-        lost += _lost_outside(own, cell[0])
-    if j + 1 < ny:
-        y = _flow(own, reach[n, i, j + 1, k], cell[1])
-        lost += y
-    else:
-        lost += _lost_outside(own, cell[1])
-    if k + 1 < nz:
-        z = _flow(own, reach[n, i, j, k + 1], cell[2])
-        lost += z
-    else:
-        lost += _lost_outside(own, cell[2])
-    if i > 0:
-        lost += _flow(own, reach[n, i - 1, j, k], cell[0])
-    else:
-        lost += _lost_outside(own, cell[0])
-    if j > 0:
-        lost += _flow(own, reach[n, i, j - 1, k], cell[1])
-    else:
-        lost += _lost_outside(own, cell[1])
-    if k > 0:
-        lost += _flow(own, reach[n, i, j, k - 1], cell[2])
-    else:
-        lost += _lost_outside(own, cell[2])
-    flows[n, i, j, k] = wp.vec4(x, y, z, 1.0 / lost)
-
-
-@wp.kernel
-def _relax(
-    # in:
-    source: wp.array4d[float],
-    flows: wp.array4d[wp.vec4],
-    albedos: wp.vec3,
-    each: int,
-    colour: int,
-    # out:
-    light: wp.array4d[float],
-):
-    """Cells of one colour; `each` albedos of a source follow one another in the light."""
-    n, i, j, half = wp.tid()
-    k = 2 * half + ((i + j + colour) & 1)
-    if k >= light.shape[3]:
-        return
-    own = flows[n, i, j, k]
-    got = albedos[n % each] * source[n / each, i, j, k]
-    # Beyond the box's faces nothing flows: what is read in its place doesn't count.
-    got += own[0] * light[n, wp.min(i + 1, light.shape[1] - 1), j, k]
-    got += own[1] * light[n, i, wp.min(j + 1, light.shape[2] - 1), k]
-    got += own[2] * light[n, i, j, wp.min(k + 1, light.shape[3] - 1)]
-    if i > 0:
-        got += flows[n, i - 1, j, k][0] * light[n, i - 1, j, k]
-    if j > 0:
-        got += flows[n, i, j - 1, k][1] * light[n, i, j - 1, k]
-    if k > 0:
-        got += flows[n, i, j, k - 1][2] * light[n, i, j, k - 1]
-    now = light[n, i, j, k]
-    light[n, i, j, k] = wp.max(now + _OVER * (got * own[3] - now), 0.0)
-
-
 @functools.cache
-def point_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
-    """Builds (once) the kernels `shoot` and `gather` for densities of a type, `wp.float32` or `wp.float16`."""
+def light_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
+    """Builds (once) the kernels `shoot`, `leave` and `gather` for densities of `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def shoot(
@@ -223,6 +100,34 @@ def point_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
             _splat(moment / held, cell, held, out)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    def leave(
+        # in:
+        density: wp.array3d[dtype],
+        bricks: wp.array3d[wp.uint8],
+        nodes: wp.array3d[wp.vec2],
+        extinction: float,
+        lattice: Lattice,
+        cell: wp.vec3,
+        parts: wp.vec3i,
+        # out:
+        out: wp.array3d[float],
+    ):
+        """What a cell stops of the light that comes straight from far off, per volume."""
+        i, j, k = wp.tid()
+        total = float(0.0)
+        for x in range(parts[0]):
+            for y in range(parts[1]):
+                for z in range(parts[2]):
+                    a = float(i) + (float(x) + 0.5) / float(parts[0])
+                    b = float(j) + (float(y) + 0.5) / float(parts[1])
+                    c = float(k) + (float(z) + 0.5) / float(parts[2])
+                    p = wp.cw_mul(cell, wp.vec3(a, b, c))
+                    sigma = extinction * by_bricks(density, bricks, p)
+                    if sigma > 0.0:
+                        total += sigma * wp.exp(-depths_at(nodes, lattice, p)[0])
+        out[i, j, k] = 4.0 * wp.pi * total / float(parts[0] * parts[1] * parts[2])
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def gather(
         # in:
         density: wp.array3d[dtype],
@@ -234,12 +139,15 @@ def point_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         cell: wp.vec3,
         light: wp.array4d[float],
         # out:
-        out: wp.array3d[float],
+        out: wp.array4d[float],
+        thin: wp.array2d[float],
     ):
-        """What smoke of albedo 1 in that light sends to a pixel."""
+        """What smoke of albedo 1 in that light sends to a pixel, and of that what smoke of thin cells sends."""
         n, row, column = wp.tid()
         r = marched_ray(view, row, column, size_of(density), step)
         total = float(0.0)
+        from_thin = float(0.0)
+        seen = float(0.0)
         tau = float(0.0)
         for m in range(r.count):
             p = r.origin + (r.first + (float(m) + 0.5) * r.length) * r.direction
@@ -265,13 +173,20 @@ def point_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
                     wp.lerp(light[n, a, b, k], light[n, a, b, c], fz),
                     fy,
                 )
-                total += wp.exp(-tau) * absorbed(x) * wp.lerp(near, far, fx)
+                share = wp.exp(-tau) * absorbed(x)
+                clear = share * wp.exp(-x / r.length * wp.min(cell))
+                total += share * wp.lerp(near, far, fx)
+                from_thin += clear * wp.lerp(near, far, fx)
+                seen += clear
                 tau += x
                 if wp.exp(-tau) < cutoff:
                     break
-        out[n, row, column] = total / (4.0 * wp.pi)
+        out[0, n, row, column] = total / (4.0 * wp.pi)
+        out[1, n, row, column] = from_thin / (4.0 * wp.pi)
+        if n == 0:
+            thin[row, column] = seen
 
-    return shoot, gather
+    return shoot, leave, gather
 
 
 def shoot(
@@ -298,29 +213,25 @@ def shoot(
     """
     density = medium.density
     inputs = [density, bricks, medium.extinction, place, radius, step, cell, power / _WAYS]
-    wp.launch(point_kernels(density.dtype)[0], _WAYS, inputs=inputs, outputs=[out], device=density.device)
+    wp.launch(light_kernels(density.dtype)[0], _WAYS, inputs=inputs, outputs=[out], device=density.device)
 
 
-def spread(
-    medium: Medium, extinction: wp.array, source: wp.array, cell: wp.vec3, albedos: wp.vec3, each: int, light: wp.array
+def leave(
+    medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array, bricks: wp.array
 ) -> None:
-    """Solves for the fluence.
+    """What cells stop of the light that comes straight from infinitely far off, of an irradiance of 4 pi.
 
     Args:
-        medium: The smoke, for its buffers.
-        extinction: float [X, Y, Z], per voxel.
-        source: float [L, X, Y, Z], q.
+        medium, bricks: As for `shoot`.
+        depths: Of `march_lights.reach`.
         cell: Edges of a cell.
-        albedos, each: The first so many of the albedos are those of each source.
-        light: float [L * each, X, Y, Z], what is begun with; written: f.
+        step: Between places of a cell at which light is known; but there are no more than four of them along an axis.
+        out: float [X, Y, Z], written: per volume.
     """
-    reach, flows = medium.buffer(light.shape, float), medium.buffer(light.shape, wp.vec4)
-    halves = (*light.shape[:3], (light.shape[3] + 1) // 2)
-    for _ in range(_ROUNDS):
-        wp.launch(_reach, light.shape, [extinction, light, cell], [reach], device=light.device)
-        wp.launch(_couple, light.shape, [extinction, reach, cell, albedos, each], [flows], device=light.device)
-        for sweep in range(2 * _SWEEPS):
-            wp.launch(_relax, halves, [source, flows, albedos, each, sweep & 1], [light], device=light.device)
+    density, (lattice, nodes) = medium.density, depths
+    parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))
+    inputs = [density, bricks, nodes, medium.extinction, lattice, cell, parts]
+    wp.launch(light_kernels(density.dtype)[1], out.shape, inputs=inputs, outputs=[out], device=density.device)
 
 
 def gather(
@@ -331,6 +242,7 @@ def gather(
     cell: wp.vec3,
     light: wp.array,
     out: wp.array,
+    thin: wp.array,
     bricks: wp.array,
 ) -> None:
     """What smoke of albedo 1 in a fluence sends to a camera.
@@ -340,9 +252,11 @@ def gather(
         step: The longest step along a ray.
         cutoff: A ray ends where less than this is left of its transparency.
         cell: Edges of a cell.
-        light: float [N, X, Y, Z], fluences.
-        out: float [N, H, W], written.
+        light: float [N, X, Y, Z], fluences; at least one.
+        out: float [2, N, H, W], written: all of it, and what thin smoke sends, where each place counts by the
+            transparency of a cell of smoke as dense as there.
+        thin: float [H, W], written: likewise of opacity.
     """
-    density = medium.density
+    density, size = medium.density, out.shape[1:]
     inputs = [density, bricks, medium.extinction, view, step, cutoff, cell, light]
-    wp.launch(point_kernels(density.dtype)[1], out.shape, inputs=inputs, outputs=[out], device=density.device)
+    wp.launch(light_kernels(density.dtype)[2], size, inputs=inputs, outputs=[out, thin], device=density.device)

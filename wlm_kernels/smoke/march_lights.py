@@ -69,8 +69,10 @@ def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
 
 
 @wp.func
-def _between(nodes: wp.array3d[wp.vec2], q: wp.vec3) -> wp.vec2:
-    """Trilinear between nodes, of a place in units of their gaps."""
+def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+    """Optical depths to the light and to the opposite one, trilinear between nodes."""
+    inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
+    q = wp.cw_mul(lattice.axes * p - lattice.low, inverse)
     i = wp.clamp(int(q[0]), 0, nodes.shape[0] - 2)
     j = wp.clamp(int(q[1]), 0, nodes.shape[1] - 2)
     k = wp.clamp(int(q[2]), 0, nodes.shape[2] - 2)
@@ -207,12 +209,11 @@ def light_kernels(dtype: Any) -> _Kernels:
             cosine = wp.dot(along, r.direction)
             forth = phase(march.g, cosine)
             back = phase(march.g, -cosine)
-            inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
             for n in range(r.count):
                 p = r.origin + (r.first + (float(n) + offset) * r.length) * r.direction
                 x = extinction * _look(density, bricks, p) * r.length
                 if x > 0.0:
-                    depths = shadow * _between(nodes, wp.cw_mul(lattice.axes * p - lattice.low, inverse))
+                    depths = shadow * depths_at(nodes, lattice, p)
                     share = wp.exp(-tau) * absorbed(x)
                     if lattice.point == 0:
                         light += share * wp.vec2(forth * wp.exp(-depths[0]), back * wp.exp(-depths[1]))
@@ -293,30 +294,21 @@ def _lattice(shape: Sequence[int], place: Sequence[float], radius: float | None,
     return lattice, tuple(n + 1 for n in gaps)
 
 
-def light(
-    medium: Medium,
-    view: View,
-    place: Sequence[float],
-    radius: float | None,
-    march: March,
-    shadow: float,
-    out: wp.array,
-    *,
-    bricks: wp.array,
-) -> None:
-    """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
+def reach(
+    medium: Medium, place: Sequence[float], radius: float | None, march: March, *, bricks: wp.array
+) -> tuple[Lattice, wp.array]:
+    """Optical depths from places in the smoke to a light.
 
     Args:
         medium: The smoke.
-        view: The camera, [H, W] pixels.
         place: The direction to a light infinitely far off, of length 1, or the position of a point light, in voxels.
         radius: Of a point light, in voxels: at smaller distances its irradiance is as at this one. None: infinitely
             far off.
         march: As for `march_coarse`; nodes of a point light are 2^24 at most.
-        shadow: Extinction on the ways to the light over that along the camera's rays; 1 is smoke as it is.
-        out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
-            one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
         bricks: Of `occupied`.
+
+    Returns:
+        A lattice, and vec2 of its nodes: depths to the light and to the opposite one, which a point light has none of.
     """
     spacing = march.step if march.spacing is None else march.spacing
     step = spacing if march.light_step is None else march.light_step
@@ -332,8 +324,33 @@ def light(
         wp.launch(_add_up, counts[1:], [gaps], [nodes], device=device)
     else:
         wp.launch(kernels.reach, counts, [density, bricks, extinction, lattice, step], [nodes], device=device)
-    inputs = [density, bricks, nodes, extinction, view, lattice, parameters(march), shadow]
-    wp.launch(kernels.gather, out.shape[1:], inputs=inputs, outputs=[out], device=device)
+    return lattice, nodes
+
+
+def light(
+    medium: Medium,
+    view: View,
+    depths: tuple[Lattice, wp.array],
+    march: March,
+    shadow: float,
+    out: wp.array,
+    *,
+    bricks: wp.array,
+) -> None:
+    """Smoke of albedo 1 under a light and under the opposite one, or under a point light.
+
+    Args:
+        medium, march, bricks: As for `reach`.
+        view: The camera, [H, W] pixels.
+        depths: Of `reach`.
+        shadow: Extinction on the ways to the lights over that along the camera's rays; 1 is smoke as it is.
+        out: float [2, H, W], written: light scattered once, of irradiance 4 pi from the place and from the opposite
+            one. Of a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
+    """
+    density, (lattice, nodes) = medium.density, depths
+    inputs = [density, bricks, nodes, medium.extinction, view, lattice, parameters(march), shadow]
+    kernel = light_kernels(density.dtype).gather
+    wp.launch(kernel, out.shape[1:], inputs=inputs, outputs=[out], device=density.device)
 
 
 def seen(medium: Medium, view: View, march: March, out: wp.array, *, bricks: wp.array) -> None:

@@ -5,15 +5,15 @@ from wlm._facade import facade
 _PLACES = {
     "Environment": "wlm.smoke.transport.lights",
     "LitSmoke": "wlm.smoke.transport.lighting",
-    "OrdersModel": "wlm.smoke.transport.filtering",
+    "OrdersModel": "wlm.smoke.transport.orders",
     "PointLight": "wlm.smoke.transport.lights",
-    "ScatteredSmoke": "wlm.smoke.transport.filtering",
+    "ScatteredSmoke": "wlm.smoke.transport.orders",
     "Transport": "wlm.smoke.transport.tracing",
     "bake_sphere": "wlm.smoke.transport.sphere",
     "fine_march": "wlm.smoke.transport.lighting",
     "light_smoke": "wlm.smoke.transport.lighting",
-    "load_orders": "wlm.smoke.transport.filtering",
-    "scatter": "wlm.smoke.transport.filtering",
+    "load_orders": "wlm.smoke.transport.orders",
+    "scatter": "wlm.smoke.transport.orders",
     "trace": "wlm.smoke.transport.tracing",
 }
 

@@ -1,149 +1,122 @@
-"""What light of all orders is predicted from: planes of marches, blurred at scales of the smoke's box and shifted."""
+"""What light of all orders is predicted from: light scattered once, and what diffusion makes of each light."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-import warp as wp
 
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream, to_warp, torch_memory
+from wlm.interop import to_warp
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.lighting import LitSmoke, marching
+from wlm.smoke.transport.diffusion import Spreading
+from wlm.smoke.transport.lighting import LitSmoke, light_in, marching
 from wlm.smoke.transport.lights import AnyLight, PointLight
-from wlm_kernels.smoke import scales
+from wlm_kernels.smoke import orders
+from wlm_kernels.smoke.orders import FEATURES
 from wlm_kernels.smoke.settings import March
-
-SCALES = (1 / 64, 1 / 32, 1 / 16, 1 / 8)
-"""Standard deviations of blurs, in edges of the smoke's box."""
-
-BASES, SHIFTED = 9, 3
-FEATURES = 2 * (BASES + (BASES + SHIFTED) * len(SCALES))
 
 _THINNEST = 1e-4  # transparency below which depths count the same
 _STEPS = 130  # through the box, of a march for light of all orders
 _NODES = 64  # gaps of its lattice through the box, at least
 _SHORTEST = 0.25  # voxels: of a march in shorter steps nothing is left to gain
-_AROUND = 64  # steps through the box that light from all around is marched in, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What all light of one light is predicted from; H x W pixels.
+    """What all light of L lights is predicted from, of irradiance 4 pi; that of point lights at the smoke's centre.
 
     Attributes:
-        single: float32 tensor [H, W], S, light scattered once.
-        features: float32 tensor [FEATURES, H, W].
-        opacity: float32 tensor [H, W].
-        cosine: Of the angle between the directions to the light and to the camera.
-        depth: Logarithm of the smoke's mean optical depth along rays, weighed by opacity; a tensor of one number.
+        single: float32 tensor [L, H, W], S, light scattered once.
+        opposite: float32 tensor [L, H, W], the same under lights from the opposite directions.
+        diffused: float32 tensor [L, A, H, W], R by diffusion, light scattered more than once over an albedo's square.
+        from_thin: float32 tensor [L, A, H, W], what thin smoke has in it.
+        albedos: The A albedos.
+        transparency: float32 tensor [H, W].
+        thin: float32 tensor [H, W], opacity of thin smoke.
+        cosines: Of the angles between the directions to the lights and to the camera.
+        depth: float32 tensor [1], the logarithm of the smoke's mean optical depth along rays, weighed by opacity.
     """
 
     single: torch.Tensor
-    features: torch.Tensor
-    opacity: torch.Tensor
-    cosine: float
+    opposite: torch.Tensor
+    diffused: torch.Tensor
+    from_thin: torch.Tensor
+    albedos: tuple[float, ...]
+    transparency: torch.Tensor
+    thin: torch.Tensor
+    cosines: tuple[float, ...]
     depth: torch.Tensor
+
+    def features(self, light: int) -> torch.Tensor:
+        """What the weights of one light are for, float32 [A, FEATURES, H, W]."""
+        size = (len(self.albedos), FEATURES, *self.transparency.shape)
+        out = torch.empty(size, device=self.transparency.device)
+        of_light = (part[light] for part in (self.single, self.opposite, self.diffused, self.from_thin))
+        planes = (*of_light, self.transparency, self.thin)
+        orders.features(*map(to_warp, planes), to_warp(out))
+        return out
+
+    def of(self, light: int) -> "Inputs":
+        """Those of one light."""
+        names = ("single", "opposite", "diffused", "from_thin")
+        planes = {name: getattr(self, name)[light : light + 1] for name in names}
+        return replace(self, **planes, cosines=self.cosines[light : light + 1])
+
+    def at(self, albedo: float) -> "Inputs":
+        """Those at one of the albedos."""
+        n = self.albedos.index(albedo)
+        planes = {name: getattr(self, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
+        return replace(self, **planes, albedos=(albedo,))
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """The march whose planes the filter takes: in steps of a 130th of the smoke's longest edge, but of no less than a
-    quarter of a voxel, and with a lattice whose nodes are as far apart, but at least a voxel or, on small grids, a 64th
-    of the edge: more of them take far more time, and bring a tenth of a decibel."""
+    """The march whose planes light of all orders is made of: in steps of a 130th of the smoke's longest edge, but of no
+    less than a quarter of a voxel, and with a lattice whose nodes are as far apart, but at least a voxel or, on small
+    grids, a 64th of the edge: more of them take far more time, and bring a tenth of a decibel."""
     edge = max(volume.shape)
     step = max(_SHORTEST, edge / _STEPS)
     return March(step=step, spacing=max(min(1.0, edge / _NODES), step), jitter=0.0, g=g)
 
 
-def blur(planes: torch.Tensor, sigma: float) -> torch.Tensor:
-    """Blurs planes [C, H, W] by a Gaussian of a standard deviation in pixels; outside the image they are 0."""
-    height, width = planes.shape[1:]
-    with stream(device_name(planes.device)):
-        planes = planes.detach().float().contiguous()
-        made = scales.make_scales(to_warp(planes), [sigma], torch_memory(planes.device))[0]
-        small = wp.to_torch(made.planes).clone()
-        if made.factor > 1:
-            size = tuple(made.factor * n for n in small.shape[1:])
-            small = F.interpolate(small[None], size=size, mode="bilinear", align_corners=False)[0, :, :height, :width]
-    return small
-
-
-def ambient(volume: DensityVolume, camera: Camera, march: March | None = None) -> torch.Tensor:
-    """Light from all around, scattered once: the mean under lights along the camera's six axes, [H, W].
-
-    It is smooth: steps are as long as a 64th of the box, if those of the march (None: `orders_march`) are shorter.
-    """
-    march = orders_march(volume) if march is None else march
-    march = replace(march, step=max(march.step, max(volume.shape) / _AROUND))
-    with marching(volume, camera, march) as scene:
-        planes = torch.empty(len(camera.axes), 2, camera.height, camera.width, device=volume.device)
-        for axis, plane in zip(camera.axes, planes, strict=True):
-            scene.light(axis, None, plane)
-        return planes.mean((0, 1))
-
-
-def make_inputs(volume: DensityVolume, lit: LitSmoke, around: torch.Tensor) -> list[Inputs]:
-    """The filter's inputs for each light; arguments as for `input_maker`."""
-    make = input_maker(volume, lit, around)
-    return [make(n) for n in range(len(lit.lights))]
-
-
-def input_maker(volume: DensityVolume, lit: LitSmoke, around: torch.Tensor) -> Callable[[int], Inputs]:
-    """Blurs planes, and makes the filter's inputs of them for one light at a time, by number.
-
-    The light has an irradiance of 4 pi; of a point light that at the smoke's centre.
+def make_inputs(
+    volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedos: Sequence[float], march: March
+) -> tuple[LitSmoke, Inputs]:
+    """Marches to lights and spreads their light, inside `wlm.interop.stream`.
 
     Args:
         volume: The smoke.
-        lit: It under its lights.
-        around: Of `ambient`.
+        camera: Any.
+        lights: Any number.
+        albedos: Any number.
+        march: Of a g of 0.
+
+    Returns:
+        The smoke under light scattered once, and the inputs.
     """
-    camera, device = lit.camera, lit.planes.device
-    edge = volume.voxel * max(volume.shape)
-    pitch = camera.pitch
-    if camera.perspective:
-        away = float(np.linalg.norm(np.asarray(camera.position) - volume.centre))
-        pitch *= max(away, 0.5 * edge)
-    with stream(device_name(device)):
-        ways = [aim(light, volume) for light in lit.lights]
+    ways = [aim(light, volume) for light in lights]
+    with marching(volume, camera, march) as scene:
+        spreading = Spreading(scene, volume, lights)
+        lit = light_in(scene, volume, camera, lights, spreading.add)
+        diffused, thin = spreading.seen(albedos)
         single, opposite = lit.planes, lit.opposite
-        if any(isinstance(light, PointLight) for light in lit.lights):
-            single, opposite = _as_directional(volume, lit, ways)
-        opacity = 1.0 - lit.transparency
-        thickness = -torch.log(lit.transparency.clamp(min=_THINNEST))
-        # At least that of a tenth of a pixel's smoke.
-        mean = (thickness * opacity).sum() / opacity.sum().clamp(min=0.1)
-        depth = mean.clamp(min=1e-3).log()
-        arrays = (to_warp(part) for part in (single, opposite, around, lit.transparency))
-        bases = scales.make_bases(*arrays, _THINNEST, torch_memory(device))
-        blurred = scales.make_scales(bases, [scale * edge / pitch for scale in SCALES], torch_memory(device))
-
-    def make(n: int) -> Inputs:
-        across, rise, cosine = camera.axes @ ways[n][0]
-        with stream(device_name(device)):
-            features = torch.empty(FEATURES, camera.height, camera.width, device=device)
-            scales.features(bases, blurred, n, across, rise, to_warp(features))
-        return Inputs(single[n], features, opacity, float(cosine), depth)
-
-    return make
-
-
-def _as_directional(
-    volume: DensityVolume, lit: LitSmoke, ways: list[tuple[np.ndarray, float]]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Planes of lights of irradiance 4 pi, and of the opposite ones, with point lights as if they were far off."""
-    single = torch.stack([factor * plane for (_, factor), plane in zip(ways, lit.planes, strict=True)])
-    opposite = lit.opposite.clone()
-    with marching(volume, lit.camera, lit.march) as scene:
-        for n, (light, (toward, _)) in enumerate(zip(lit.lights, ways, strict=True)):
-            if isinstance(light, PointLight):
-                both = torch.empty(2, *single.shape[1:], device=single.device)
-                scene.light(-toward, None, both)
-                opposite[n] = both[0]
-    return single, opposite
+        if any(isinstance(light, PointLight) for light in lights):
+            single, diffused, opposite = single.clone(), diffused.clone(), opposite.clone()
+            for n, (light, (toward, factor)) in enumerate(zip(lights, ways, strict=True)):
+                if isinstance(light, PointLight):
+                    single[n] *= factor
+                    diffused[:, n] *= factor
+                    both = torch.empty(2, *single.shape[1:], device=single.device)
+                    scene.light(scene.reach(-toward, None), both)
+                    opposite[n] = both[0]
+    opacity = 1.0 - lit.transparency
+    thickness = -torch.log(lit.transparency.clamp(min=_THINNEST))
+    # At least that of a tenth of a pixel's smoke.
+    mean = (thickness * opacity).sum() / opacity.sum().clamp(min=0.1)
+    cosines = tuple(float(camera.axes[2] @ toward) for toward, _ in ways)
+    depth = mean.clamp(min=1e-3).log().reshape(1)
+    return lit, Inputs(single, opposite, *diffused, tuple(albedos), lit.transparency, thin, cosines, depth)
 
 
 def aim(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, float]:

@@ -2,11 +2,11 @@
 
 Six lightmaps, weighed, are 30% off for lights between their axes. The march that they are made by, with its lattice
 turned towards a light, costs as much for this light and the opposite one as for two of the six, and has the error of
-its step alone. `wlm.smoke.transport.filtering` makes light of all orders from such planes.
+its step alone. `wlm.smoke.transport.orders` makes light of all orders from such planes.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -153,16 +153,40 @@ def light_smoke(
         ValueError: A light without direction, or of a colour that isn't one.
     """
     march = fine_march(volume) if march is None else march
-    planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     with marching(volume, camera, march, shadow) as scene:
-        for n, light in enumerate(lights):
-            place, _, radius = in_voxels(light, volume)
-            scene.light(place, radius, planes[:, n] if radius is None else planes[:1, n])
-            if radius is not None:
-                planes[0, n] /= volume.voxel**2
-        transparency, emission, depth = scene.seen()
+        return light_in(scene, volume, camera, lights)
+
+
+def light_in(
+    scene: "Marching",
+    volume: DensityVolume,
+    camera: Camera,
+    lights: Sequence[AnyLight],
+    visit: Callable[[int, "Depths"], None] | None = None,
+) -> LitSmoke:
+    """As `light_smoke`, in a march that has been opened.
+
+    Args:
+        scene: The march.
+        volume, camera, lights: As for `light_smoke`.
+        visit: Called with each light's number and the depths to it, which aren't kept.
+    """
+    planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
+    for n, light in enumerate(lights):
+        place, _, radius = in_voxels(light, volume)
+        depths = scene.reach(place, radius)
+        scene.light(depths, planes[:, n] if radius is None else planes[:1, n])
+        if radius is not None:
+            planes[0, n] /= volume.voxel**2
+        if visit is not None:
+            visit(n, depths)
+    transparency, emission, depth = scene.seen()
     hot = emission if volume.temperature is not None else None
-    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, march)
+    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)
+
+
+Depths = tuple[march_lights.Lattice, wp.array]
+"""Optical depths to a light and to the opposite one, at the nodes of a lattice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +199,13 @@ class Marching:
     shadow: float
     bricks: wp.array
 
-    def light(self, place: Sequence[float], radius: float | None, out: torch.Tensor) -> None:
+    def reach(self, place: Sequence[float], radius: float | None) -> Depths:
+        """Optical depths to a light: see `march_lights.reach`."""
+        return march_lights.reach(self.medium, place, radius, self.march, bricks=self.bricks)
+
+    def light(self, depths: Depths, out: torch.Tensor) -> None:
         """Light scattered once: see `march_lights.light`; `out` is float32 [2, H, W], of a point light [1, H, W]."""
-        arguments = (place, radius, self.march, self.shadow, to_warp(out))
+        arguments = (depths, self.march, self.shadow, to_warp(out))
         march_lights.light(self.medium, self.view, *arguments, bricks=self.bricks)
 
     def seen(self) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Smoke, cameras and lights drawn at random, with all light that reaches the camera: what a filter of planes learns."""
+"""Smoke, cameras and lights drawn at random, with all light that reaches the camera: what a mix learns from."""
 
 from dataclasses import dataclass, replace
 

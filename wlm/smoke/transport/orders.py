@@ -1,0 +1,219 @@
+"""Light of all orders from light scattered once and from diffusion: a mix of planes, learned from path tracing.
+
+Light that is scattered on and on spreads as diffusion says, but for the smoke's edges, where it leaves, and its thin
+parts, where there is too little smoke for it. What is missing there can be told from the pixel itself: from light
+scattered once, from the same under the opposite light, from opacity, and from the share that thin smoke has in them. So
+R, all light but the first order, is a sum of such features, whose weights depend on the angle between light and camera
+and on the smoke's mean depth and were found by least squares. A network with two hidden layers of 32 units that was
+trained on the same adds nothing to it that holds for other smoke.
+
+Of an albedo a all light is a S + a^2 R(a), where S was scattered once and R more often. Weights are known at the
+albedos of `samples.ALBEDOS`, between which they are linear.
+"""
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume
+from wlm.formats.atomic import atomic_path
+from wlm.formats.npz import read_npz
+from wlm.interop import device_name, stream, to_warp
+from wlm.smoke.camera import Camera
+from wlm.smoke.shading import Ramp
+from wlm.smoke.transport.diffusion import share_of, thrown_by_fire
+from wlm.smoke.transport.features import Inputs, aim, make_inputs, orders_march
+from wlm.smoke.transport.lighting import LitSmoke, light_smoke, marching
+from wlm.smoke.transport.lights import AnyLight, checked_albedo
+from wlm.smoke.transport.samples import ALBEDOS
+from wlm_kernels.smoke import orders
+from wlm_kernels.smoke.orders import FEATURES, MIXES
+from wlm_kernels.smoke.settings import March
+
+_SHIPPED = Path(__file__).resolve().parents[2] / "data" / "smoke-orders.npz"
+_SHAPES = {"weights": (len(ALBEDOS), MIXES, FEATURES), "range": (2,)}
+_MOST_NUMBERS = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class OrdersModel:
+    """A learned mix, as it is in a file.
+
+    Attributes:
+        weights: float32 tensor [A, MIXES, FEATURES], at each of `ALBEDOS` of each product of powers of the cosine
+            between light and camera and of the depth.
+        known: float32 tensor [2], the least and the greatest depth that were learned, as in `Inputs`.
+    """
+
+    weights: torch.Tensor
+    known: torch.Tensor
+
+    def to(self, device: torch.device | str) -> "OrdersModel":
+        """The same on a device: copied there once."""
+        device = torch.device(device)
+        if self.weights.device == device:
+            return self
+        if device not in self._elsewhere:
+            self._elsewhere[device] = OrdersModel(self.weights.to(device), self.known.to(device))
+        return self._elsewhere[device]
+
+    @functools.cached_property
+    def _elsewhere(self) -> dict[torch.device, "OrdersModel"]:
+        return {}
+
+    def mixes(self, inputs: Inputs) -> torch.Tensor:
+        """What the weights of each light are mixed by, float32 [L, MIXES]."""
+        out = torch.empty(len(inputs.cosines), MIXES, device=inputs.depth.device)
+        for cosine, row in zip(inputs.cosines, out, strict=True):
+            orders.mixes(to_warp(inputs.depth), to_warp(self.known), cosine, to_warp(row))
+        return out
+
+    def light(self, inputs: Inputs, albedo: Sequence[float]) -> torch.Tensor:
+        """All light of each light alone, of irradiance 4 pi, float32 [L, H, W, 3].
+
+        Args:
+            inputs: Of the lights, at each channel's albedo.
+            albedo: R, G, B, 0 to 1.
+        """
+        places = [inputs.albedos.index(float(value)) for value in checked_albedo(albedo)]
+        lights, device = len(inputs.cosines), inputs.depth.device
+        out = torch.empty((*inputs.single.shape, 3), device=device)
+        if lights:
+            weights = torch.empty(lights, len(inputs.albedos), FEATURES, device=device)
+            of_lights = (inputs.single, inputs.opposite, inputs.diffused, inputs.from_thin)
+            planes = (*of_lights, inputs.transparency, inputs.thin)
+            learned = (self.weights, self.mixes(inputs))
+            nodes = [_between(value) for value in inputs.albedos]
+            settings = (inputs.albedos, nodes, places, to_warp(weights), to_warp(out))
+            orders.light(*map(to_warp, (*planes, *learned)), *settings)
+        return out
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the model as `.npz`, atomically.
+
+        Raises:
+            WlmError: Another suffix, or it can't be written.
+        """
+        if Path(path).suffix.lower() != ".npz":
+            raise WlmError(f"{path}: expected a name that ends in .npz")
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, weights=self.weights.cpu().numpy(), range=self.known.cpu().numpy())
+
+
+def _between(albedo: float) -> tuple[int, float]:
+    """The one of `ALBEDOS` before an albedo, by number, and its share of the way to the next; beyond them their end."""
+    at = min(max(albedo, ALBEDOS[0]), ALBEDOS[-1])
+    before = int(np.searchsorted(ALBEDOS, at, side="right").clip(1, len(ALBEDOS) - 1)) - 1
+    return before, (at - ALBEDOS[before]) / (ALBEDOS[before + 1] - ALBEDOS[before])
+
+
+def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
+    """Reads a model that `OrdersModel.save` wrote.
+
+    Args:
+        path: The file; None: the model that comes with wlm.
+
+    Raises:
+        WlmError: The file is missing, damaged or not such a model.
+    """
+    path = _SHIPPED if path is None else path
+    arrays = read_npz(path, lambda names: list(_SHAPES), numbers=_MOST_NUMBERS)
+    for name, shape in _SHAPES.items():
+        array = arrays[name]
+        if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
+            raise WlmError(f"{path}: {name}: expected finite float32 {shape}, found {array.dtype} {array.shape}")
+    if not arrays["range"][0] < arrays["range"][1]:
+        raise WlmError(f"{path}: range: expected the least depth before the greatest, found {arrays['range'].tolist()}")
+    return OrdersModel(*(torch.from_numpy(arrays[name]) for name in _SHAPES))
+
+
+@dataclass(frozen=True, eq=False)
+class ScatteredSmoke:
+    """Smoke under lights, with light of all orders.
+
+    Attributes:
+        lit: Light scattered once.
+        planes: float32 tensor [L, H, W, 3], all light of each light, of an irradiance or intensity of 4 pi.
+    """
+
+    lit: LitSmoke
+    planes: torch.Tensor
+
+    def shade(
+        self, *, background: torch.Tensor | Sequence[float] | None = None, ramp: Ramp | None = None
+    ) -> torch.Tensor:
+        """The picture, float32 [H, W, 3], linear; arguments as for `LitSmoke.shade`."""
+        return self.lit.compose(self.planes, background=background, ramp=ramp)
+
+
+def scatter(
+    volume: DensityVolume,
+    camera: Camera,
+    lights: Sequence[AnyLight],
+    albedo: Sequence[float] = (1.0, 1.0, 1.0),
+    *,
+    march: March | None = None,
+    model: OrdersModel | None = None,
+) -> ScatteredSmoke:
+    """Smoke under its lights with light of all orders, predicted from marches and from diffusion.
+
+    Args:
+        volume: The smoke.
+        camera: Any.
+        lights: Any number. Each is predicted alone; a point light in the smoke's box by diffusion as it is, one beside
+            the box as if its rays were nearly parallel.
+        albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
+        march: Of the planes. With a g other than 0 light scattered once is that of its phase function, and what is
+            scattered again that of smoke which scatters alike in all directions and is thinner by the share g^2 of
+            what goes straight on (delta-Eddington: Joseph, Wiscombe and Weinman 1976); the farther g is from 0, the
+            less exact. None: `orders_march`.
+        model: None: the one that comes with wlm.
+
+    Raises:
+        ValueError: Not an albedo.
+        WlmError: The model that comes with wlm can't be read.
+    """
+    colour = checked_albedo(albedo)
+    march = orders_march(volume) if march is None else march
+    model = (_shipped() if model is None else model).to(volume.device)
+    with stream(device_name(volume.device)):
+        alike, thinner, even = volume, colour, march
+        if march.g != 0.0:
+            # What goes straight on is as if it hadn't been scattered.
+            straight = max(march.g, 0.0) ** 2
+            left = 1.0 - float(colour.mean()) * straight
+            alike = replace(volume, extinction=volume.extinction * left)
+            thinner = (colour * (1.0 - straight) / left).clip(0.0, 1.0)
+            even = replace(march, g=0.0)
+        values = sorted(set(map(float, thinner)))
+        lit, inputs = make_inputs(alike, camera, lights, values, even)
+        planes = model.light(inputs, thinner)
+        for n, light in enumerate(lights):
+            if (factor := aim(light, alike)[1]) != 1.0:
+                planes[n] /= factor
+            if (near := share_of(light, alike)) > 0.0:
+                for channel, value in enumerate(map(float, thinner)):
+                    again = inputs.diffused[n, values.index(value)] / factor
+                    planes[n, ..., channel].lerp_(value * lit.planes[n] + value**2 * again, near)
+        if march.g != 0.0:
+            once = light_smoke(volume, camera, lights, march)
+            for channel in range(3):
+                planes[..., channel] += colour[channel] * once.planes - thinner[channel] * lit.planes
+            planes.clamp_(min=0.0)
+            lit = once
+        if volume.temperature is not None:
+            with marching(alike, camera, even) as scene:
+                thrown = thrown_by_fire(scene, alike, values)
+            lit = replace(lit, thrown=torch.stack([thrown[values.index(float(value))] for value in thinner], -1))
+    return ScatteredSmoke(lit, planes)
+
+
+@functools.cache
+def _shipped() -> OrdersModel:
+    return load_orders()

@@ -1,0 +1,240 @@
+"""Light of all orders, mixed from light scattered once and from what diffusion makes of it, pixel by pixel.
+
+Of an albedo a all light is a S + a^2 R. R is a sum of features of a pixel: of S, of the same under the opposite light,
+of opacity, of the R that diffusion finds, and of what thin smoke has in the last two. Their weights are a polynomial of
+the cosine between light and camera and of the smoke's depth, and linear between the albedos that they are known at.
+"""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+_OPTIONS = {"enable_backward": False}
+wp.set_module_options(_OPTIONS)
+
+FEATURES = 28
+MIXES = 10
+
+_THINNEST = wp.constant(1e-4)  # transparency below which depths count the same
+_BRIGHTEST = wp.constant(6.0)  # light of all orders over opacity: a white surface under irradiance 4 pi has 4
+
+_Features = wp.types.vector(length=FEATURES, dtype=float)
+_Mixes = wp.types.vector(length=MIXES, dtype=float)
+
+
+@wp.func
+def _features(
+    single: float, opposite: float, diffused: float, from_thin: float, transparency: float, thin: float
+) -> _Features:
+    opacity = 1.0 - transparency
+    root = wp.sqrt(single)
+    spread = wp.sqrt(diffused)
+    x = _Features()
+    x[0] = single
+    x[1] = opposite
+    x[2] = opacity
+    x[3] = opacity * opacity
+    x[4] = -wp.log(wp.max(transparency, _THINNEST)) / 9.0
+    x[5] = single * single
+    x[6] = single * opacity
+    x[7] = root
+    x[8] = spread
+    for n in range(9):
+        x[9 + n] = opacity * x[n]
+    x[18] = diffused
+    x[19] = diffused * opacity
+    x[20] = diffused * diffused
+    x[21] = diffused * opacity * opacity
+    x[22] = root * spread
+    x[23] = wp.sqrt(opposite) * spread
+    x[24] = from_thin
+    x[25] = from_thin * opacity
+    x[26] = thin
+    x[27] = thin * opacity
+    return x
+
+
+@wp.func
+def _mixes(cosine: float, depth: float) -> _Mixes:
+    m = _Mixes()
+    m[0] = 1.0
+    m[1] = cosine
+    m[2] = cosine * cosine
+    m[3] = depth
+    m[4] = depth * depth
+    m[5] = cosine * depth
+    m[6] = cosine * cosine * cosine
+    m[7] = depth * depth * depth
+    m[8] = cosine * cosine * depth
+    m[9] = cosine * depth * depth
+    return m
+
+
+@wp.kernel
+def _write_features(
+    # in:
+    single: wp.array2d[float],
+    opposite: wp.array2d[float],
+    diffused: wp.array3d[float],
+    from_thin: wp.array3d[float],
+    transparency: wp.array2d[float],
+    thin: wp.array2d[float],
+    # out:
+    out: wp.array4d[float],
+):
+    a, row, column = wp.tid()
+    s = single[row, column]
+    o = opposite[row, column]
+    d = diffused[a, row, column]
+    x = _features(s, o, d, from_thin[a, row, column], transparency[row, column], thin[row, column])
+    for n in range(FEATURES):
+        out[a, n, row, column] = x[n]
+
+
+@wp.kernel
+def _write_mixes(
+    # in:
+    depth: wp.array[float],
+    known: wp.array[float],
+    cosine: float,
+    # out:
+    out: wp.array[float],
+):
+    """One thread: depth in the range of those known, from -1 to 1."""
+    at = (2.0 * depth[0] - known[0] - known[1]) / (known[1] - known[0])
+    m = _mixes(cosine, wp.clamp(at, -1.0, 1.0))
+    for n in range(MIXES):
+        out[n] = m[n]
+
+
+@wp.kernel
+def _weigh(
+    # in:
+    weights: wp.array3d[float],
+    mixes: wp.array2d[float],
+    nodes: wp.vec3i,
+    shares: wp.vec3,
+    # out:
+    out: wp.array3d[float],
+):
+    """Weights of a light's features at an albedo, a share of the way from one node to the next."""
+    light, a, feature = wp.tid()
+    total = float(0.0)
+    for n in range(MIXES):
+        one = weights[nodes[a], n, feature]
+        total += mixes[light, n] * wp.lerp(one, weights[nodes[a] + 1, n, feature], shares[a])
+    out[light, a, feature] = total
+
+
+@wp.kernel
+def _light(
+    # in:
+    single: wp.array3d[float],
+    opposite: wp.array3d[float],
+    diffused: wp.array4d[float],
+    from_thin: wp.array4d[float],
+    transparency: wp.array2d[float],
+    thin: wp.array2d[float],
+    weights: wp.array3d[float],
+    albedos: wp.vec3,
+    places: wp.vec3i,
+    # out:
+    out: wp.array4d[float],
+):
+    n, row, column = wp.tid()
+    t = transparency[row, column]
+    s = single[n, row, column]
+    found = wp.vec3()
+    o = opposite[n, row, column]
+    for a in range(diffused.shape[1]):
+        x = _features(s, o, diffused[n, a, row, column], from_thin[n, a, row, column], t, thin[row, column])
+        more = float(0.0)
+        for m in range(FEATURES):
+            more += weights[n, a, m] * x[m]
+        once = albedos[a] * s
+        total = once + albedos[a] * albedos[a] * wp.max(more, 0.0)
+        # No more than a white surface's, and no less than was scattered once.
+        found[a] = wp.max(wp.min(total, _BRIGHTEST * (1.0 - t)), once)
+    for channel in range(3):
+        out[n, row, column, channel] = found[places[channel]]
+
+
+def features(
+    single: wp.array,
+    opposite: wp.array,
+    diffused: wp.array,
+    from_thin: wp.array,
+    transparency: wp.array,
+    thin: wp.array,
+    out: wp.array,
+) -> None:
+    """The features of one light.
+
+    Args:
+        single, opposite: float [H, W], light scattered once, of the light and of the opposite one.
+        diffused, from_thin: float [A, H, W], R by diffusion at some albedos, and what thin smoke has in it.
+        transparency: float [H, W].
+        thin: float [H, W], opacity of thin smoke.
+        out: float [A, FEATURES, H, W], written.
+    """
+    inputs = [single, opposite, diffused, from_thin, transparency, thin]
+    wp.launch(_write_features, diffused.shape, inputs, [out], device=out.device)
+
+
+def mixes(depth: wp.array, known: wp.array, cosine: float, out: wp.array) -> None:
+    """What the weights of a light are mixed by.
+
+    Args:
+        depth: float [1], the logarithm of the smoke's mean optical depth.
+        known: float [2], its range in the training; beyond it all is as at its end.
+        cosine: Of the angle between the directions to the light and to the camera.
+        out: float [MIXES], written.
+    """
+    wp.launch(_write_mixes, 1, [depth, known, float(cosine)], [out], device=out.device)
+
+
+def light(
+    single: wp.array,
+    opposite: wp.array,
+    diffused: wp.array,
+    from_thin: wp.array,
+    transparency: wp.array,
+    thin: wp.array,
+    weights: wp.array,
+    mixed: wp.array,
+    albedos: Sequence[float],
+    nodes: Sequence[tuple[int, float]],
+    places: Sequence[int],
+    buffer: wp.array,
+    out: wp.array,
+) -> None:
+    """All light of each light alone.
+
+    Args:
+        single, opposite: float [L, H, W].
+        diffused, from_thin: float [L, A, H, W], R by diffusion at one to three albedos, and what thin smoke has in it.
+        transparency: float [H, W].
+        thin: float [H, W], opacity of thin smoke.
+        weights: float [N, MIXES, FEATURES], at N albedos.
+        mixed: float [L, MIXES], of `mixes`.
+        albedos: A.
+        nodes: Of each albedo the one of N before it, and the share of the way to the next.
+        places: The albedo of each channel.
+        buffer: float [L, A, FEATURES], written.
+        out: float [L, H, W, 3], written.
+    """
+    fill = [0] * (3 - len(albedos))
+    before, shares = wp.vec3i(*(n for n, _ in nodes), *fill), wp.vec3(*(share for _, share in nodes), *fill)
+    wp.launch(_weigh, buffer.shape, [weights, mixed, before, shares], [buffer], device=out.device)
+    inputs = [
+        single,
+        opposite,
+        diffused,
+        from_thin,
+        transparency,
+        thin,
+        buffer,
+        wp.vec3(*albedos, *fill),
+        wp.vec3i(*places),
+    ]
+    wp.launch(_light, single.shape, inputs, [out], device=out.device)
