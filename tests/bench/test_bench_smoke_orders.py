@@ -10,7 +10,7 @@ from builders.bench_rows import ENVIRONMENT, check_command
 from builders.smoke_plumes import facing, plume
 
 import wlm.bench.smoke_orders as bench
-from wlm.baselines.smoke_orders import FITTED, octaves, three_octaves
+from wlm.baselines.smoke_orders import FITTED, SCALES, filter_planes, octaves, three_octaves
 from wlm.bench import read_json, tables, write_json
 from wlm.bench.path_tracer import denoised_picture
 from wlm.bench.runner import Bench
@@ -30,7 +30,15 @@ SINGLE = GridSizes((12, 16), extinctions=(20.0,), pixels=10, samples=64)
 SMALL = {"plumes": 1, "pixels": 10, "samples": 96, "scale": 0.08, "frames": 20, "sides": 1}
 OTHER = {"views": 1, "samples": 32, "cells": 12}
 TINY = replace(QUICK, **SMALL, repeats=1, single=SINGLE, other=OTHER)
-WAYS = ("single scattering", "single x gain", "three octaves", "fitted octaves", "diffusion", "learned mix")
+WAYS = (
+    "single scattering",
+    "single x gain",
+    "three octaves",
+    "fitted octaves",
+    "fitted filter",
+    "diffusion",
+    "learned mix",
+)
 
 
 @pytest.fixture(scope="module")
@@ -144,5 +152,10 @@ def test_rivals_are_nearer_than_single_scattering(device: str):
     wanted = trace(volume, camera, lights, samples=256).total
     once = light_smoke(volume, camera, lights).shade()
     assert psnr(three_octaves(volume, camera, lights, 1.0), wanted) > psnr(once, wanted) + 2.0
+    planes = filter_planes(volume, camera, lights)
+    assert planes.shape == (1, 12 * (1 + len(SCALES)), 16, 16)
+    # A blur keeps what doesn't leave the image.
+    assert float(planes[0, 6].sum()) == pytest.approx(float(planes[0, 0].sum()), rel=0.02)
+    assert torch.allclose(planes[0, 30:], planes[0, 3] * planes[0, :30], atol=1e-6)
     made = octaves(volume, camera, lights)
     assert made.shape == (len(FITTED), 16, 16, 3) and torch.allclose(made[0], once, atol=0.02)

@@ -1,13 +1,15 @@
-"""What light of all orders is compared with: octaves of light scattered once.
+"""What light of all orders is compared with: octaves of light scattered once, and a linear filter of its planes.
 
-Wrenninge et al. 2013, "Oz: the great and volumetric": light scattered more often is light scattered once in thinner
-smoke.
+Octaves: Wrenninge et al. 2013, "Oz: the great and volumetric"; light scattered more often is light scattered once in
+thinner smoke. Filter: light that is scattered on comes out blurred, so planes blurred at several scales have most of
+it.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
@@ -20,6 +22,12 @@ CLASSIC = ((0.5, 0.5), (0.25, 0.25))
 
 FITTED = tuple((seen, shadow) for shadow in (1.0, 0.5, 0.25, 0.1, 0.04) for seen in (1.0, 0.4, 0.15))
 """Extinctions along the camera's rays and on the way to the light, over the smoke's own, of octaves to be fitted."""
+
+SCALES = (1 / 64, 1 / 32, 1 / 16, 1 / 8)
+"""Standard deviations of the filter's blurs, in edges of the smoke's box."""
+
+_REACH = 3.0  # standard deviations
+_THINNEST = 1e-4  # transparency below which depths count the same
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
@@ -40,3 +48,37 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
         thinner = replace(volume, extinction=seen * volume.extinction)
         made.append(light_smoke(thinner, camera, lights, march, shadow=shadow / seen).shade())
     return torch.stack(made)
+
+
+def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
+    """What a linear filter mixes for each light of irradiance 4 pi, float32 [L, P, H, W].
+
+    Light of the light itself and of the opposite one, from all around, opacity, its square and optical depth: as they
+    are and blurred, and all of it times opacity.
+
+    Args:
+        volume: The smoke.
+        camera: Orthographic.
+        lights: At least one.
+    """
+    march = orders_march(volume)
+    lit = light_smoke(volume, camera, lights, march)
+    six = light_smoke(volume, camera, [Light(tuple(map(float, axis))) for axis in camera.axes], march)
+    around = 0.5 * (six.planes + six.opposite).mean(0)
+    opacity, depth = 1.0 - lit.transparency, -torch.log(lit.transparency.clamp(min=_THINNEST))
+    shared = torch.stack([around, opacity, opacity**2, depth])
+    planes = torch.cat([lit.planes[:, None], lit.opposite[:, None], shared.expand(len(lights), -1, -1, -1)], 1)
+    edge = volume.voxel * max(volume.shape) / camera.pitch
+    every = torch.cat([planes, *(_blurred(planes, scale * edge) for scale in SCALES)], 1)
+    return torch.cat([every, opacity * every], 1)
+
+
+def _blurred(planes: torch.Tensor, sigma: float) -> torch.Tensor:
+    """By a Gaussian of so many pixels, black outside, [L, P, H, W]."""
+    reach = max(1, round(_REACH * sigma))
+    away = torch.arange(-reach, reach + 1, device=planes.device) / max(sigma, 1e-3)
+    weights = torch.exp(-0.5 * away**2)
+    weights /= weights.sum()
+    flat = planes.flatten(0, 1)[:, None]
+    flat = F.conv2d(flat, weights[None, None, None, :], padding=(0, reach))
+    return F.conv2d(flat, weights[None, None, :, None], padding=(reach, 0)).reshape(planes.shape)

@@ -9,14 +9,15 @@ The methods, each a row; a picture's PSNR and FLIP are in sRGB, against path tra
 
 - "single scattering", and "single x gain", a factor on it;
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
+- "fitted filter", a linear one of planes blurred at four scales;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
 - "diffusion" on a grid of 32^3 beside single scattering, which is a part of
 - "learned mix", what `wlm.smoke.transport.scatter` does.
 
-The gain and the weights of the fitted octaves are those nearest to the very references that they are scored by: other
-smoke would give no better ones. A reference is the mean of two traced apart: "path tracing" is its own noise, which
-their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible, after
-the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
+The gain and the weights of the fitted octaves and filter are those nearest to the very references that they are scored
+by: other smoke would give no better ones. A reference is the mean of two traced apart: "path tracing" is its own noise,
+which their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible,
+after the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
 
 Rows of what the mix adds to diffusion, light by light on grids of every size, are those of `smoke_grids`; of other
 phase functions, point lights in the smoke and fire those of `smoke_other_light`.
@@ -33,7 +34,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from wlm.baselines.smoke_orders import FITTED, octaves, three_octaves
+from wlm.baselines.smoke_orders import FITTED, filter_planes, octaves, three_octaves
 from wlm.bench.path_tracer import denoised_picture, denoiser_device, has_denoiser
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
@@ -71,7 +72,8 @@ _CURVE = 1.16  # as the mix's fit weighs errors
 _RIDGE = 1e-6
 _VISIBLE = 0.05  # opacity
 _OF_MEAN = 20.0 * math.log10(2.0)  # dB, by which the mean of two has less noise than their difference
-_TRACED, _DENOISED, _GAIN, _OCTAVES = "path tracing", "1 sample, denoised", "single x gain", "fitted octaves"
+_TRACED, _DENOISED, _GAIN = "path tracing", "1 sample, denoised", "single x gain"
+_OCTAVES, _FILTER = "fitted octaves", "fitted filter"
 
 
 @dataclass(frozen=True)
@@ -191,10 +193,10 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
         traced.append(tuple(_trace(shot, sizes.samples // 2, salt) for salt in (0, 1)))
         once = _once(shot)
         opacity.append(1.0 - once.transparency)
-        fitted = _octaves_by_angle(shot)
+        fitted = {_GAIN: once.shade()[None], _OCTAVES: _octaves_by_angle(shot), _FILTER: _filter_by_angle(shot)}
         for albedo in ALBEDOS:
             pictures = {way: make(shot, albedo) for way, make in _ways().items()}
-            for way, picture in (pictures | {_GAIN: once.shade()[None], _OCTAVES: fitted}).items():
+            for way, picture in (pictures | fitted).items():
                 found[albedo].setdefault(way, []).append(picture)
     bench.note(f"{name}: times")
     times = _times(bench, shots[0], sizes)
@@ -203,7 +205,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
     for albedo in ALBEDOS:
         halves = [tuple(half[albedo] for half in pair) for pair in traced]
         truth = [0.5 * (one + other) for one, other in halves]
-        for way in (_GAIN, _OCTAVES):
+        for way in (_GAIN, _OCTAVES, _FILTER):
             found[albedo][way] = _fitted(found[albedo][way], truth)
         scene, notes = f"{name}, albedo {albedo:g}", f"{len(shots)} pictures"
         for way, timing in times.items():
@@ -255,6 +257,16 @@ def _octaves_by_angle(shot: Shot) -> torch.Tensor:
     return parts.flatten(0, 1)
 
 
+def _filter_by_angle(shot: Shot) -> torch.Tensor:
+    """The filter's planes of each light times powers of the cosine between it and the camera, [P * 3, H, W, 3]."""
+    parts = 0.0
+    for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
+        cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
+        powers = torch.cat([cosine**power * planes for power in range(_POWERS)])
+        parts = parts + powers[..., None] * torch.tensor(light.irradiance, device=planes.device) / _FOUR_PI
+    return parts
+
+
 def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
     """All light at each of `ALBEDOS`, [H, W, 3]."""
     seed = 2 * shot.seed + salt
@@ -280,12 +292,13 @@ def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
     ways, albedo = _ways(), ALBEDOS[0]
     calls = {way: lambda make=make: make(shot, albedo) for way, make in ways.items()}
     calls[_OCTAVES] = lambda: octaves(shot.volume, shot.camera, shot.lights)
+    calls[_FILTER] = lambda: filter_planes(shot.volume, shot.camera, shot.lights)
     waiting = {way: calls.pop(way) for way in (_DENOISED,) if way in calls}
     if bench.device != "cpu":
         calls = {way: bench.replay(call) for way, call in calls.items()}
     times = bench.time(calls) | (bench.time(waiting, few=True) if waiting else {})
     times[_GAIN] = times["single scattering"]
-    order = ("single scattering", _GAIN, "three octaves", _OCTAVES, _DENOISED, "diffusion", "learned mix")
+    order = ("single scattering", _GAIN, "three octaves", _OCTAVES, _FILTER, _DENOISED, "diffusion", "learned mix")
     return {way: times[way] for way in order if way in times}
 
 
