@@ -313,7 +313,9 @@ def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_pat
     check_a_stop_is_resumed(monkeypatch, tmp_path, words)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_a_signal_keeps_the_fit(number, code, folder, profile, tmp_path):
     # Ten thousand times more steps than can be done before the signal comes.
     words = ["lightmap", "compress", folder, "--profile", profile, "--steps", 3_000_000]

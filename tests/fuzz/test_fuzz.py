@@ -80,6 +80,7 @@ def test_a_reader_that_refuses_its_own_good_file_is_an_error(faulty):
         next(faulty.run("nothing", 0, 1))
 
 
+@pytest.mark.slow
 def test_counts_of_several_workers():
     seen = []
     tallies = campaign({"obj": 30, "yaml-atlas": 20}, 2, first=1000, done=lambda name, tally: seen.append(name))

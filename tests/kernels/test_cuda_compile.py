@@ -91,7 +91,7 @@ def test_modules(name: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
-@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+@pytest.mark.parametrize("hidden", _slow_but(8, (16, *WIDTHS[1:])))
 def test_mlp(hidden: int, gelu: str, tmp_path: Path):
     """ "fast" has an instruction that only a GPU has; three outputs, and another number."""
     _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path / "three")
@@ -106,14 +106,14 @@ def test_step(dynamic: bool, hidden: int, gelu: str, tmp_path: Path):
     _compile_all(vars(lightmap_step.step_kernels(dynamic, hidden, gelu, "cuda")).values(), tmp_path)
 
 
-@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+@pytest.mark.parametrize("hidden", _slow_but(8, (16, *WIDTHS[1:])))
 @pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
 def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
     """Decoding a texel a thread."""
     _compile_all(lightmap_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", _slow_but(True, [False]))
 @pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
 def test_strip_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding four texels a thread."""

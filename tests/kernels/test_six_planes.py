@@ -178,7 +178,7 @@ def test_wrong_edges_and_reaches_are_refused():
             kernels(5, reach, False, False)
 
 
-@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("half", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_compiles_for_a_gpu(tmp_path, half):
     made = kernels(5, 8, half, True)
     alone = {"encode": smoke_planes._encode_six, "decode": smoke_planes._decode}

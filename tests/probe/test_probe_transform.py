@@ -271,6 +271,7 @@ def test_more_probes_than_the_bytes_can_tell_are_refused_before_they_are_placed(
         dataclasses.replace(model, probes=1 << 20, dead=np.zeros(0, bool), places=many).save(tmp_path / "a.wlm")
 
 
+@pytest.mark.slow
 def test_held_out_probes_of_a_file_with_places_get_no_bytes_for_them():
     probes = synthetic(200)
     plain, placed = (wlm.probe.compress(probes, positions=positions) for positions in (False, True))

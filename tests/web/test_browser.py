@@ -83,7 +83,14 @@ def model(lightmaps):
     return wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(static_budget_db=20.0))
 
 
-@pytest.mark.parametrize(("unpacked", "interpolation"), [(False, "radiance"), (True, "radiance"), (False, "network")])
+def _long(*values: object) -> object:
+    """Of the long run alone: a page takes seconds."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("unpacked", "interpolation"), [(False, "radiance"), _long(True, "radiance"), _long(False, "network")]
+)
 def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpolation):
     assert sorted(model.kind.tolist()) == [0, 1, 2, 3]
     model = dataclasses.replace(model, profile=model.profile.override({"interpolation": interpolation}))
@@ -99,7 +106,9 @@ def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpol
         assert apart.max() < 2 / 255
 
 
-@pytest.mark.parametrize(("unpacked", "interpolation"), [(False, "radiance"), (True, "radiance"), (True, "network")])
+@pytest.mark.parametrize(
+    ("unpacked", "interpolation"), [_long(False, "radiance"), (True, "radiance"), _long(True, "network")]
+)
 def test_frames_of_all_modes_and_video_decode_as_in_python(tmp_path, show, unpacked, interpolation):
     model = random_model((4, 1, 2, 4, 5, 6), times=(0.0, 7.5, 19.0), interpolation=interpolation)
     model.save(tmp_path / "frames.wlm")
@@ -155,7 +164,7 @@ def test_the_original_its_error_and_the_wipe(tmp_path, show):
     assert np.abs(picture(page) - decoded).max() > 50
 
 
-@pytest.mark.parametrize("touch", [False, True])
+@pytest.mark.parametrize("touch", [_long(False), True])
 def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, touch):
     model.save(tmp_path / "four.wlm")
     small_sets.write_set(tmp_path / "set", lightmaps)
@@ -364,7 +373,7 @@ def test_atlases_read_as_in_python(kind, tmp_path, show):
     assert np.abs(picture(page) - before).max() > 20
 
 
-@pytest.mark.parametrize("outputs", [27, 12, 48])
+@pytest.mark.parametrize("outputs", [27, _long(12), _long(48)])
 def test_probes_decode_as_in_python(outputs, tmp_path, show):
     model = probe_models.random_model(count=12, probes=40, outputs=outputs, positions=True)
     model.save(tmp_path / "probe.wlm")

@@ -173,7 +173,7 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
 
 def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -> list[Row]:
     """Measures it at the given sizes; the rest as for `run`."""
-    bench = Bench("smoke", device, progress, clock="time_ms", warmup=2, repeats=sizes.repeats, few=2)
+    bench = Bench("smoke", device, progress, clock="time_ms", repeats=sizes.repeats, few=2)
     if not has_denoiser():
         bench.note(f"{_DENOISED}: left out, pyoidn isn't installed: wlm[bake]")
     plumes, jet = [_plume(sizes, number, bench.device) for number in range(sizes.plumes)], _jet(sizes, bench)

@@ -228,7 +228,7 @@ def spread(
     while max(grids[-1][1].shape[1:]) > _FEWEST:
         counts, edges = grids[-1][1].shape[1:], grids[-1][2]
         fewer = tuple((n + 1) // 2 for n in counts)
-        made = [medium.buffer((len_, *fewer), float) for len_ in (1, source.shape[0])]
+        made = [medium.buffer((count, *fewer), float) for count in (1, source.shape[0])]
         for fine, coarse in zip(grids[-1], made, strict=False):
             wp.launch(_coarsen, coarse.shape, [fine], [coarse], device=device)
         grids.append((*made, wp.vec3(*(edge * n / m for edge, n, m in zip(edges, counts, fewer, strict=True)))))
