@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from builders.bench_rows import ENVIRONMENT, check_command
+from builders.orders import input_alone
 from builders.smoke_plumes import facing, plume
 
 import wlm.baselines.smoke_orders as rivals
@@ -89,9 +90,7 @@ def test_a_mix_that_takes_from_its_input_is_seen():
     """By the least gain of any light; one that hands on its input has none."""
     bench_ = Bench("smoke", "cpu", None, clock="time_ms", warmup=0, repeats=1, few=1)
     model = load_orders()
-    same = torch.zeros(model.weights.shape)
-    same[:, 0, 18] = 1.0
-    wild, none = (OrdersModel(weights, model.known) for weights in (1.5 * model.weights, same))
+    wild, none = OrdersModel(1.5 * model.weights, model.known), input_alone()
     sizes = replace(SINGLE, grids=(12,))
     worst, still = (grid_rows(bench_, sizes, each)[0] for each in (wild, none))
     assert worst["gain_min"] < -0.5 and abs(still["gain_min"]) < 1e-3 and abs(still["gain"]) < 1e-3

@@ -9,11 +9,12 @@ import pytest
 import torch
 from builders.smoke_plumes import plume
 
+from wlm.baselines.smoke_orders import diffused
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.transport.diffusion import CoarseSmoke, diffused, share_of
+from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
 from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.learning import psnr
 from wlm.smoke.transport.lighting import light_smoke, marching
@@ -123,10 +124,9 @@ def test_diffusion_is_nearer_than_single_scattering(device: str):
     camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=16)
     lights = [Light((1.0, 0.5, 0.6))]
     wanted = trace(volume, camera, lights, samples=256).total
-    march = orders_march(volume)
-    found, once = diffused(volume, camera, lights, 1.0, march), light_smoke(volume, camera, lights).shade()
+    found, once = diffused(volume, camera, lights, 1.0), light_smoke(volume, camera, lights).shade()
     assert psnr(found, wanted) > psnr(once, wanted) + 6.0
-    assert not diffused(volume, camera, lights, 0.0, march).any() and not diffused(volume, camera, [], 1.0, march).any()
+    assert not diffused(volume, camera, lights, 0.0).any() and not diffused(volume, camera, [], 1.0).any()
 
 
 def test_diffusion_fades_out_beside_the_smoke():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from builders.orders import input_alone
 from builders.smoke_plumes import plume
 
 from wlm.bench.smoke_light import make_cloud
@@ -37,8 +38,7 @@ def lessons(unseen) -> list[Lesson]:
 
 def diffused(inputs: Inputs, albedo: float) -> torch.Tensor:
     """What the mix begins with, [H, W]: single scattering and diffusion."""
-    at = inputs.at(albedo)
-    return albedo * at.single[0] + albedo**2 * at.diffused[0, 0]
+    return inputs.by_diffusion(albedo)[0]
 
 
 def mixed(model: OrdersModel, inputs: Inputs, albedo: float) -> torch.Tensor:
@@ -65,12 +65,9 @@ def test_the_mix_is_worth_its_name_and_never_worse(lessons):
     untrained = 0.1 * torch.randn(model.weights.shape, generator=random)
     assert not holds(OrdersModel(untrained, model.known))
     # Nor does one that hands on its input.
-    same = torch.zeros(model.weights.shape)
-    same[:, 0, 18] = 1.0
-    same = OrdersModel(same, model.known)
-    assert not holds(same)
+    assert not holds(input_alone())
     inputs = lessons[0].inputs
-    assert torch.allclose(mixed(same, inputs, 0.9), diffused(inputs, 0.9), atol=1e-6)
+    assert torch.allclose(mixed(input_alone(), inputs, 0.9), diffused(inputs, 0.9), atol=1e-6)
 
 
 @pytest.mark.parametrize("cells", [32, 64])

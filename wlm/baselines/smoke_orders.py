@@ -1,4 +1,4 @@
-"""What light of all orders is compared with: octaves of light scattered once, and a linear filter of its planes.
+"""What light of all orders is compared with: octaves of light scattered once, a linear filter, diffusion alone.
 
 Octaves: Wrenninge et al. 2013, "Oz: the great and volumetric"; light scattered more often is light scattered once in
 thinner smoke. Filter: light that is scattered on comes out blurred, so planes blurred at several scales have most of
@@ -12,10 +12,12 @@ import torch
 import torch.nn.functional as F
 
 from wlm.fluid.volume import DensityVolume
+from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import orders_march
+from wlm.smoke.transport.features import make_inputs, orders_march
 from wlm.smoke.transport.lighting import light_smoke
+from wlm_kernels.smoke.orders import THINNEST
 
 CLASSIC = ((0.5, 0.5), (0.25, 0.25))
 """Of the second and the third octave the light, and the extinction on the way to it, over the first's."""
@@ -27,7 +29,6 @@ SCALES = (1 / 64, 1 / 32, 1 / 16, 1 / 8)
 """Standard deviations of the filter's blurs, in edges of the smoke's box."""
 
 _REACH = 3.0  # standard deviations
-_THINNEST = 1e-4  # transparency below which depths count the same
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
@@ -50,6 +51,13 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
     return torch.stack(made)
 
 
+def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
+    """A picture by single scattering and diffusion alone, which the learned mix begins with, float32 [H, W, 3]."""
+    with stream(device_name(volume.device)):
+        lit, inputs = make_inputs(volume, camera, lights, [albedo], orders_march(volume))
+        return lit.compose(inputs.by_diffusion(albedo)[..., None].expand(-1, -1, -1, 3))
+
+
 def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
     """What a linear filter mixes for each light of irradiance 4 pi, float32 [L, P, H, W].
 
@@ -65,7 +73,7 @@ def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
     lit = light_smoke(volume, camera, lights, march)
     six = light_smoke(volume, camera, [Light(tuple(map(float, axis))) for axis in camera.axes], march)
     around = 0.5 * (six.planes + six.opposite).mean(0)
-    opacity, depth = 1.0 - lit.transparency, -torch.log(lit.transparency.clamp(min=_THINNEST))
+    opacity, depth = 1.0 - lit.transparency, -torch.log(lit.transparency.clamp(min=THINNEST))
     shared = torch.stack([around, opacity, opacity**2, depth])
     planes = torch.cat([lit.planes[:, None], lit.opposite[:, None], shared.expand(len(lights), -1, -1, -1)], 1)
     edge = volume.voxel * max(volume.shape) / camera.pitch

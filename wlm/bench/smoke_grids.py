@@ -83,9 +83,8 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
         with stream(device):
             _, inputs = make_inputs(volume, camera, lights, _ALBEDOS, orders_march(volume))
             for albedo in _ALBEDOS:
-                known = inputs.at(albedo)
-                diffused = albedo * known.single + albedo**2 * known.diffused[:, 0]
-                mixed = model.light(known, (albedo,) * 3)[..., 0]
+                diffused = inputs.by_diffusion(albedo)
+                mixed = model.light(inputs.at(albedo), (albedo,) * 3)[..., 0]
                 truth = (traced if albedo == 1.0 else traced.with_albedo((albedo,) * 3)).planes.sum(1)[..., 0]
                 for one, other, wanted in zip(diffused, mixed, truth, strict=True):
                     yield psnr(one, wanted), psnr(other, wanted)

@@ -34,7 +34,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from wlm.baselines.smoke_orders import FITTED, filter_planes, octaves, three_octaves
+from wlm.baselines.smoke_orders import FITTED, diffused, filter_planes, octaves, three_octaves
 from wlm.bench.path_tracer import denoised_picture, denoiser_device, has_denoiser
 from wlm.bench.rows import Row
 from wlm.bench.runner import Bench, Note
@@ -50,7 +50,6 @@ from wlm.smoke.planes import to_srgb
 from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.transport.diffusion import diffused
 from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.learning import FAINT, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
@@ -226,7 +225,7 @@ def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
     ways = {
         "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
         "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
-        "diffusion": _diffused,
+        "diffusion": lambda shot, albedo: diffused(shot.volume, shot.camera, shot.lights, albedo),
         "learned mix": lambda shot, albedo: scatter(shot.volume, shot.camera, shot.lights, (albedo,) * 3).shade(),
     }
     return ways | ({_DENOISED: _denoised} if has_denoiser() else {})
@@ -234,10 +233,6 @@ def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
 
 def _once(shot: Shot) -> LitSmoke:
     return light_smoke(shot.volume, shot.camera, shot.lights, orders_march(shot.volume))
-
-
-def _diffused(shot: Shot, albedo: float) -> torch.Tensor:
-    return diffused(shot.volume, shot.camera, shot.lights, albedo, orders_march(shot.volume))
 
 
 def _denoised(shot: Shot, albedo: float) -> torch.Tensor:

@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from wlm_kernels.smoke.fluence import between_cells
 from wlm_kernels.smoke.march import Medium, View, absorbed, clip, marched_ray, size_of
 from wlm_kernels.smoke.march_coarse import by_bricks
 from wlm_kernels.smoke.march_lights import Lattice, depths_at
@@ -153,30 +154,11 @@ def light_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
             p = r.origin + (r.first + (float(m) + 0.5) * r.length) * r.direction
             x = extinction * by_bricks(density, bricks, p) * r.length
             if x > 0.0:
-                q = wp.cw_div(p, cell) - wp.vec3(0.5, 0.5, 0.5)
-                i = wp.clamp(int(wp.floor(q[0])), 0, wp.max(light.shape[1] - 2, 0))
-                j = wp.clamp(int(wp.floor(q[1])), 0, wp.max(light.shape[2] - 2, 0))
-                k = wp.clamp(int(wp.floor(q[2])), 0, wp.max(light.shape[3] - 2, 0))
-                fx = wp.clamp(q[0] - float(i), 0.0, 1.0)
-                fy = wp.clamp(q[1] - float(j), 0.0, 1.0)
-                fz = wp.clamp(q[2] - float(k), 0.0, 1.0)
-                a = wp.min(i + 1, light.shape[1] - 1)
-                b = wp.min(j + 1, light.shape[2] - 1)
-                c = wp.min(k + 1, light.shape[3] - 1)
-                near = wp.lerp(
-                    wp.lerp(light[n, i, j, k], light[n, i, j, c], fz),
-                    wp.lerp(light[n, i, b, k], light[n, i, b, c], fz),
-                    fy,
-                )
-                far = wp.lerp(
-                    wp.lerp(light[n, a, j, k], light[n, a, j, c], fz),
-                    wp.lerp(light[n, a, b, k], light[n, a, b, c], fz),
-                    fy,
-                )
+                here = between_cells(light, n, wp.cw_div(p, cell) - wp.vec3(0.5, 0.5, 0.5))
                 share = wp.exp(-tau) * absorbed(x)
                 clear = share * wp.exp(-x / r.length * wp.min(cell))
-                total += share * wp.lerp(near, far, fx)
-                from_thin += clear * wp.lerp(near, far, fx)
+                total += share * here
+                from_thin += clear * here
                 seen += clear
                 tau += x
                 if wp.exp(-tau) < cutoff:

@@ -173,9 +173,32 @@ def _coarsen(
 
 
 @wp.func
+def between_cells(light: wp.array4d[float], n: int, q: wp.vec3) -> float:
+    """Trilinear between the centres of cells, which are at whole numbers of `q`; outside of them as at the nearest."""
+    x = wp.clamp(q[0], 0.0, float(light.shape[1] - 1))
+    y = wp.clamp(q[1], 0.0, float(light.shape[2] - 1))
+    z = wp.clamp(q[2], 0.0, float(light.shape[3] - 1))
+    i = int(x)
+    j = int(y)
+    k = int(z)
+    a = wp.min(i + 1, light.shape[1] - 1)
+    b = wp.min(j + 1, light.shape[2] - 1)
+    c = wp.min(k + 1, light.shape[3] - 1)
+    fy = y - float(j)
+    fz = z - float(k)
+    near = wp.lerp(
+        wp.lerp(light[n, i, j, k], light[n, i, j, c], fz), wp.lerp(light[n, i, b, k], light[n, i, b, c], fz), fy
+    )
+    far = wp.lerp(
+        wp.lerp(light[n, a, j, k], light[n, a, j, c], fz), wp.lerp(light[n, a, b, k], light[n, a, b, c], fz), fy
+    )
+    return wp.lerp(near, far, x - float(i))
+
+
+@wp.func
 def _place(cell: int, cells: int, coarse: int) -> float:
     """Of a cell's centre among the centres of coarser cells."""
-    return wp.clamp((float(cell) + 0.5) * float(coarse) / float(cells) - 0.5, 0.0, float(coarse - 1))
+    return (float(cell) + 0.5) * float(coarse) / float(cells) - 0.5
 
 
 @wp.kernel
@@ -190,24 +213,7 @@ def _refine(
     x = _place(i, out.shape[1], coarse.shape[1])
     y = _place(j, out.shape[2], coarse.shape[2])
     z = _place(k, out.shape[3], coarse.shape[3])
-    a = int(x)
-    b = int(y)
-    c = int(z)
-    a1 = wp.min(a + 1, coarse.shape[1] - 1)
-    b1 = wp.min(b + 1, coarse.shape[2] - 1)
-    c1 = wp.min(c + 1, coarse.shape[3] - 1)
-    fx = x - float(a)
-    fy = y - float(b)
-    fz = z - float(c)
-    near = wp.lerp(
-        wp.lerp(coarse[n, a, b, c], coarse[n, a, b, c1], fz), wp.lerp(coarse[n, a, b1, c], coarse[n, a, b1, c1], fz), fy
-    )
-    far = wp.lerp(
-        wp.lerp(coarse[n, a1, b, c], coarse[n, a1, b, c1], fz),
-        wp.lerp(coarse[n, a1, b1, c], coarse[n, a1, b1, c1], fz),
-        fy,
-    )
-    out[n, i, j, k] = wp.lerp(near, far, fx)
+    out[n, i, j, k] = between_cells(coarse, n, wp.vec3(x, y, z))
 
 
 def spread(

@@ -15,7 +15,10 @@ wp.set_module_options(_OPTIONS)
 FEATURES = 28
 MIXES = 10
 
-_THINNEST = wp.constant(1e-4)  # transparency below which depths count the same
+THINNEST = 1e-4
+"""Transparency below which depths count the same."""
+
+_THINNEST = wp.constant(THINNEST)
 _BRIGHTEST = wp.constant(6.0)  # light of all orders over opacity: a white surface under irradiance 4 pi has 4
 
 _Features = wp.types.vector(length=FEATURES, dtype=float)

@@ -14,12 +14,10 @@ import warp as wp
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import to_warp
-from wlm.smoke.camera import Camera
 from wlm.smoke.marching import medium_of
-from wlm.smoke.transport.lighting import Depths, Marching, light_in, marching
+from wlm.smoke.transport.lighting import Depths, Marching
 from wlm.smoke.transport.lights import AnyLight, PointLight, in_voxels
 from wlm_kernels.smoke import diffusion, fluence
-from wlm_kernels.smoke.settings import March
 
 CELLS = 32
 """Of a grid of diffusion, along the longest edge."""
@@ -87,25 +85,6 @@ class Spreading:
             if isinstance(light, PointLight):
                 made[:, n] /= self._volume.voxel**2
         return made, thin
-
-
-def diffused(
-    volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedo: float, march: March
-) -> torch.Tensor:
-    """A picture by single scattering and diffusion alone, float32 [H, W, 3].
-
-    Args:
-        volume: Cold smoke.
-        camera: Any.
-        lights: Any number.
-        albedo: 0 to 1.
-        march: To the lights and along the camera's rays.
-    """
-    with marching(volume, camera, march) as scene:
-        spreading = Spreading(scene, volume, lights)
-        lit = light_in(scene, volume, camera, lights, spreading.add)
-        planes = albedo * lit.planes + albedo**2 * spreading.seen([albedo])[0][0, :, 0]
-        return lit.compose(planes[..., None].expand(-1, -1, -1, 3))
 
 
 def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:

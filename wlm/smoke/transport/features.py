@@ -14,10 +14,9 @@ from wlm.smoke.transport.diffusion import Spreading
 from wlm.smoke.transport.lighting import LitSmoke, light_in, marching
 from wlm.smoke.transport.lights import AnyLight, PointLight
 from wlm_kernels.smoke import orders
-from wlm_kernels.smoke.orders import FEATURES
+from wlm_kernels.smoke.orders import FEATURES, THINNEST
 from wlm_kernels.smoke.settings import March
 
-_THINNEST = 1e-4  # transparency below which depths count the same
 _STEPS = 130  # through the box, of a march for light of all orders
 _NODES = 64  # gaps of its lattice through the box, at least
 _SHORTEST = 0.25  # voxels: of a march in shorter steps nothing is left to gain
@@ -57,6 +56,10 @@ class Inputs:
         planes = (*of_light, self.transparency, self.thin)
         orders.features(*map(to_warp, planes), to_warp(out))
         return out
+
+    def by_diffusion(self, albedo: float) -> torch.Tensor:
+        """Light scattered once, and by diffusion what was scattered more often, at one of the albedos, [L, H, W]."""
+        return albedo * self.single + albedo**2 * self.diffused[:, self.albedos.index(albedo)]
 
     def of(self, light: int) -> "Inputs":
         """Those of one light."""
@@ -101,17 +104,18 @@ def make_inputs(
         lit = light_in(scene, volume, camera, lights, spreading.add)
         diffused, thin = spreading.seen(albedos)
         single, opposite = lit.planes, lit.opposite
-        if any(isinstance(light, PointLight) for light in lights):
-            single, diffused, opposite = single.clone(), diffused.clone(), opposite.clone()
-            for n, (light, (toward, factor)) in enumerate(zip(lights, ways, strict=True)):
-                if isinstance(light, PointLight):
-                    single[n] *= factor
-                    diffused[:, n] *= factor
-                    both = torch.empty(2, *single.shape[1:], device=single.device)
-                    scene.light(scene.reach(-toward, None), both)
-                    opposite[n] = both[0]
+        points = [n for n, light in enumerate(lights) if isinstance(light, PointLight)]
+        if points:
+            single, opposite = single.clone(), opposite.clone()
+        for n in points:
+            toward, factor = ways[n]
+            single[n] *= factor
+            diffused[:, n] *= factor
+            both = torch.empty(2, *single.shape[1:], device=single.device)
+            scene.light(scene.reach(-toward, None), both)
+            opposite[n] = both[0]
     opacity = 1.0 - lit.transparency
-    thickness = -torch.log(lit.transparency.clamp(min=_THINNEST))
+    thickness = -torch.log(lit.transparency.clamp(min=THINNEST))
     # At least that of a tenth of a pixel's smoke.
     mean = (thickness * opacity).sum() / opacity.sum().clamp(min=0.1)
     cosines = tuple(float(camera.axes[2] @ toward) for toward, _ in ways)

@@ -157,34 +157,6 @@ def light_smoke(
         return light_in(scene, volume, camera, lights)
 
 
-def light_in(
-    scene: "Marching",
-    volume: DensityVolume,
-    camera: Camera,
-    lights: Sequence[AnyLight],
-    visit: Callable[[int, "Depths"], None] | None = None,
-) -> LitSmoke:
-    """As `light_smoke`, in a march that has been opened.
-
-    Args:
-        scene: The march.
-        volume, camera, lights: As for `light_smoke`.
-        visit: Called with each light's number and the depths to it, which aren't kept.
-    """
-    planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
-    for n, light in enumerate(lights):
-        place, _, radius = in_voxels(light, volume)
-        depths = scene.reach(place, radius)
-        scene.light(depths, planes[:, n] if radius is None else planes[:1, n])
-        if radius is not None:
-            planes[0, n] /= volume.voxel**2
-        if visit is not None:
-            visit(n, depths)
-    transparency, emission, depth = scene.seen()
-    hot = emission if volume.temperature is not None else None
-    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)
-
-
 Depths = tuple[march_lights.Lattice, wp.array]
 """Optical depths to a light and to the opposite one, at the nodes of a lattice."""
 
@@ -222,3 +194,31 @@ def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float 
     with stream(device_name(volume.device)):
         medium = medium_of(volume)
         yield Marching(medium, camera.view(volume), march, shadow, occupied(medium))
+
+
+def light_in(
+    scene: Marching,
+    volume: DensityVolume,
+    camera: Camera,
+    lights: Sequence[AnyLight],
+    visit: Callable[[int, Depths], None] | None = None,
+) -> LitSmoke:
+    """As `light_smoke`, in a march that has been opened.
+
+    Args:
+        scene: The march.
+        volume, camera, lights: As for `light_smoke`.
+        visit: Called with each light's number and the depths to it, which aren't kept.
+    """
+    planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
+    for n, light in enumerate(lights):
+        place, _, radius = in_voxels(light, volume)
+        depths = scene.reach(place, radius)
+        scene.light(depths, planes[:, n] if radius is None else planes[:1, n])
+        if radius is not None:
+            planes[0, n] /= volume.voxel**2
+        if visit is not None:
+            visit(n, depths)
+    transparency, emission, depth = scene.seen()
+    hot = emission if volume.temperature is not None else None
+    return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)

@@ -70,8 +70,9 @@ class OrdersModel:
     def mixes(self, inputs: Inputs) -> torch.Tensor:
         """What the weights of each light are mixed by, float32 [L, MIXES]."""
         out = torch.empty(len(inputs.cosines), MIXES, device=inputs.depth.device)
+        depth, known = to_warp(inputs.depth), to_warp(self.known)
         for cosine, row in zip(inputs.cosines, out, strict=True):
-            orders.mixes(to_warp(inputs.depth), to_warp(self.known), cosine, to_warp(row))
+            orders.mixes(depth, known, cosine, to_warp(row))
         return out
 
     def light(self, inputs: Inputs, albedo: Sequence[float]) -> torch.Tensor:
@@ -195,12 +196,11 @@ def scatter(
         lit, inputs = make_inputs(alike, camera, lights, values, even)
         planes = model.light(inputs, thinner)
         for n, light in enumerate(lights):
-            if (factor := aim(light, alike)[1]) != 1.0:
-                planes[n] /= factor
             if (near := share_of(light, alike)) > 0.0:
                 for channel, value in enumerate(map(float, thinner)):
-                    again = inputs.diffused[n, values.index(value)] / factor
-                    planes[n, ..., channel].lerp_(value * lit.planes[n] + value**2 * again, near)
+                    planes[n, ..., channel].lerp_(inputs.of(n).by_diffusion(value)[0], near)
+            if (factor := aim(light, alike)[1]) != 1.0:
+                planes[n] /= factor
         if march.g != 0.0:
             once = light_smoke(volume, camera, lights, march)
             for channel in range(3):
