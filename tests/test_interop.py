@@ -1,4 +1,6 @@
 import gc
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -168,3 +170,10 @@ def test_one_side_stream_a_device(device):
             assert side is None
     else:
         assert interop._side_stream(device) is interop._side_stream(device)
+
+
+def test_a_tensor_is_wrapped_before_anything_has_started_warp():
+    """In a process of its own, whose first call of Warp this is."""
+    program = "import torch; from wlm.interop import to_warp; print(to_warp(torch.arange(3.0)).numpy().sum())"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.split()[-1] == "3.0"

@@ -87,6 +87,8 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     Raises:
         ValueError: The tensor doesn't fit the type.
     """
+    # Wrapping a tensor, unlike all else in Warp, doesn't start it.
+    wp.init()
     try:
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
     except (RuntimeError, TypeError) as error:

@@ -152,7 +152,6 @@ def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
 
 
 def _resampled(lattice: Lattice, values: torch.Tensor, turn: np.ndarray, shift: np.ndarray) -> torch.Tensor:
-    wp.init()  # which wrapping a tensor doesn't do
     out = torch.empty(lattice.shape, dtype=torch.float32, device=values.device)
     inputs = [to_warp(values.contiguous()), wp.mat33(*turn.ravel().tolist()), wp.vec3(*shift.tolist())]
     device = device_name(values.device)

@@ -107,7 +107,6 @@ class DensityVolume:
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
         """Density and temperature as Warp arrays that share the tensors' memory."""
-        wp.init()  # unlike the rest of Warp, wrapping a tensor doesn't initialise it
         hot = None if self.temperature is None else to_warp(self.temperature)
         return to_warp(self.density), hot
 

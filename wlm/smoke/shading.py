@@ -106,7 +106,6 @@ def obstacle_visibility(
         raise ValueError(f"bias: expected at least 0, got {bias}")
     if not len(triangles):
         return lit
-    wp.init()  # which wrapping a tensor doesn't do
     with stream(device_name(depth.device)):
         arrays = to_warp(vertices.float().contiguous(), wp.vec3), to_warp(triangles.int().contiguous())
         surface = to_warp(depth.float().contiguous())

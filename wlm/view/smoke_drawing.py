@@ -87,7 +87,6 @@ class Drawing:
         ) -> torch.Tensor:
             return torch.tensor(np.asarray(values), dtype=kind).reshape(shape).to(device)
 
-        wp.init()  # which wrapping a tensor doesn't do
         with stream(device):
             self.image = torch.zeros((height, width, 3), device=device)
             self.solid_light = torch.zeros_like(self.image)
