@@ -43,11 +43,11 @@ docs: $(STAMP)
 
 bench: $(STAMP)
 	mkdir -p out
-	$(BIN)/wlm bench lightmap --quick --json out/bench.json --plot out/bench.png
-	$(BIN)/wlm bench probe --quick --json out/bench.json --plot out/bench-probe.png
-	$(BIN)/wlm bench atlas --quick --json out/bench.json --plot out/bench-atlas.png
-	$(BIN)/wlm bench smoke --quick --json out/bench.json --plot out/bench-smoke.png
-	$(BIN)/wlm bench smoke-network --quick --profile 16 --json out/bench.json --plot out/bench-smoke-network.png
+	$(BIN)/python -m benchmarks lightmap --quick --json out/bench.json --plot out/bench.png
+	$(BIN)/python -m benchmarks probe --quick --json out/bench.json --plot out/bench-probe.png
+	$(BIN)/python -m benchmarks atlas --quick --json out/bench.json --plot out/bench-atlas.png
+	$(BIN)/python -m benchmarks smoke --quick --json out/bench.json --plot out/bench-smoke.png
+	$(BIN)/python -m benchmarks smoke-network --quick --profile 16 --json out/bench.json --plot out/bench-smoke-network.png
 
 lint: $(STAMP)
 	$(BIN)/ruff check

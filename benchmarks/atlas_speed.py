@@ -23,14 +23,14 @@ import numpy as np
 import torch
 
 import wlm
+from benchmarks import describe_environment
+from benchmarks.atlas import PROFILES
 from wlm.atlas.cascade import group_triangles
 from wlm.atlas.data import LightmappedMesh, from_arrays
 from wlm.atlas.data import load as load_mesh
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.atlas.stages import Stages
-from wlm.bench import describe_environment
-from wlm.bench.atlas import PROFILES
 from wlm.formats.atomic import atomic_write
 
 DATA = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "atlas"

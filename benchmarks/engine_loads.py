@@ -23,7 +23,7 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 
 import wlm
-from wlm.bench import describe_environment
+from benchmarks import describe_environment
 from wlm.engines import ENGINES, export_lightmap
 from wlm.formats.atomic import atomic_write
 from wlm.lightmap.data import from_arrays

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 import wlm
+from benchmarks.rivals.atlas import downsampling
 from wlm.atlas.evaluation import Report, Score
 from wlm.atlas.exporter import MODEL_FILE
-from wlm.baselines.atlas import downsampling
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write

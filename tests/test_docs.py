@@ -11,7 +11,7 @@ line and its figures in the order of the text::
 
 A source is a file, then system, scene, method and option of a row; `FILE/SET/METHOD` of a report of ``wlm smoke
 evaluate --json`; `FILE.csv/STEP` of a training's curve. ` - ` between two sources is their difference, ` / ``
-their ratio. A figure has the format of `wlm.bench.figures` unless another follows its name. Above a table of all rows
+their ratio. A figure has the format of `benchmarks.figures` unless another follows its name. Above a table of all rows
 whose source begins alike one line is enough; its first columns are the rest of the source::
 
     <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr | bytes -->
@@ -26,7 +26,7 @@ from pathlib import Path
 
 import pytest
 
-from wlm.bench import FIGURES, pages, read_json
+from benchmarks import FIGURES, pages, read_json
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

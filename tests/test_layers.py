@@ -6,29 +6,30 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 GROUND = (
-    "wlm_kernels wlm wlm._facade wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels wlm.system "
-    "wlm.workers wlm.shading"
+    "wlm_kernels wlm wlm._facade wlm.bundle wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels "
+    "wlm.system wlm.workers wlm.shading"
 )
 FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.bake", "wlm.baselines", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
-    ["wlm.bench"],
+    ["wlm.bake", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
     ["wlm.cli"],
     ["wlm.__main__"],
+    ["benchmarks"],
 )
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 
 def room_of(module: str) -> str:
-    """`wlm.probe` of `wlm.probe.fit`; the kernels are one room."""
-    return "wlm_kernels" if module.startswith("wlm_kernels") else ".".join(module.split(".")[:2])
+    """`wlm.probe` of `wlm.probe.fit`; the kernels and the benchmarks are one room each."""
+    root = module.split(".")[0]
+    return root if root != "wlm" else ".".join(module.split(".")[:2])
 
 
 def imports() -> dict[str, set[str]]:
     """For each module the modules of ours that it imports anywhere, also in functions and for types alone."""
-    files = [path for folder in ("wlm", "wlm_kernels") for path in (ROOT / folder).rglob("*.py")]
+    files = [path for folder in ("wlm", "wlm_kernels", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
     graph = {}
     for name, path in names.items():

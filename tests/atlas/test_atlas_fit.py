@@ -36,7 +36,7 @@ def psnr(model, mesh) -> float:
 
 def downsampled(mesh, share: float) -> float:
     """PSNR of the texels of a smaller lightmap at as many bits."""
-    from wlm.baselines.atlas import downsampling
+    from benchmarks.rivals.atlas import downsampling
 
     row, column = np.nonzero(mesh.mask)
     uv = torch.tensor(np.stack([column + 0.5, row + 0.5], 1) / mesh.mask.shape[::-1], dtype=torch.float32)

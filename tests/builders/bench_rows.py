@@ -4,13 +4,13 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from wlm.bench import plot, read_json, tables, write_json
-from wlm.cli.bench import app
+from benchmarks import plot, read_json, tables, write_json
+from benchmarks.app import app
 
 ENVIRONMENT = {
     "device": "cpu",
     "device_name": "a CPU",
-    "command": "wlm bench",
+    "command": "python -m benchmarks",
     "date": "2026-01-02T03:04:05",
     "threads": 1,
     "python": "3",
@@ -42,7 +42,7 @@ def check_outputs(rows, folder: Path, panels, plotted=None) -> None:
 
 
 def check_command(monkeypatch, module, rows, words: list, folder: Path) -> tuple[str, tuple, dict]:
-    """Runs `wlm bench` with a `run` that gives these rows; checks what it writes.
+    """Runs `python -m benchmarks` with a `run` that gives these rows; checks what it writes.
 
     Returns:
         The command line in the result file, and the arguments that `run` was called with.

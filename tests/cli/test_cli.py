@@ -16,7 +16,7 @@ from builders.small_sets import HOURS, moving_light, tiny_profile
 from PIL import Image
 
 import wlm
-from wlm.baselines.lightmap import FEW, RIVALS
+from benchmarks.rivals.lightmap import FEW, RIVALS
 from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap import codec
 
@@ -351,11 +351,11 @@ def test_a_closed_pipe_is_no_traceback(fitted):
 
 
 def test_bench_report_makes_pages(tmp_path):
-    from wlm.bench import Row, describe_environment, write_json
+    from benchmarks import Row, describe_environment, write_json
 
     file, index = tmp_path / "here.json", tmp_path / "index.md"
     row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
-    write_json(file, [row], describe_environment("cpu", "wlm bench"))
+    write_json(file, [row], describe_environment("cpu", "python -m benchmarks"))
     text = call("bench", "report", file)
     assert "`here.json`" in text and "| 45.98 |" in text
     call("bench", "report", file, "-o", index)

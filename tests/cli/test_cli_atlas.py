@@ -13,10 +13,10 @@ from PIL import Image
 
 import wlm.atlas.colour
 import wlm.atlas.fit
+from benchmarks.rivals.atlas import downsampling
 from wlm.atlas.data import load
 from wlm.atlas.evaluation import compare, evaluate
 from wlm.atlas.fit import compress
-from wlm.baselines.atlas import downsampling
 from wlm.formats.exr import read_exr, write_exr
 
 CASCADE = {"name": "short", "method": "cascade", "fallback": False, "steps": 20, "resolution": 64}

@@ -9,7 +9,7 @@ from builders.probe_sets import synthetic
 from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
-from wlm.baselines import probe as baselines
+from benchmarks.rivals import probe as baselines
 from wlm.probe import data, evaluate, save_probes
 
 PROBES, DEAD = 160, 5

@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.rows import read_runs
 from wlm import atlas, lightmap
 from wlm.atlas.data import write_mesh
-from wlm.bench.rows import read_runs
 from wlm.cli.console import escape, note, show, show_text, table
 from wlm.config import load_settings
 from wlm.errors import WlmError, printable

@@ -16,7 +16,7 @@ from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
-from wlm.bench import Row, write_json
+from benchmarks import Row, write_json
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb

@@ -17,11 +17,11 @@ import numpy as np
 from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 
 import wlm
+from benchmarks.rows import read_json
 from wlm.atlas.exporter import geometry, read_folder
 from wlm.atlas.scene.description import read_description
 from wlm.bake.geometry import read_geometry
 from wlm.bake.settings import LightmapSettings
-from wlm.bench.rows import read_json
 from wlm.config import load_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume

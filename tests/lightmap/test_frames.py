@@ -13,7 +13,7 @@ from builders.synthetic import any_blocks, random_model
 from typer.testing import CliRunner
 
 import wlm
-from wlm.baselines.lightmap import encode_set
+from benchmarks.rivals.lightmap import encode_set
 from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact

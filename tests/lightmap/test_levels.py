@@ -10,7 +10,7 @@ from builders.synthetic import random_model
 from builders.words import check_written, error_of_changed
 
 import wlm
-from wlm.baselines.lightmap import evaluate_rivals
+from benchmarks.rivals.lightmap import evaluate_rivals
 from wlm.errors import WlmError
 from wlm.lightmap import video
 from wlm.lightmap.data import from_arrays

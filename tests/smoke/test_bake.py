@@ -7,7 +7,7 @@ import pytest
 import torch
 from builders.smoke_plumes import facing, unit_grid
 
-from wlm.bench.path_tracer import PathTracer
+from benchmarks.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, axis_faults, weights

@@ -9,7 +9,7 @@ import pytest
 import torch
 from builders.smoke_plumes import plume
 
-from wlm.baselines.smoke_orders import diffused
+from benchmarks.rivals.smoke_orders import diffused
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.learn.synthetic import make_plume

@@ -9,7 +9,7 @@ from builders.smoke_plumes import facing, unit_grid
 from reference.marching import Scene
 from reference.transport import scattered_twice
 
-from wlm.bench.path_tracer import PathTracer
+from benchmarks.path_tracer import PathTracer
 from wlm.errors import WlmError
 from wlm.fluid.shapes import box
 from wlm.fluid.volume import DensityVolume, from_array

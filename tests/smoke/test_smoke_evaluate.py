@@ -11,7 +11,7 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import random_model, small_pool
 
 import wlm
-from wlm.baselines.smoke import COARSE, FLIP_BOOK, RIVALS
+from benchmarks.rivals.smoke import COARSE, FLIP_BOOK, RIVALS
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse

@@ -12,14 +12,14 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bake, bench, compare, doctor, inspect, lightmap, probe, smoke, view, web
+from wlm.cli import atlas, bake, compare, doctor, inspect, lightmap, probe, smoke, view, web
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
@@ -30,7 +30,7 @@ _INTERRUPTED = 130  # what typer makes of KeyboardInterrupt
 _UsageError = typer.BadParameter.__base__
 
 
-class _Group(TyperGroup):
+class Group(TyperGroup):
     """Turns errors that are meant for the user into one line and an exit code."""
 
     def main(self, args: Sequence[str] | None = None, **extra: Any) -> Any:
@@ -59,7 +59,7 @@ class _Group(TyperGroup):
 
 
 app = typer.Typer(
-    cls=_Group,
+    cls=Group,
     # A bug's traceback is for a report: plain, whole, without the values of locals.
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -70,7 +70,6 @@ app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")
 app.add_typer(bake.app, name="bake")
-app.add_typer(bench.app, name="bench")
 app.command()(compare.compare)
 app.command()(inspect.inspect)
 app.command()(view.view)
@@ -80,10 +79,15 @@ app.command()(doctor.doctor)
 
 def main() -> None:
     """Runs the command line; the entry point of `wlm`."""
+    run(app)
+
+
+def run(command: Callable[[], Any]) -> None:
+    """Runs a command line with the signals and exit codes above."""
     try:
         # All is written when it ends: a signal then comes too late to stop anything, and must not change its exit code.
         with handled(after=signal.SIG_IGN):
-            app()
+            command()
     except KeyboardInterrupt:
         sys.exit(exit_code())
 

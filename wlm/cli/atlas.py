@@ -189,9 +189,9 @@ def evaluate(
 
         evaluate_scene(folder, views, resolution, json_path, device, trust)
         return
+    from benchmarks.rivals.atlas import evaluate_rivals, share_of
     from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
-    from wlm.baselines.atlas import evaluate_rivals, share_of
     from wlm.interop import check_device
 
     output = read_folder(folder)

@@ -283,7 +283,7 @@ def evaluate(
         lightmap_report(html_path, model, lightmaps, report)
     extra, scores = {}, {}
     if baselines:
-        from wlm.baselines.lightmap import RIVALS, evaluate_rivals
+        from benchmarks.rivals.lightmap import RIVALS, evaluate_rivals
 
         with running("baselines") as progress:
             rivals = evaluate_rivals(model, lightmaps, views=views, device=device, progress=progress)

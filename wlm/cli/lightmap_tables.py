@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from wlm.cli.console import escape, note, number, show, table
 
 if TYPE_CHECKING:
-    from wlm.baselines.lightmap import Score
+    from benchmarks.rivals.lightmap import Score
     from wlm.lightmap import Report
     from wlm.lightmap.held import HeldTile
     from wlm.metrics.contest import ContestScore

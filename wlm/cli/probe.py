@@ -51,7 +51,7 @@ from wlm.errors import WlmError
 if TYPE_CHECKING:
     import numpy as np
 
-    from wlm.baselines.rival import Rival
+    from benchmarks.rivals.rival import Rival
     from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
 app = typer.Typer(
@@ -286,7 +286,7 @@ def evaluate(
         probe_report(html_path, model, probes, report)
     rivals = []
     if baselines:
-        from wlm.baselines.probe import evaluate_rivals
+        from benchmarks.rivals.probe import evaluate_rivals
 
         with running("baselines") as progress:
             rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))

@@ -162,7 +162,7 @@ def evaluate(
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from wlm.baselines.smoke import RIVALS
+    from benchmarks.rivals.smoke import RIVALS
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network, shipped
     from wlm.smoke.evaluation import compare

@@ -1,0 +1,435 @@
+"""The atlas system against smaller and carved lightmaps, block codecs and single-colour merging: size, speed and error.
+
+For each lightmap of each mesh these kinds of rows:
+
+- method "ours", one row for each profile: the file, the compression with the writing, the error as the mesh is seen
+  from around, and the time to read a million random points of its surface. In a full run also the first profile at the
+  bits that the paper's method came to, and at CRs of 92.5% and 95%.
+- method "lightmap": the time to read the same points from the lightmap itself, in half floats.
+- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at those of the others.
+  Single-colour merging has a size of its own instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
+  of its eq. 9, which leave out UVs and headers; a rival's bytes are these bits alone, it has no file.
+- method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
+  surface; the time is that of the tuning alone.
+
+Where there are several lightmaps the last rows are the means over them, with the least and the most of some figures;
+their largest error is the largest of all.
+
+A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
+graph, so that gaps between launches do not count. The peaks of PSNR are those of `wlm.atlas.evaluation`.
+"""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from statistics import fmean
+
+import numpy as np
+import torch
+import warp as wp
+
+from benchmarks.atlas_inputs import Lightmap
+from benchmarks.plot import Panel
+from benchmarks.rivals.atlas import OWN_SIZE, RIVALS, share_of
+from benchmarks.rivals.rival import Rival
+from benchmarks.rows import MEAN, Row, read_json
+from benchmarks.runner import Bench, Note, exact_errors
+from wlm import interop
+from wlm.atlas.data import from_arrays
+from wlm.atlas.decode import Decoder
+from wlm.atlas.evaluation import Sampler, compare
+from wlm.atlas.exact import decode64
+from wlm.atlas.fit import compress
+from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
+from wlm.atlas.views import surface_points
+from wlm.errors import WlmError
+from wlm.texels import fill_gaps
+
+PROFILES = ("standard", "half", "bc6h", "astc", "compact", "cascade", "paper")
+"""Profiles of a run; the first has the bits of the first cascade too."""
+
+_RIVALS = {
+    "downsampling": "downsampling",
+    "downsampling bilinear": "downsampling bilinear",
+    "BC6H": "bc6h",
+    "BC6H, our encoder": "bc6h own",
+    "ASTC": "astc",
+    "carving": "carving",
+}
+_METHODS = (*_RIVALS, *OWN_SIZE)
+_OWN = "its own size"  # the option of those without a budget
+_SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
+_HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # whose bits rivals get when they run alone
+_FIRST = "downsampling"  # what everything is compared with
+VIEWS, RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
+QUICK_VIEWS, QUICK_RESOLUTION = 8, 256
+_QUICK_CASCADE = {"steps": 30, "resolution": 256}
+_POINTS = 1_000_000
+_CHECKED = 1 << 17  # of them, against float64
+_SAME = 0.01  # shares of bits that differ by less are equal
+SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
+"""Figures of a row that are those of a `Score`."""
+
+_RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")  # with their least and most
+_AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", *_RANGED)
+
+PANELS = (Panel("bpp", "psnr", ("ours", _FIRST, "BC6H", "ASTC")), Panel("decode_ms", "max_error", ("ours", "lightmap")))
+"""What a plot of the rows shows: quality against size, of all but the weakest rivals, whose names would hide the rest;
+and a decode's error against its time."""
+
+
+def run(
+    lightmaps: Sequence[Lightmap],
+    names: Sequence[str] = (),
+    *,
+    quick: bool,
+    device: str,
+    rivals: bool = True,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the atlas system.
+
+    Args:
+        lightmaps: At least one, as `benchmarks.atlas_inputs.load` reads them.
+        names: Profiles; none: `PROFILES`.
+        quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
+            two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
+        device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
+        rivals: With block codecs, carving and single-colour merging, which take minutes on the CPU: `run_rivals` has
+            them alone. Downsampling is always there.
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, lightmap by lightmap in the order of the module's list.
+
+    Raises:
+        WlmError: A profile or the device isn't there, or a compression failed.
+    """
+    profiles = [Profile.load(name) for name in names or PROFILES]
+    if quick:
+        profiles = [p.model_copy(update=_QUICK_CASCADE) if p.method == "cascade" else p for p in profiles]
+    return run_rows(
+        lightmaps,
+        profiles,
+        device=interop.check_device(device),
+        views=QUICK_VIEWS if quick else VIEWS,
+        resolution=QUICK_RESOLUTION if quick else RESOLUTION,
+        whole=not quick,
+        methods=_METHODS if rivals else (_FIRST,),
+        progress=progress,
+    )
+
+
+def run_rivals(
+    results: str | os.PathLike[str], lightmaps: Sequence[Lightmap], *, progress: Note | None = None
+) -> list[Row]:
+    """Measures the rivals alone, at the bits that our tiles took in a former run.
+
+    Args:
+        results: What that run wrote.
+        lightmaps: At least one; those of that run.
+        progress: As for `run`.
+
+    Returns:
+        The rows of the rivals, of the CPU, and their means.
+
+    Raises:
+        WlmError: `results` can't be read, or has no row of a lightmap.
+    """
+    ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
+    rows: list[Row] = []
+    for lightmap in lightmaps:
+        shares = {
+            row.option: _share(row)
+            for row in ours
+            if row.scene == lightmap.scene and row.option in _HELD_TO and row.get("bpp")
+        }
+        if not shares:
+            raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
+        bench = _AtlasBench(lightmap, "cpu", progress, 1)
+        rows += bench.scored(bench.rivals(shares, _METHODS), VIEWS, RESOLUTION)
+    return rows + means(rows, len(lightmaps))
+
+
+def run_rows(
+    lightmaps: Sequence[Lightmap],
+    profiles: Sequence[Profile],
+    *,
+    device: str,
+    views: int,
+    resolution: int,
+    whole: bool,
+    methods: Sequence[str] = _METHODS,
+    points: int = _POINTS,
+    repeats: int | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the given profiles; the rest as for `run`.
+
+    Args:
+        lightmaps: At least one.
+        profiles: At least one; the rivals have the bits of the first.
+        views, resolution: Cameras of the scores, and their pixels along a side.
+        whole: With the first profile at the bits of a cascade and at the CRs of `_SMALLER`, and rivals at the bits of
+            all profiles.
+        methods: The rivals.
+        points: Read by a timed decode.
+        repeats: As for `Bench`.
+    """
+    if not lightmaps or not profiles:
+        raise ValueError("expected at least one lightmap and one profile")
+    (progress or (lambda line: None))("compiling")
+    for profile in profiles:
+        warm_up(profile, device)
+    rows: list[Row] = []
+    for lightmap in lightmaps:
+        bench = _AtlasBench(lightmap, device, progress, points, repeats)
+        entries = bench.ours(profiles, whole)
+        named = {profile.name for profile in profiles} | {_smaller_name(profiles[0], cr) for cr in _SMALLER}
+        shares = {entry.row.option: _share(entry.row) for entry in entries if entry.model and entry.row.option in named}
+        if lightmap is lightmaps[0]:
+            entries += bench.tuned(entries)
+        entries.append(bench.original(entries[0].model))
+        entries = bench.timed(entries)
+        entries += bench.rivals(shares if whole else {profiles[0].name: shares[profiles[0].name]}, methods)
+        rows += bench.scored(entries, views, resolution)
+    return rows + means(rows, len(lightmaps))
+
+
+def plotted(rows: Sequence[Row]) -> list[Row]:
+    """The rows that a plot shows: the means, or all where there are none."""
+    return [row for row in rows if row.scene.startswith(MEAN)] or list(rows)
+
+
+def _smaller_name(profile: Profile, cr: float) -> str:
+    return f"{profile.name}, CR {100 * cr:g}%"
+
+
+def _share(row: Row) -> float:
+    """Bits of eq. 9 over the lightmap's."""
+    return row["bpp"] / SOURCE_BITS
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """What a lightmap is measured with.
+
+    Attributes:
+        row: Without score, and before the timing without a decode time.
+        sample: The decoder to score; None: none.
+        decode: The decoder to time; None: none.
+        model: Ours.
+    """
+
+    row: Row
+    sample: Sampler | None = None
+    decode: Callable[[], object] | None = None
+    model: AtlasModel | None = None
+
+
+class _AtlasBench(Bench):
+    """A lightmap, and points of its surface."""
+
+    def __init__(
+        self, lightmap: Lightmap, device: str, progress: Note | None, points: int, repeats: int | None = None
+    ) -> None:
+        super().__init__("atlas", device, progress, scene=lightmap.scene, repeats=repeats)
+        self.mesh = lightmap.mesh
+        self.triangle, self.weight = surface_points(self.mesh, points, np.random.default_rng(0))
+
+    def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
+        """Our profiles, the first of them smaller, and at the bits of the first cascade."""
+        entries = [self.entry(profile, profile.name) for profile in profiles]
+        if not whole or profiles[0].method != "tiles":
+            return entries
+        budgets = {_smaller_name(profiles[0], cr): 1.0 - cr for cr in _SMALLER}
+        cascade = next((entry for entry in entries if entry.model.profile.method == "cascade"), None)
+        if cascade is not None:
+            budgets[f"{profiles[0].name}, bits of {cascade.row.option}"] = _share(cascade.row)
+        for option, budget in budgets.items():
+            try:
+                entries.append(self.entry(profiles[0].model_copy(update={"budget": budget}), option))
+            except WlmError as error:  # no room for a table
+                entries.append(_Entry(self.missing_row("ours", option, error)))
+        return entries
+
+    def entry(self, profile: Profile, option: str) -> _Entry:
+        """Compresses and writes, and reads the file back."""
+        self.note(f"{option}: compressing")
+        fit = self.fit(option, lambda: compress(self.mesh, profile, device=self.device))
+        model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
+        decode, errors = self._decode(model)
+        figures = {f"{stage}_seconds": seconds for stage, seconds in model.report["seconds"].items()}
+        row = self.row(
+            "ours",
+            option,
+            model.method,
+            bytes=fit.bytes,
+            bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
+            compression_ratio=model.compression_ratio,
+            encode_seconds=fit.seconds,
+            steps=profile.steps if profile.method == "cascade" else None,
+            colour_width=model.texels.shape[1],
+            colour_height=model.texels.shape[0],
+            lut_width=model.lut.shape[1] or None,
+            lut_height=model.lut.shape[0] or None,
+            **errors,
+            **figures,
+        )
+        return _Entry(row, Decoder(model, self.device), decode, model)
+
+    def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
+        """A cascade tuned in either space."""
+        cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
+        if cascade is None:
+            return []
+        # A cascade that doesn't pay is scored as the cascade that it is, here.
+        alone = cascade.model.profile.model_copy(update={"fallback": False})
+        tuned = []
+        for space in (alone.space, "uv" if alone.space == "views" else "views"):
+            fit = self.entry(alone.model_copy(update={"space": space}), f"{cascade.row.option}, {space}")
+            seconds = fit.model.report["seconds"]["fit"]
+            row = self.row(
+                "fit",
+                f"{alone.name}, space {space}",
+                "the tuning alone",
+                encode_seconds=seconds,
+                step_ms=1e3 * seconds / max(alone.steps, 1),
+                steps=alone.steps,
+                resolution=alone.resolution,
+            )
+            tuned.append(_Entry(row, fit.sample))
+        return tuned
+
+    def original(self, model: AtlasModel) -> _Entry:
+        """The lightmap itself, in the place of a model of it."""
+        model = replace(
+            model,
+            method="plain",
+            colour="half",
+            texels=fill_gaps(self.mesh.lightmap, self.mesh.mask).astype(np.float16),
+            blocks=np.empty((0, 16), np.uint8),
+            block_texels=np.empty((0, 0, 3), np.float16),
+            lut=np.empty((0, 0, 2), np.uint16),
+            uv=np.empty((0, 3, 2), np.float32),
+        )
+        decode, errors = self._decode(model)
+        figures = {"bytes": model.texels.nbytes, "bpp": SOURCE_BITS, "compression_ratio": 0.0}
+        return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), decode=decode)
+
+    def timed(self, entries: Sequence[_Entry]) -> list[_Entry]:
+        """Times the decoders of those that have one, in turns."""
+        peers = [entry for entry in entries if entry.decode is not None]
+        rows = self.time_rows([(entry.row, entry.decode) for entry in peers])
+        timed = {id(entry): row for entry, row in zip(peers, rows, strict=True)}
+        return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
+
+    def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
+        """The rivals at the bits of our profiles, and those of a size of their own.
+
+        One that holds the whole lightmap in fewer bits isn't measured twice.
+
+        Args:
+            shares: By profile, its bits over the lightmap's.
+            methods: The rivals.
+        """
+        entries, measured, enough = [], [], {}
+        for profile, share in shares.items():
+            if any(abs(share / other - 1.0) < _SAME for other in measured):
+                continue
+            measured.append(share)
+            for method in (name for name in methods if name in _RIVALS):
+                if enough.get(method, math.inf) > share:
+                    make = partial(RIVALS[_RIVALS[method]], self.mesh, share)
+                    entries.append(self._rival(method, f"bits of {profile}", make))
+                    row = entries[-1].row
+                    # ASTC has other blocks for other budgets.
+                    if (row.get("colour_height"), row.get("colour_width")) == self.mesh.mask.shape and method != "ASTC":
+                        enough[method] = _share(row)
+        for method in (name for name in methods if name in OWN_SIZE):
+            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.mesh)))
+        return entries
+
+    def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:
+        self.note(f"{method}, {option}")
+        try:
+            rival = make()
+        except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
+            return _Entry(self.missing_row(method, option, error))
+        share = share_of(rival, self.mesh)
+        height, width = rival.size or (None, None)
+        row = self.row(
+            method,
+            option,
+            "compressed on the CPU, no file",
+            bytes=rival.bytes,
+            bpp=SOURCE_BITS * share,
+            compression_ratio=1.0 - share,
+            encode_seconds=rival.encode_seconds,
+            colour_width=width,
+            colour_height=height,
+        )
+        return _Entry(row, rival.decoded)
+
+    def scored(self, entries: Sequence[_Entry], views: int, resolution: int) -> list[Row]:
+        """Scores all in one go: each view is drawn once."""
+        self.note(f"scoring, {views} views of {resolution}²")
+        decoders = {str(i): entry.sample for i, entry in enumerate(entries) if entry.sample is not None}
+        reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
+        rows = [entry.row for entry in entries]
+        for i, report in reports.items():
+            rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in SCORES})
+        return rows
+
+    def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
+        """The decode to time, and its errors against float64."""
+        decoder = Decoder(model, self.device)
+        corner = model.uv if len(model.uv) else self.mesh.uv[self.mesh.triangle]
+        uv = np.einsum("nk,nkc->nc", self.weight, corner[self.triangle]).astype(np.float32)
+        points = interop.to_warp(torch.from_numpy(uv).to(self.device), wp.vec2)
+        out = torch.empty((len(uv), 3), dtype=torch.float32, device=self.device)
+        decoder.run(points, out)
+        wp.synchronize_device(self.device)
+        errors = exact_errors(out[:_CHECKED].cpu().numpy(), decode64(model, uv[:_CHECKED]))
+        return self.replay(lambda: decoder.run(points, out)), errors
+
+
+def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
+    """Makes a row for each method and option that was measured on more than one lightmap.
+
+    Args:
+        rows: Those of each lightmap.
+        lightmaps: How many there are.
+        of: What their scene says besides.
+    """
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.figures and row.method != "fit":
+            groups.setdefault((row.method, row.option), []).append(row)
+    made = []
+    for (method, option), group in groups.items():
+        if len(group) < 2:
+            continue
+        figures: dict[str, float | None] = {}
+        for name in _AVERAGED:
+            if values := [row[name] for row in group if name in row.figures]:
+                figures[name] = fmean(values)
+                if name in _RANGED:
+                    figures |= {f"{name}_min": min(values), f"{name}_max": max(values)}
+        figures["max_error"] = max((row["max_error"] for row in group if "max_error" in row.figures), default=None)
+        figures["lightmaps"] = len(group)
+        made.append(Row("atlas", f"{MEAN} {lightmaps} lightmaps{of}", method, option, figures))
+    return made
+
+
+def warm_up(profile: Profile, device: str) -> None:
+    """Compiles what a compression by a profile and a decode need on a device, with a square of 32 texels a side."""
+    side = np.linspace(0.1, 1.0, 32)
+    image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
+    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
+    mesh = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
+    small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64, "budget": 1.0}
+    model = compress(mesh, profile.model_copy(update=small), device=device)
+    Decoder(model, device).lightmap(mesh)

@@ -1,0 +1,203 @@
+"""Ablation of the paper's cascade and sweeps of its sizes (lightmap-uv-clustering-cascade, section 4.5 and table 2).
+
+One profile is fitted again and again, each time with one thing changed, without a plain lightmap in its place where
+that is better. The rows of method "ablation":
+
+- "whole": the profile.
+- "no repacking": the mesh keeps its UVs, and the cascade begins as the lightmap itself (table 3).
+- "no cascade": the repacked lightmap as it is, without a table and without tuning (table 3).
+- "not tuned": the cascade as tuning begins, whose seams are those before tuning.
+- "ASTC": T_p in blocks of 4 x 4 texels (table 2).
+
+Those of method "sweep" (figure 7) have another epsilon, "scale", epsilon_p, "colour_scale", or epsilon_c, "lut_scale".
+
+Triangles are grouped once a lightmap, which takes no part in the times. Seams are the borders of the charts under the
+row's own UVs. Bits are as everywhere those of a GPU, 64 a texel of half floats, where the paper has 48.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+
+from benchmarks.atlas import QUICK_RESOLUTION, QUICK_VIEWS, RESOLUTION, SCORES, VIEWS, means, warm_up
+from benchmarks.atlas_inputs import Lightmap
+from benchmarks.rows import Row
+from benchmarks.runner import Bench, Note
+from wlm.atlas.cascade import fit_cascade, group_triangles
+from wlm.atlas.decode import Decoder
+from wlm.atlas.evaluation import chart_labels, compare
+from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
+from wlm.atlas.stages import Stages
+from wlm.errors import WlmError
+
+WHOLE, KEPT_UVS = "whole", "no repacking"
+"""The rows of the profile itself, and of its cascade under the mesh's own UVs."""
+
+ABLATION = {
+    WHOLE: {},
+    KEPT_UVS: {},
+    "no cascade": {"lut_scale": 0.0, "colour_scale": 1.0, "steps": 0},
+    "not tuned": {"steps": 0},
+    "ASTC": {"colour": "astc"},
+}
+"""By the row's name, the settings that are changed."""
+
+SWEEPS = {
+    "scale": (0.3, 0.4, 0.5, 0.6, 0.7),
+    "colour_scale": (0.2, 0.3, 0.4, 0.5, 0.6, 0.8),
+    "lut_scale": (0.3, 0.5, 0.6, 0.7, 0.8, 1.0),
+}
+"""By the setting, its values."""
+
+_SEED = 0
+_QUICK = {"steps": 200, "resolution": 256}
+
+
+def run(
+    lightmaps: Sequence[Lightmap],
+    profile: str = "paper",
+    only: Sequence[str] = (),
+    *,
+    quick: bool,
+    device: str,
+    steps: int | None = None,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
+) -> list[Row]:
+    """Fits the variants of a profile to each lightmap and compares them.
+
+    Args:
+        lightmaps: At least one, as `benchmarks.atlas_inputs.load` reads them.
+        profile: A profile of method "cascade": its name or a YAML file.
+        only: Names of rows; none: all.
+        quick: Short fits in small views, which show on a CPU that all of it works: errors are those of unfinished fits.
+        device: "cpu" or "cuda:0".
+        steps: Of each fit; None: the profile's.
+        progress: Called with a line before each part of the work.
+        done: Called after each lightmap with all rows so far.
+
+    Returns:
+        The rows, lightmap by lightmap, and where there are several their means.
+
+    Raises:
+        WlmError: The profile or the device isn't there, the profile is of tiles, or no row has such a name.
+    """
+    settings = Profile.load(profile).override(_QUICK if quick else {})
+    if steps is not None:
+        settings = settings.override({"steps": steps})
+    views, resolution = (QUICK_VIEWS, QUICK_RESOLUTION) if quick else (VIEWS, RESOLUTION)
+    options = {"device": device, "progress": progress, "done": done}
+    return run_rows(lightmaps, settings, only, views=views, resolution=resolution, **options)
+
+
+def run_rows(
+    lightmaps: Sequence[Lightmap],
+    profile: Profile,
+    only: Sequence[str] = (),
+    *,
+    device: str,
+    views: int,
+    resolution: int,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
+) -> list[Row]:
+    """Fits the variants of a profile, scored in so many views of so many pixels a side; the rest as for `run`."""
+    chosen = choose(profile, only)
+    of = f", ablation of {profile.name}"
+    first = Bench("atlas", device, progress)
+    first.note("compiling")
+    warm_up(profile, first.device)
+    rows: list[Row] = []
+    for lightmap in lightmaps:
+        bench = Bench("atlas", device, progress, scene=lightmap.scene + of)
+        rows += _rows(bench, lightmap, profile, chosen, views, resolution)
+        if done is not None:
+            done(rows)
+    return rows + means(rows, len(lightmaps), of)
+
+
+def variants(base: Profile) -> list[tuple[str, str, Profile]]:
+    """Methods, options and settings of all rows; a sweep leaves out the value that the profile has.
+
+    Args:
+        base: What each is with one change.
+    """
+    rows = [("ablation", name, base.override(changes)) for name, changes in ABLATION.items()]
+    for setting, values in SWEEPS.items():
+        for value in values:
+            if value != getattr(base, setting):
+                rows.append(("sweep", f"{setting} {value:g}", base.override({setting: value})))
+    return rows
+
+
+def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
+    """The `variants` that are asked for.
+
+    Args:
+        base: What each is with one change.
+        only: Names of rows; none: all.
+
+    Raises:
+        WlmError: The profile is of tiles, or no row has such a name.
+    """
+    if base.method != "cascade":
+        raise WlmError(f"bench: --profile: expected one of method cascade, found {base.name}, of {base.method}")
+    rows = variants(base)
+    names = [option for _, option, _ in rows]
+    for name in only:
+        if name not in names:
+            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
+    return [row for row in rows if not only or row[1] in only]
+
+
+def _rows(
+    bench: Bench,
+    lightmap: Lightmap,
+    base: Profile,
+    chosen: Sequence[tuple[str, str, Profile]],
+    views: int,
+    resolution: int,
+) -> list[Row]:
+    mesh, device = lightmap.mesh, bench.device
+    clusters = None
+    if any(option != KEPT_UVS for _, option, _ in chosen):
+        bench.note("grouping triangles")
+        clusters = group_triangles(mesh, base, Stages(device))
+    rows, models = [], {}
+    for i, (method, option, variant) in enumerate(chosen):
+        bench.note(option)
+        stages, start = Stages(device), time.perf_counter()
+        try:
+            model = fit_cascade(mesh, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)
+        except WlmError as error:  # a package is missing, or the fit diverged
+            rows.append(bench.missing_row(method, option, error))
+            continue
+        rows.append(_row(bench, method, option, variant, model, stages, time.perf_counter() - start))
+        models[str(i)] = model
+    bench.note(f"scoring, {views} views of {resolution}²")
+    decoders = {i: Decoder(model, device) for i, model in models.items()}
+    labels = {i: chart_labels(model, mesh, device) for i, model in models.items()}
+    scores = compare(mesh, decoders, labels=labels, views=views, resolution=resolution, device=device)
+    for i, score in scores.items():
+        rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(score, name) for name in SCORES})
+    return rows
+
+
+def _row(
+    bench: Bench, method: str, option: str, profile: Profile, model: AtlasModel, stages: Stages, seconds: float
+) -> Row:
+    fit = stages.seconds["fit"]
+    return bench.row(
+        method,
+        option,
+        bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
+        compression_ratio=model.compression_ratio,
+        encode_seconds=seconds,
+        step_ms=1e3 * fit / profile.steps if profile.steps else None,
+        steps=profile.steps,
+        resolution=profile.resolution if profile.space == "views" and profile.steps else None,
+        colour_width=model.texels.shape[1],
+        colour_height=model.texels.shape[0],
+        lut_width=model.lut.shape[1] or None,
+        lut_height=model.lut.shape[0] or None,
+        **{f"{stage}_seconds": value for stage, value in stages.seconds.items()},
+    )

@@ -1,0 +1,63 @@
+"""Results beside older ones: what has become worse."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.figures import FIGURES
+from benchmarks.rows import Row, Run
+
+_LEAST_DB = 0.05
+_LEAST_TIME = 0.05  # of the old time
+_SPREAD = "_spread"
+
+
+@dataclass(frozen=True)
+class Change:
+    """One figure that two rows of the same method, option and scene both have.
+
+    Attributes:
+        row: The new row.
+        name: The figure's, as in `benchmarks.figures`.
+        old, new: Its values.
+        worse: Whether it lost more than 0.05 dB, or takes more than 5% longer and more than the samples' own spread.
+    """
+
+    row: Row
+    name: str
+    old: float
+    new: float
+    worse: bool
+
+
+def compare(rows: Sequence[Row], runs: Sequence[Run], device_name: object) -> list[Change]:
+    """Compares rows with those of an older result file.
+
+    Args:
+        rows: The new results.
+        runs: The older file's.
+        device_name: Of the machine that the new rows are from, as `describe_environment` gives it. Times of another
+            one are not compared.
+
+    Returns:
+        All figures in decibels and all times that two rows both have, in the order of the new rows.
+    """
+    older = {_key(row): (row, run.environment.get("device_name")) for run in runs for row in run.rows}
+    changes = []
+    for row in rows:
+        old, machine = older.get(_key(row), (None, None))
+        for name in row.figures if old is not None else ():
+            before, unit = old.get(name), FIGURES[name].unit
+            if before is None or name.endswith(_SPREAD):
+                continue
+            if unit == "dB":
+                changes.append(Change(row, name, before, row[name], row[name] < before - _LEAST_DB))
+            elif unit in ("ms", "s") and machine == device_name:
+                # Half of each spread: a median may lie there by chance.
+                chance = sum(each.get(name + _SPREAD) or 0.0 for each in (row, old)) / 2
+                least = max(_LEAST_TIME * before, chance)
+                changes.append(Change(row, name, before, row[name], row[name] > before + least))
+    return changes
+
+
+def _key(row: Row) -> tuple[str, str, str, str]:
+    return row.system, row.scene, row.method, row.option

@@ -1,0 +1,473 @@
+"""The lightmap system against itself and against block codecs: size, speed and error in one run.
+
+Five kinds of rows:
+
+- method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, and the
+  decode time of the whole map to 8 bits on the fast path. The largest error is in radiance, against the float64 path.
+- methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, and on CUDA
+  "matrix" (the fast path on matrix units), of profile M:
+  the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
+  8 bits, 0.00196, is the rounding itself.
+- method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
+  (`wlm.lightmap.page`), its errors and how long it takes from the stored bytes.
+- the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
+  and a video codec; between stored times their light is mixed.
+- method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
+
+Profiles and rivals have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
+of views in a full run.
+
+A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
+alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
+memory, `disk_bytes` and `disk_bpp` after lossless compression; what has no random access has the latter alone.
+"""
+
+import functools
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.plot import Panel
+from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
+from benchmarks.rivals.lightmap_torch import PlainFit
+from benchmarks.rows import Row
+from benchmarks.runner import Bench, Fit, Note, demo_data
+from wlm.errors import WlmError
+from wlm.lightmap.data import LightmapSet, load
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
+from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
+from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.frame_decode import image_kinds
+from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
+from wlm.lightmap.page import MapDecoder
+from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
+from wlm.lightmap.seen import Tally
+from wlm.lightmap.tiles import TileGrid, TileKind, assemble
+from wlm.lightmap.views import VIEWS, views_of
+from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
+
+PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
+"""Profiles of a full run: the paper's table 3, ours, and M as the paper fits it."""
+
+QUICK_PROFILES = ("L", "M", "M-paper")
+"""Profiles of a quick run."""
+
+PANELS = (Panel("decode_ms"), Panel("bpp"), Panel("disk_bpp"))
+"""What a plot of the rows shows: quality against time and size."""
+
+# A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
+_QUICK_TILE_STEPS = 8_000
+_QUICK_SAMPLES = 2048
+_QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
+_FULL_TILES = 64  # of 1024 x 1024
+_PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # of the fit in plain torch: enough for its time
+_ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
+
+_SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
+
+_Runtime = StripDecoder | MatrixDecoder | ExactDecoder | FrameDecoder
+
+# GELU by its gate, which is shorter to read in a plot.
+_GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
+
+
+def run(
+    *,
+    quick: bool,
+    device: str,
+    set_path: str | os.PathLike[str] | None = None,
+    names: Sequence[str] | None = None,
+    qualities: Sequence[int] = (),
+    rivals: bool = True,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the lightmap system on one set.
+
+    Args:
+        quick: Three profiles with short fits and a third of the rivals, scored at three times (9, 12 and 21 h if the
+            set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
+        device: "cpu" or "cuda:0", for fits and decodes.
+        set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
+        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`, or none beside `qualities`.
+        qualities: Of the profile `video`, 0 to 100: a row for each, "video 75" for example.
+        rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, in the order of the module's list.
+
+    Raises:
+        WlmError: The set or the device isn't there, a quality is out of range, or a fit diverged.
+    """
+    if not names:
+        names = () if qualities else QUICK_PROFILES if quick else PROFILES
+    profiles = [Profile.load(name) for name in names]
+    profiles += [Profile.load("video").override({"name": f"video {q}", "video_quality": q}) for q in qualities]
+    lightmaps = _load(set_path)
+    chosen = np.arange(len(lightmaps.times))
+    if quick:
+        steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
+        profiles = [
+            profile.model_copy(update={"steps": min(steps, profile.steps), "samples": _QUICK_SAMPLES})
+            for profile in profiles
+        ]
+        chosen = _quick_times(lightmaps.times)
+    names = usual(device, quick) if rivals else ()
+    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
+
+
+def run_rivals(
+    *,
+    quick: bool = False,
+    device: str = "cpu",
+    set_path: str | os.PathLike[str] | None = None,
+    names: Sequence[str] | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the rivals alone.
+
+    Args:
+        quick, set_path, progress: As for `run`.
+        device: "cpu" or "cuda:0", for the rivals that are fitted; the others run on the CPU.
+        names: Keys of `benchmarks.rivals.lightmap.RIVALS`; None: all, or with `quick` a third of them, and on the CPU
+            without those that are fitted.
+
+    Returns:
+        Their rows.
+
+    Raises:
+        WlmError: The set or the device isn't there, or a name is unknown.
+    """
+    for name in names or ():
+        check_rival(name)
+    lightmaps = _load(set_path)
+    chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
+    bench = _LightmapBench(lightmaps, chosen, device, progress, None)
+    return [bench.rival_row(name) for name in names or usual(bench.device, quick)]
+
+
+def run_rows(
+    lightmaps: LightmapSet,
+    profiles: Sequence[Profile],
+    *,
+    device: str,
+    chosen: Sequence[int] | np.ndarray,
+    rivals: Sequence[str] = (),
+    repeats: int | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the given profiles on a given set; the rest as for `run`.
+
+    Args:
+        lightmaps: The set.
+        profiles: At least one. The rows of decode options are of the one named "M", else of the first.
+        chosen: Indices of the times that are scored, int [K], at least one.
+        rivals: Keys of `benchmarks.rivals.lightmap.RIVALS`.
+        repeats: As for `Bench`.
+    """
+    if not profiles or len(chosen) == 0:
+        raise ValueError("expected at least one profile and one time")
+    bench = _LightmapBench(lightmaps, np.asarray(chosen), device, progress, repeats)
+    fits = [bench.fit_profile(profile) for profile in profiles]
+    peers = [row(fit) for fit in fits for row in (bench.profile_row, bench.texture_row)]
+    best = next((fit for fit in fits if fit.option == "M"), fits[0])
+    if len(best.model.mapped):
+        # On the CPU "fast" is "tanh".
+        gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
+        peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
+        if bench.device != "cpu" and best.model.profile.hidden % 16 == 0:
+            peers.append(bench.option_row(best, "matrix", "fast"))
+    rows = bench.time_rows(peers)
+    rows += [bench.rival_row(name) for name in rivals]
+    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.mapped)]
+    return rows + bench.plain_rows(best)
+
+
+def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
+    return load(demo_data("city", "--set PATH") if set_path is None else set_path)
+
+
+def _quick_times(times: np.ndarray) -> np.ndarray:
+    """Indices of the three hours, or of three times spread evenly."""
+    if np.isin(_QUICK_HOURS, times).all():
+        return np.searchsorted(times, _QUICK_HOURS)
+    return np.unique(np.linspace(0, len(times) - 1, 3).round().astype(int))
+
+
+def _hours(times: Sequence[float]) -> str:
+    return ", ".join(f"{t:g}" for t in times)
+
+
+def _repeated(model: LightmapModel, count: int) -> LightmapModel:
+    """The model of a map that holds the tiles of this one several times over."""
+    arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
+    width, height = TILE * len(model.kind), TILE * count
+    return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
+
+
+def _matrix(model: LightmapModel, device: str, gelu: str | None) -> MatrixDecoder:
+    return MatrixDecoder(model, device)
+
+
+def _fast(model: LightmapModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
+    return fast_decoder(model, device)
+
+
+class _LightmapBench(Bench):
+    """A set, and the times of it that are scored."""
+
+    def __init__(
+        self, lightmaps: LightmapSet, chosen: np.ndarray, device: str, progress: Note | None, repeats: int | None
+    ) -> None:
+        super().__init__("lightmap", device, progress, scene=lightmaps.name, repeats=repeats)
+        self.lightmaps, self.chosen = lightmaps, chosen
+        self.times = [float(t) for t in lightmaps.times[chosen]]
+        self.grid = TileGrid.of(*lightmaps.mask.shape)
+        places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
+        self.error_times = [self.times[i] for i in places]
+        """Those at which the float64 path is run too."""
+        self.scored = {"times": len(lightmaps.times), "times_scored": len(chosen)}
+        whole = len(chosen) == len(lightmaps.times)
+        self.scored_at = "" if whole else f"scored at {_hours(self.times)}; "
+
+    def fit_profile(self, profile: Profile) -> Fit:
+        """Fits and writes a profile; compiling its kernels is no part of either time."""
+        if profile.frames in ("always", "video"):  # no kernel is compiled
+            self.note(f"{profile.name}: encoding {self.grid.count} tiles")
+            return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
+        self.note(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
+        compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
+        return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
+
+    def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a profile costs and yields; and its decode, to be timed."""
+        self.note(f"{fit.option}: scoring")
+        model = fit.model
+        decoder = Decoder(model, self.device)
+        frames = {t: decoder.frame(t) for t in self.times}
+        error = 0.0
+        for t in self.error_times:
+            exact = self._assembled(np.stack([decode_tile64(model, number, t) for number in range(self.grid.count)]))
+            # The float64 path leaves gaps unfilled.
+            error = max(error, float(np.abs(frames[t] - exact)[self.lightmaps.mask].max()))
+        row = self.row(
+            "ours",
+            fit.option,
+            f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
+            bytes=memory_bytes(model),
+            bpp=bits_per_texel(model, self.lightmaps.mask, memory_bytes(model)),
+            disk_bytes=fit.bytes,
+            disk_bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
+            encode_seconds=fit.seconds,
+            max_error=error,
+            steps=model.profile.steps if len(model.mapped) else None,
+            **self._score(frames.values(), fit.option, decode=decoder.frame),
+            **self._tiles(model),
+        )
+        return row, self._decode(self._decoders(model, "fast", None))
+
+    def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a renderer samples of a profile: one texture of the map, with mips."""
+        self.note(f"{fit.option}: texture")
+        decoder = MapDecoder(fit.model, self.device)
+
+        def frame(t: float) -> np.ndarray:
+            decoder.set_time(t)
+            decoder.decode()
+            return decoder.numpy()
+
+        row = self.row(
+            "texture",
+            fit.option,
+            f"{self.scored_at}one RGB9E5 texture with {len(decoder.levels) - 1} mips; time of all of it, {self.mode}",
+            **self._score((frame(t) for t in self.times), fit.option, ("psnr",), frame, views=0),
+        )
+        decoder.set_time(self.times[0])
+        return row, self.replay(decoder.decode)
+
+    def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
+        """One way to decode a profile to 8 bits."""
+        self.note(f"{fit.option}: {path} decode with {gelu} GELU")
+        model = fit.model
+        decoders = self._decoders(model, path, gelu)
+        # A small map leaves most of a GPU idle: there the time is that of 1024 x 1024, the same tiles repeated.
+        repeat = 1 if self.device == "cpu" else max(1, _FULL_TILES // self.grid.count)
+        timed = _repeated(model, repeat)
+        frames, error = [], 0.0
+        for t in self.times:
+            tiles, worst = self._tiles_8bit(model, decoders, t, compare=t in self.error_times)
+            frames.append(self._assembled(tiles))
+            error = max(error, worst)
+        trained = ", as trained" if gelu == model.profile.gelu else ""
+        row = self.row(
+            path,
+            _GELUS[gelu],
+            f"profile {fit.option}, GELU by {_GELUS[gelu]}{trained}; {self.scored_at}errors of the 8-bit output, the "
+            f"largest as a share of 255 at {_hours(self.error_times)}; time {self.mode}",
+            max_error=error,
+            tiles_timed=len(timed.kind),
+            # What an option costs shows in PSNR and in its largest error; FLIP would take most of the run.
+            **self._score(frames, path, ("psnr",)),
+        )
+        return row, self._decode(self._decoders(timed, path, gelu))
+
+    def rival_row(self, name: str) -> Row:
+        """A rival on the same lightmaps."""
+        method = RIVALS[name]
+        self.note(method.label)
+        try:
+            tally = self._tally(name)
+            score = functools.partial(self._frame, name, tally)
+            rival, frames = encode_set(name, self.lightmaps, score, self.chosen, device=self.device)
+        except WlmError as error:
+            return self.missing_row(method.title, method.option, error)
+        count = len(self.lightmaps.times)
+        bits = 8 / (self.lightmaps.mask.size * count)
+        where = "" if method.fitted else ", on one CPU thread"
+        notes = [f"{self.scored_at}size and encode time of all times{where}", rival.option]
+        figures = {"disk_bytes": rival.disk_bytes, "disk_bpp": rival.disk_bytes * bits}
+        if method.random_access:
+            figures |= {"bytes": rival.bytes, "bpp": rival.bytes * bits}
+        else:
+            notes.append("no random access")
+        if self.device == "cpu":
+            figures["decode_ms"] = 1e3 * rival.decode_seconds / count
+        figures |= {"encode_seconds": rival.encode_seconds, **self._figures(frames, tally)}
+        return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
+
+    def fit_row(self, fit: Fit) -> Row:
+        """The speed of a fit."""
+        profile = fit.model.profile
+        return self.row(
+            "fit",
+            f"{fit.option} {profile.steps:,} steps",
+            "all tiles together",
+            encode_seconds=fit.fit_seconds,
+            step_ms=1e3 * fit.fit_seconds / profile.steps,
+            steps=profile.steps,
+            samples=profile.samples,
+            **self._tiles(fit.model),
+        )
+
+    def plain_rows(self, fit: Fit) -> list[Row]:
+        """Some steps of the same fit in plain torch; none where no tile is dynamic."""
+        # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
+        plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
+        profile = fit.model.profile.model_copy(update=plain)
+        targets = dynamic_targets(self.lightmaps, profile)
+        if targets is None:
+            return []
+        self.note(f"{fit.option}: the fit in plain torch")
+        axis = TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis)
+        peer = PlainFit(profile, axis, targets, device=self.device)
+        peer.step().item()
+        steps = min(profile.steps, _PLAIN_STEPS["cpu" if self.device == "cpu" else "cuda"])
+        start = time.perf_counter()
+        for _ in range(steps):
+            loss = peer.step()
+        loss.item()  # waits for the device
+        seconds = time.perf_counter() - start
+        row = self.row(
+            "fit in plain torch",
+            f"{fit.option} {steps:,} steps",
+            "maps stay continuous, no file",
+            encode_seconds=seconds,
+            step_ms=1e3 * seconds / steps,
+            times_ours=seconds / steps / (fit.fit_seconds / profile.steps),
+            steps=steps,
+        )
+        return [row]
+
+    def _assembled(self, tiles: np.ndarray) -> np.ndarray:
+        return assemble(tiles, np.arange(self.grid.count), self.grid)
+
+    def _tiles(self, model: LightmapModel) -> dict[str, int]:
+        """Counts tiles by kind; those without valid texels are left out."""
+        kinds = count_kinds(model).items()
+        return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
+
+    def _score(
+        self,
+        frames: Iterable[np.ndarray],
+        name: str,
+        metrics: Sequence[str] = METRICS,
+        decode: Callable[[float], np.ndarray] | None = None,
+        views: int = VIEWS,
+    ) -> dict[str, float]:
+        """The figures of lightmaps at the chosen times and, with a decoder of any time, of how they are seen."""
+        tally = None if decode is None else self._tally(name, decode, views)
+        pairs = zip(self.chosen.tolist(), frames, strict=True)
+        return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
+
+    def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
+        """The scores of `wlm.lightmap.seen`, to be filled."""
+        whole = len(self.chosen) == len(self.lightmaps.times)
+        seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
+        for warning in warnings:
+            self.note(warning)
+        return Tally(self.lightmaps, self.lightmaps.mask, decode, seen_from, name)
+
+    def _frame(
+        self, name: str, tally: Tally | None, i: int, decoded: np.ndarray, metrics: Sequence[str] = METRICS
+    ) -> FrameMetrics:
+        frame, valid = self.lightmaps.frames[i], self.lightmaps.valid(i)
+        scores = evaluate_frame(frame, decoded, valid, TILE, metrics, name=name)
+        if tally is not None:
+            tally.add(i, decoded, scores)
+        return scores
+
+    def _figures(self, frames: Sequence[FrameMetrics], tally: Tally | None) -> dict[str, float]:
+        """PSNR, SSIM and FLIP, at how many times, and how the lightmaps are seen."""
+        summary = summarise(frames)
+        figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
+        if tally is None:
+            return figures
+        score = tally.score()
+        figures |= {key: getattr(score, key) for key in _SEEN} | {"excess_change": score.flicker}
+        worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
+        return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
+
+    def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[_Runtime]:
+        """Decoders of the tiles with maps; a constant tile needs no launch."""
+        decoders: list[_Runtime] = []
+        if (model.kind == TileKind.DYNAMIC).any():
+            make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
+            decoders.append(make(model, self.device, gelu))
+        if (model.kind == TileKind.STATIC).any():
+            decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
+        decoders += [FrameDecoder(model, self.device, kind) for kind in image_kinds(model)]
+        for decoder in decoders:
+            decoder.set_time(self.times[0])
+        return decoders
+
+    def _decode(self, decoders: Sequence[_Runtime]) -> Callable[[], object]:
+        def decode() -> None:
+            for decoder in decoders:
+                decoder.decode()
+
+        # Without any launch there is nothing to capture.
+        return self.replay(decode) if decoders else decode
+
+    def _tiles_8bit(
+        self, model: LightmapModel, decoders: Sequence[_Runtime], t: float, compare: bool
+    ) -> tuple[np.ndarray, float]:
+        """Radiance of all tiles through 8 bits, and the largest error of a byte over 255 if it is to be compared."""
+        tiles = np.zeros((self.grid.count, TILE, TILE, 3))
+        worst = 0.0
+        for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():
+            tiles[number] = decode_tile64(model, number, t)
+        for decoder in decoders:
+            decoder.set_time(t)
+            decoder.decode()
+            shares = decoder.numpy()[..., :3] / 255.0
+            for number, share, bound in zip(decoder.numbers.tolist(), shares, decoder.bounds, strict=True):
+                tiles[number] = (share * bound) ** model.profile.gamma
+                peak = bound64(model, number, t)
+                if compare and peak > 0:
+                    exact = np.minimum(colour_tile64(model, number, t) / peak, 1.0)
+                    worst = max(worst, float(np.abs(share - exact).max()))
+        return tiles, worst

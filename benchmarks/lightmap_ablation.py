@@ -1,0 +1,183 @@
+"""Ablation of the feature maps and of the simulation of block compression (neural-dynamic-gi, section 11).
+
+One profile is fitted again and again in plain torch (`benchmarks.rivals.lightmap_torch`), from the same seed and for as
+many steps, each time with other feature maps, at about the same bytes. All are scored as decoded from the levels that a
+file would hold, the network fitted to these at the end (section 4). The rows:
+
+- "hybrid": F_uv, F_uvt, F_ut and F_vt, the paper's and the profile's.
+- "2D alone", "3D alone": two maps F_uv; an F_uvt of 48 x 48 x 15 (table 6, figure 9).
+- "tri-plane": F_uv, and F_ut and F_vt of six channels in place of F_uvt.
+- "8 channels of F_uv": two maps F_uv in place of F_ut and F_vt (table 8).
+- "no block simulation": the hybrid, whose texels are trained on 8-bit levels and meet a BC7 encoder at the end
+  (table 7, figure 10).
+- "kernels": the hybrid by `wlm.lightmap.compress`, to hold the plain fit to it.
+
+Only dynamic tiles are fitted, scored and weighed.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from benchmarks.rivals.lightmap_torch import Features, PlainFit
+from benchmarks.rows import Row
+from benchmarks.runner import Bench, Note, demo_data
+from wlm.errors import WlmError
+from wlm.lightmap.data import LightmapSet, load
+from wlm.lightmap.decode import Decoder
+from wlm.lightmap.evaluation import memory_bytes
+from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.tiles import TILE, TileGrid, assemble
+from wlm.metrics import evaluate_frame, summarise
+
+METHOD = "ablation"
+"""The table of these rows."""
+
+KERNELS = "kernels"
+"""The row of the fused fit."""
+
+VARIANTS = {
+    "hybrid": Features(),
+    "2D alone": Features(uv=2, uvt=0, channels=0),
+    "3D alone": Features(uv=0, uvt=48, slices=15, channels=0),
+    "tri-plane": Features(uvt=0, channels=6),
+    "8 channels of F_uv": Features(uv=2, channels=0),
+    "no block simulation": Features(blocks=False),
+}
+"""The feature maps of each row but the last, at the sizes of profile M."""
+
+_PROFILE = "M"
+_SEED = 0
+_QUICK = {"steps": 200, "samples": 512}
+_METRICS = ("psnr", "ssim")
+
+
+def run(
+    only: Sequence[str] = (),
+    *,
+    quick: bool,
+    device: str,
+    set_path: str | os.PathLike[str] | None = None,
+    steps: int | None = None,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
+) -> list[Row]:
+    """Fits the variants of profile M to one set and compares them.
+
+    Args:
+        only: Names of rows; none: all.
+        quick: Short fits, to see on a CPU that all of it works: so few steps show little.
+        device: "cpu" or "cuda:0".
+        set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
+        steps: Of each fit; None: the profile's.
+        progress: Called with a line before each part of the work.
+        done: Called after each row with all rows so far.
+
+    Returns:
+        One row for each variant.
+
+    Raises:
+        WlmError: The set or the device isn't there, no row has such a name, no tile is dynamic, or a fit diverged.
+    """
+    _check(only)
+    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
+    profile = Profile.load(_PROFILE).override(_QUICK if quick else {})
+    if steps is not None:
+        profile = profile.override({"steps": steps})
+    return run_rows(lightmaps, profile, only, device=device, progress=progress, done=done)
+
+
+def run_rows(
+    lightmaps: LightmapSet,
+    profile: Profile,
+    only: Sequence[str] = (),
+    *,
+    device: str,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
+) -> list[Row]:
+    """Fits the variants of a profile, whose own sizes of maps don't count, to a set; the rest as for `run`."""
+    names = _check(only)
+    bench = _AblationBench(lightmaps, profile, device, progress)
+    rows = []
+    for name in names:
+        if not only or name in only:
+            bench.note(f"fits {name}")
+            rows.append(bench.kernels_row() if name == KERNELS else bench.variant_row(name))
+            if done is not None:
+                done(rows)
+    return rows
+
+
+def _check(only: Sequence[str]) -> tuple[str, ...]:
+    """Checks the names of rows that are asked for; returns all there are."""
+    names = (*VARIANTS, KERNELS)
+    for name in only:
+        if name not in names:
+            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
+    return names
+
+
+class _AblationBench(Bench):
+    """A set, and the dynamic tiles of it that are fitted."""
+
+    def __init__(self, lightmaps: LightmapSet, profile: Profile, device: str, progress: Note | None) -> None:
+        super().__init__("lightmap", device, progress, scene=f"{lightmaps.name}, ablation")
+        self._lightmaps, self._profile = lightmaps, profile
+        targets = dynamic_targets(lightmaps, profile)
+        if targets is None:
+            raise WlmError(f"{lightmaps.name}: expected a tile whose light changes in more than its strength")
+        self._targets = targets
+        self._grid = TileGrid.of(*lightmaps.mask.shape)
+        tiles = np.ones((len(targets.number), TILE, TILE, 1), bool)
+        self._held = assemble(tiles, targets.number, self._grid)[..., 0]
+
+    def variant_row(self, name: str) -> Row:
+        """What feature maps are worth."""
+        axis = TimeAxis(self._lightmaps.times, self._lightmaps.period, self._profile.time_axis)
+        try:
+            fit = PlainFit(self._profile, axis, self._targets, VARIANTS[name], seed=_SEED, device=self.device)
+            start = time.perf_counter()
+            for _ in range(self._profile.steps):
+                loss = fit.step()
+            loss.item()  # waits for the device
+            seconds = time.perf_counter() - start
+            tiles = fit.decode()
+        except WlmError as error:
+            return self.missing_row(METHOD, name, error)
+        frames = (assemble(tiles[:, k], self._targets.number, self._grid) for k in range(len(self._lightmaps.times)))
+        return self._row(name, "in plain torch", fit.tile_bytes * len(tiles), frames, seconds)
+
+    def kernels_row(self) -> Row:
+        """The profile as it is shipped."""
+        profile, tiles = self._profile, sorted(self._targets.number.tolist())
+        compress(self._lightmaps, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
+        start = time.perf_counter()
+        model = compress(self._lightmaps, profile, tiles=tiles, seed=_SEED, device=self.device)
+        seconds = time.perf_counter() - start
+        decoder = Decoder(model, self.device)
+        frames = (decoder.frame(t) for t in self._lightmaps.times)
+        return self._row(KERNELS, "fused kernels", memory_bytes(model), frames, seconds)
+
+    def _row(self, name: str, notes: str, size: int, frames: Iterable[np.ndarray], seconds: float) -> Row:
+        lightmaps, steps = self._lightmaps, self._profile.steps
+        valid = [lightmaps.valid(i) & self._held for i in range(len(lightmaps.times))]
+        triples = zip(lightmaps.frames, frames, valid, strict=True)
+        scores = summarise([evaluate_frame(a, b, inside, TILE, _METRICS, name=name) for a, b, inside in triples])
+        return self.row(
+            METHOD,
+            name,
+            notes,
+            bytes=size,
+            bpp=8 * size / (int(self._held.sum()) * len(valid)),
+            psnr=scores.psnr,
+            ssim=scores.ssim,
+            encode_seconds=seconds,
+            step_ms=1e3 * seconds / steps,
+            steps=steps,
+            samples=self._profile.samples,
+            dynamic_tiles=len(self._targets.number),
+        )

@@ -1,0 +1,246 @@
+"""Six-way lightmaps by Mitsuba's volumetric path tracer, of one bounce or more, and Open Image Denoise: extra `bake`.
+
+An independent estimate of the same integral: with many samples it checks the march, with few it shows the quality that
+a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU whose driver has OptiX, which drivers
+for computing alone often lack; the denoiser runs on the CPU.
+"""
+
+import functools
+import importlib.util
+import math
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+
+from wlm.errors import WlmError, one_line
+from wlm.fluid.volume import DensityVolume
+from wlm.smoke.camera import VECTORS, Camera
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.scene import CameraSettings, make_camera
+
+GPU = "cuda_ad_rgb"
+"""Mitsuba's variant for a GPU."""
+
+_FILTER = "RTLightmap"  # of one image without normals or albedo, in linear light
+_NEVER = 100  # bounces after which Russian roulette begins
+_LLVM = 19  # older versions can't compile Mitsuba's kernels, and end the process
+_TRIAL = f"from benchmarks.path_tracer import try_variant; try_variant({GPU!r})"
+_PATIENCE = 180.0  # seconds of a trial, most of which compile the first kernels
+_REASON = 160  # characters of why it failed
+
+
+def has_tracer() -> bool:
+    """Whether Mitsuba is installed."""
+    return importlib.util.find_spec("mitsuba") is not None
+
+
+def has_denoiser() -> bool:
+    """Whether Open Image Denoise is installed."""
+    return importlib.util.find_spec("pyoidn") is not None
+
+
+def choose_variant(device: str = "cpu") -> tuple[str, str]:
+    """Chooses Mitsuba's fastest variant for a device.
+
+    Args:
+        device: "cpu" or "cuda:0".
+
+    Returns:
+        The variant, and the reason why it is one of the CPU although a GPU was asked for, else an empty string.
+
+    Raises:
+        WlmError: Mitsuba isn't installed.
+    """
+    if not has_tracer():
+        raise WlmError("path tracing needs mitsuba: install wlm[bake]")
+    import drjit
+
+    reason = ""
+    if device != "cpu":
+        reason = _no_gpu(device, drjit.has_backend(drjit.JitBackend.CUDA))
+        if not reason:
+            return GPU, ""
+    fast = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= _LLVM
+    return "llvm_ad_rgb" if fast else "scalar_rgb", reason
+
+
+def _no_gpu(device: str, has_cuda: bool) -> str:
+    """Why Mitsuba can't trace on a GPU; empty if it can."""
+    if device != "cuda:0":
+        return "Mitsuba takes the first GPU alone"
+    if not has_cuda:
+        return "Dr.Jit finds no CUDA"
+    # In a process of its own, which Mitsuba may end where OptiX is missing or too old.
+    try:
+        trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        return f"a first image took more than {_PATIENCE:g} s"
+    except OSError as error:
+        return f"a second process can't be started, {error.strerror}"
+    if trial.returncode == 0:
+        return ""
+    lines = trial.stderr.strip().splitlines()
+    return one_line(lines[-1] if lines else f"a first image ended with {trial.returncode}", _REASON)
+
+
+def try_variant(variant: str) -> None:
+    """Traces a small plume.
+
+    Raises:
+        WlmError: Mitsuba isn't installed, or the image is black or not finite.
+        Exception: Whatever Mitsuba raises where the variant doesn't work.
+    """
+    volume = make_plume(8, hot=False, extinction=14.0)
+    camera = make_camera(CameraSettings(resolution=8), volume.origin, (1.0, 1.0, 1.0))
+    lightmaps, _ = PathTracer(volume, camera, variant=variant)(4)
+    if not (np.isfinite(lightmaps).all() and lightmaps.any()):
+        raise WlmError(f"path tracing: {variant}: expected light, found none, or numbers that aren't finite")
+
+
+class PathTracer:
+    """Images of smoke under one of the six lights at a time.
+
+    Attributes:
+        variant: Mitsuba's.
+    """
+
+    def __init__(
+        self,
+        volume: DensityVolume,
+        camera: Camera,
+        *,
+        variant: str | None = None,
+        albedo: float = 1.0,
+        g: float = 0.0,
+        order: int = 1,
+    ) -> None:
+        """Loads smoke and camera into Mitsuba.
+
+        Args:
+            volume: The smoke, on any device.
+            camera: Orthographic.
+            variant: As `choose_variant` gives it; None: the fastest on the CPU.
+            albedo: The share of light that a scattering leaves.
+            g: Mean cosine of the Henyey-Greenstein phase function.
+            order: Scatterings after which a path ends.
+
+        Raises:
+            ValueError: The camera is in perspective.
+            WlmError: Mitsuba isn't installed.
+        """
+        if camera.perspective:
+            raise ValueError("six-way lightmaps need an orthographic camera")
+        if not has_tracer():
+            raise WlmError("path tracing needs mitsuba: install wlm[bake]")
+        import mitsuba
+
+        self.variant = variant or choose_variant()[0]
+        mitsuba.set_variant(self.variant)
+        self._mitsuba, self._camera, self._order = mitsuba, camera, order
+        self._smoke = self._load_smoke(volume, albedo, g)
+        self._sensor = self._load_sensor(volume)
+
+    def __call__(self, samples: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Traces all six lightmaps.
+
+        Args:
+            samples: Of each pixel of each lightmap.
+            seed: Of the paths.
+
+        Returns:
+            Lightmaps float32 [6, H, W] as those of `SixWay`, and the transparency [H, W], which is noisy too.
+        """
+        # Each is a copy on the CPU, which waits for the device.
+        images = np.stack([self.trace(direction, samples, seed) for direction in VECTORS])
+        return images[..., 0], 1.0 - images[..., 3].mean(0)
+
+    def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
+        """RGBA float32 [H, W, 4] under one light of irradiance 4 pi; its direction [3] is in the camera's axes."""
+        light = {
+            "type": "directional",
+            "direction": [float(-w) for w in self._camera.axes.T @ direction],
+            "irradiance": {"type": "rgb", "value": 4 * math.pi},
+        }
+        integrator = {"type": "volpath", "max_depth": self._order + 1, "rr_depth": _NEVER, "hide_emitters": True}
+        parts = {"integrator": integrator, "sensor": self._sensor, "light": light, "smoke": self._smoke}
+        scene = self._mitsuba.load_dict({"type": "scene", **parts})
+        return np.array(self._mitsuba.render(scene, spp=samples, seed=seed))
+
+    def _load_smoke(self, volume: DensityVolume, albedo: float, g: float) -> Any:
+        """The smoke, in voxels; a border of empty voxels makes Mitsuba's clamped grid end as ours does."""
+        transform = self._mitsuba.ScalarTransform4f
+        size = np.array(volume.shape, np.float64)
+        grid = np.pad(volume.density.float().cpu().numpy(), 1).transpose(2, 1, 0)[..., None]
+        box = transform().translate([-1.0] * 3).scale([float(s + 2) for s in size])
+        values = self._mitsuba.VolumeGrid(np.ascontiguousarray(grid))
+        medium = {
+            "type": "heterogeneous",
+            "albedo": albedo,
+            "scale": volume.extinction * volume.voxel,
+            "sigma_t": {"type": "gridvolume", "grid": values, "to_world": box},
+            "phase": {"type": "hg", "g": g} if g else {"type": "isotropic"},
+        }
+        centre = [float(c) for c in size / 2]
+        return self._mitsuba.load_dict(
+            {
+                "type": "cube",
+                "to_world": transform().translate(centre).scale([float(0.5 * s + 0.999) for s in size]),
+                "bsdf": {"type": "null"},
+                "interior": medium,
+            }
+        )
+
+    def _load_sensor(self, volume: DensityVolume) -> Any:
+        camera, transform = self._camera, self._mitsuba.ScalarTransform4f
+        position = (np.asarray(camera.position) - np.asarray(volume.origin)) / volume.voxel
+        half = 0.5 * camera.extent / volume.voxel
+        target = position - np.asarray(camera.toward)
+        view = {"origin": position.tolist(), "target": target.tolist(), "up": list(camera.up)}
+        to_world = transform().look_at(**view).scale([half * camera.width / camera.height, half, 1.0])
+        film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+        film |= {"pixel_format": "rgba", "component_format": "float32"}
+        sampler = {"type": "independent"}
+        return self._mitsuba.load_dict({"type": "orthographic", "to_world": to_world, "film": film, "sampler": sampler})
+
+
+def denoise(lightmaps: np.ndarray) -> np.ndarray:
+    """Denoises lightmaps [N, H, W], each alone.
+
+    Raises:
+        WlmError: Open Image Denoise isn't installed.
+    """
+    if not has_denoiser():
+        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+    import pyoidn
+
+    grey = np.repeat(np.asarray(lightmaps, np.float32)[..., None], 3, axis=-1)
+    return np.stack([pyoidn.denoise(image, filter_type=_FILTER)[..., 0] for image in grey])
+
+
+@functools.cache
+def denoiser_device(device: str) -> str:
+    """Where Open Image Denoise computes for pictures on a device: there, or "cpu" where it doesn't know the device."""
+    import pyoidn
+
+    try:
+        pyoidn.denoise(torch.zeros(16, 16, 3, device=device), filter_type="RT", hdr=True)
+    except (RuntimeError, ImportError, OSError):
+        return "cpu"
+    return device
+
+
+def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
+    """Denoises a picture [H, W, 3] of linear light, on `denoiser_device`.
+
+    Raises:
+        WlmError: Open Image Denoise isn't installed.
+    """
+    if not has_denoiser():
+        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+    import pyoidn
+
+    there = picture.float().contiguous().to(denoiser_device(str(picture.device)))
+    return pyoidn.denoise(there, filter_type="RT", hdr=True).to(picture.device)

@@ -1,0 +1,462 @@
+"""The probe system against itself, plain torch, the PCA family and an engine's packing: size, speed and error.
+
+For each set these kinds of rows, but where another is named:
+
+- method "ours", one row for each profile, and for the first profile at each ratio of gaussian-probe-compression,
+  tables 2 and 3: the file, the fit with the writing, the errors of the decode against the input, and the decode time of
+  all live probes.
+- method "decode", the first profile, one row for each way to find and to bound the Gaussians: its time and its error.
+  "sphere" is the paper's way (eq. 6), another fit, in which Gaussians reach a sphere; "sphere lists" only finds the
+  ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
+- method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
+  in plain torch, all of them on CUDA, else a few.
+- method "transform", one row for each size, a share of the probes as float32: as "ours". A size in which there is no
+  room for the file is left out.
+- the rivals of `benchmarks.rivals.probe` at the bytes of each of these files, and Unreal's packing, which has one size.
+  The list of dead probes is counted for them too; positions are for nobody.
+- method "held out", the first profile and the transform of 5%: the light at every fifth probe, of a file of the others,
+  beside that of the uncompressed others by plain rules, and the light half-way between probes.
+- methods "volume" and "views" of `benchmarks.probe_volume`, the first profile and the transform of 5%: the light
+  through the cascaded volume along a walk, and pictures under it. `run_volume` has the walks alone.
+
+A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
+CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from benchmarks.plot import Panel
+from benchmarks.probe_volume import view_rows, volume_rows
+from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
+from benchmarks.rivals.probe_torch import DenseFit
+from benchmarks.rivals.rival import Rival
+from benchmarks.rows import Row, read_json
+from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors
+from wlm.errors import WlmError
+from wlm.probe.between import between_psnr, held_out
+from wlm.probe.data import ProbeSet, load
+from wlm.probe.decode import Decoder, Points
+from wlm.probe.evaluation import Report, score
+from wlm.probe.exact import decode64
+from wlm.probe.fields import pack_dead
+from wlm.probe.fit import compress
+from wlm.probe.model import Profile
+from wlm.probe.seen import VIEWS
+
+PROFILES = ("standard", "compact", "paper")
+"""Profiles of a run; the first is the one that the other rows are about."""
+
+SHARES = (1, 2, 3, 5, 7, 10)
+"""Sizes of transforms, per cent of float32, in a full run."""
+
+RATIOS = (0.02, 0.05, 0.10, 0.15, 0.20)
+"""Gaussians as a share of the live probes, in a full run: the paper's tables 2 and 3."""
+
+_DEMO_KEYS = ("12.00", "21.00")  # noon and night
+# A quick fit is worth this many steps of one probe, however many probes there are: some seconds on two CPU cores.
+_QUICK_PROBE_STEPS = 600_000
+_QUICK_FRAMES = 60
+_DENSE_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
+_CUTS = (2.5, 2.0)
+_RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
+    # The paper's own rival: clusters of places, nothing but half floats.
+    "CPCA in halves": ("clustered_pca", (None,)),
+    "global PCA": ("global_pca", WEIGHT_BITS),
+    "block PCA": ("block_pca", WEIGHT_BITS),
+    "window PCA": ("window_pca", WEIGHT_BITS),
+    "clustered PCA": ("clustered_pca", WEIGHT_BITS),
+    "CPCA by signal": ("clustered_pca_signal", WEIGHT_BITS),
+    "moving basis": ("moving_basis", WEIGHT_BITS),
+}
+_TRANSFORM = "transform"
+_BESIDE = 5  # per cent, of the transform that is scored between probes and through the volume too
+
+PANELS = (Panel("bpp", "psnr", ("transform", "ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
+"""What a plot of the rows shows: quality against size, and a decode's error against its time."""
+
+
+def run(
+    *,
+    quick: bool,
+    device: str,
+    probes_path: str | os.PathLike[str] | None = None,
+    keys: Sequence[str] = (),
+    rivals: bool = True,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the probe system on one file.
+
+    Args:
+        quick: Short fits, no other ratios than the profiles', transform and rivals of one size, a short walk, and of
+            the demo noon alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
+        device: "cpu" or "cuda:0", for fits, decodes and the volume.
+        probes_path: A file as `wlm.probe.load` reads it; None: the checkout's
+            `demos/data/probes/street.npz`.
+        keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
+        rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: `run_rivals`
+            has them alone.
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, set by set in the order of the module's list.
+
+    Raises:
+        WlmError: The file, a key or the device isn't there, or a fit diverged.
+    """
+    sets = _load(probes_path, keys or (_DEMO_KEYS[: 1 if quick else None] if probes_path is None else ()))
+    profiles = [Profile.load(name) for name in PROFILES]
+    if quick:
+        steps = max(200, _QUICK_PROBE_STEPS // max(int(probes.live.sum()) for probes in sets))
+        profiles = [profile.model_copy(update={"steps": min(steps, profile.steps)}) for profile in profiles]
+    return run_rows(
+        sets,
+        profiles,
+        device=device,
+        ratios=() if quick else RATIOS,
+        shares=(_BESIDE,) if quick else SHARES,
+        rivals=rivals,
+        frames=_QUICK_FRAMES if quick else None,
+        progress=progress,
+    )
+
+
+def run_rivals(
+    results: str | os.PathLike[str],
+    *,
+    probes_path: str | os.PathLike[str] | None = None,
+    keys: Sequence[str] = (),
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the rivals alone, at the bytes that our transforms took in a former run.
+
+    Args:
+        results: What a former run wrote, maybe without rivals.
+        probes_path: As for `run`.
+        keys: As for `run`.
+        progress: As for `run`.
+
+    Returns:
+        The rows of the rivals, computed on the CPU.
+
+    Raises:
+        WlmError: As `run`, or `results` lacks the transforms of a set.
+    """
+    rows = read_json(results)[0]
+    sets = _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ()))
+    benches = [_ProbeBench(probes, "cpu", progress) for probes in sets]
+    sizes = {bench.scene: _sizes(row for row in rows if row.scene == bench.scene) for bench in benches}
+    missing = [scene for scene, ours in sizes.items() if not ours]
+    if missing:
+        raise WlmError(f"{results}: expected rows of transforms of {missing[0]}")
+    return [row for bench in benches for row in bench.rival_rows(sizes[bench.scene])]
+
+
+def run_volume(
+    *,
+    device: str,
+    probes_path: str | os.PathLike[str] | None = None,
+    keys: Sequence[str] = (),
+    frames: int | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the volume alone, over the probes as they were and as the transform of 5% has them.
+
+    Args:
+        device: As for `run`.
+        probes_path: As for `run`.
+        keys: As for `run`.
+        frames: Of the walk, at least one; None: as many as a tenth of a block each takes.
+        progress: As for `run`.
+
+    Returns:
+        The rows of method "volume", set by set.
+
+    Raises:
+        WlmError: The file, a key or the device isn't there.
+    """
+    rows = []
+    for probes in _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ())):
+        bench = _ProbeBench(probes, device, progress)
+        models = {fit.option: fit.model for fit in bench.transforms((_BESIDE,)).values()}
+        rows += volume_rows(bench, probes, models, frames)
+    return rows
+
+
+def _sizes(rows: Iterable[Row]) -> dict[str, int]:
+    """Bytes of the transforms' files, by their option."""
+    return {row.option: int(row["bytes"]) for row in rows if row.method == _TRANSFORM and row.get("bytes")}
+
+
+def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
+    if path is None:
+        path = demo_data("probes/street.npz", "--probes FILE")
+    return [load(path, key=key) for key in keys or (None,)]
+
+
+def run_rows(
+    sets: Sequence[ProbeSet],
+    profiles: Sequence[Profile],
+    *,
+    device: str,
+    ratios: Sequence[float],
+    shares: Sequence[int],
+    frames: int | None,
+    rivals: bool = True,
+    repeats: int | None = None,
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures the given profiles on given sets; the rest as for `run`.
+
+    Args:
+        sets: At least one.
+        profiles: At least one; all but the rows "ours" are about the first.
+        ratios: Further ratios of the first profile; the profile's ratio is left out.
+        shares: Sizes of transforms, per cent of float32.
+        frames: Frames of the walk, at least one; None: as many as a tenth of a block each takes.
+        rivals: With the rivals, at the transforms' bytes.
+        repeats: As for `Bench`.
+    """
+    if not sets or not profiles:
+        raise ValueError("expected at least one set and one profile")
+    rows = []
+    for probes in sets:
+        bench = _ProbeBench(probes, device, progress, repeats)
+        first, *others = [bench.fit_profile(profile, profile.name) for profile in profiles]
+        for ratio in ratios:
+            if ratio != profiles[0].ratio:
+                changed = profiles[0].model_copy(update={"ratio": ratio})
+                others.append(bench.fit_profile(changed, f"ratio {ratio:.2f}"))
+        transforms = bench.transforms(shares)
+        peers = [bench.profile_row(fit) for fit in (first, *others)]
+        peers += [bench.transform_row(fit) for fit in transforms.values()]
+        rows += bench.time_rows(peers + bench.decode_rows(first))
+        if probes is sets[0]:
+            rows += bench.fit_rows(first)
+        if rivals:
+            rows += bench.rival_rows({fit.option: fit.bytes for fit in transforms.values()})
+        both = [fit for fit in (first, transforms.get(_BESIDE)) if fit is not None]
+        rows += [bench.held_out_row(fit) for fit in both]
+        rows += volume_rows(bench, probes, {"ours" if fit is first else fit.option: fit.model for fit in both}, frames)
+        rows += view_rows(bench, probes, first.model, VIEWS if frames is None else min(frames, VIEWS))
+    return rows
+
+
+class _ProbeBench(Bench):
+    """A set of probes."""
+
+    def __init__(self, probes: ProbeSet, device: str, progress: Note | None, repeats: int | None = None) -> None:
+        key = probes.key.removeprefix("sh").removeprefix("_")
+        super().__init__("probe", device, progress, scene=f"{probes.name} {key}".strip(), repeats=repeats)
+        self.probes = probes
+        self.position, self.values = probes.position[probes.live], probes.values[probes.live]
+
+    def fit_profile(self, profile: Profile, option: str) -> Fit:
+        """Fits and writes a profile; compiling its kernels is no part of either time."""
+        self.note(f"{option}: fitting {len(self.position):,} probes, {profile.steps:,} steps")
+        compress(self.probes, profile.model_copy(update={"steps": 10}), device=self.device)
+        return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
+
+    def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a fit costs and yields; and its decode, to be timed."""
+        model, decoder = fit.model, Decoder(fit.model, self.device)
+        points = decoder.points(self.position)
+        report, errors = self._decode(decoder, points, decode64(model, self.position), fit.bytes)
+        row = self.row(
+            "ours",
+            fit.option,
+            f"time of all live probes, {self.mode}",
+            encode_seconds=fit.seconds,
+            steps=model.profile.steps,
+            probes=report.live,
+            gaussians=model.count,
+            dropped=model.dropped,
+            irradiance_psnr=report.irradiance_psnr,
+            **_size_and_psnr(report),
+            **errors,
+        )
+        return row, self.replay(lambda: decoder.run(points))
+
+    def transforms(self, shares: Sequence[int]) -> dict[int, Fit]:
+        """Transforms by their share of float32, those that there is room for."""
+        fits = {}
+        for share in shares:
+            self.note(f"transform, {share}%")
+            limit = share * self.probes.float_bytes // 100
+            try:
+                fits[share] = self.fit(f"{share}%", lambda limit=limit: compress(self.probes, max_bytes=limit))
+            except WlmError as error:
+                self.note(str(error))
+        return fits
+
+    def transform_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """What a transform costs and yields; and its decode once it is unpacked, to be timed."""
+        decoder = fit.model.decoder(self.device, position=self.probes.position)
+        report = score(decoder.decode_probes(), self.probes, fit.bytes)
+        points = decoder.points(self.position)
+        row = self.row(
+            _TRANSFORM,
+            fit.option,
+            f"time of all live probes once they are unpacked, {self.mode}; made on the CPU",
+            encode_seconds=fit.seconds,
+            probes=report.live,
+            irradiance_psnr=report.irradiance_psnr,
+            memory=decoder.device_bytes / 2**20,
+            **_size_and_psnr(report),
+        )
+        return row, self.replay(lambda: decoder.run(points))
+
+    def held_out_row(self, fit: Fit) -> Row:
+        """The light where no probe was compressed."""
+        self.note(f"{fit.option}: fitting four fifths of the probes")
+        held = held_out(fit.model, self.probes, device=self.device)
+        decoder = fit.model.decoder(self.device)
+        decoder.decode_probes(self.probes.position)
+        return self.row(
+            "held out",
+            fit.option,
+            "PSNR at every fifth probe of a file of the others; beside it that of the uncompressed others",
+            bytes=held.bytes,
+            probes=held.probes,
+            psnr=held.psnr,
+            nearest_psnr=held.nearest,
+            distance_psnr=held.distance,
+            kriging_psnr=held.kriging,
+            half_way_psnr=between_psnr(decoder, self.probes),
+        )
+
+    def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
+        """The ways to decode a model."""
+        model = fit.model
+        spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
+        exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
+        ways = {
+            "none": (Decoder(model, self.device, culling="none"), exact),
+            "sphere": (Decoder(spheres, self.device), sphere_exact),
+            "sphere lists": (Decoder(model, self.device, culling="sphere"), exact),
+            "box": (Decoder(model, self.device, culling="box"), exact),
+            "exact": (Decoder(model, self.device, culling="exact"), exact),
+            "exact, given order": (Decoder(model, self.device, culling="exact"), exact),
+        }
+        for cut in _CUTS:
+            if cut < model.profile.cut:
+                ways[f"cut {cut:g}"] = (Decoder(model, self.device, cut=cut), exact)
+        return [self._way(fit, option, *way) for option, way in ways.items()]
+
+    def _way(self, fit: Fit, option: str, decoder: Decoder, exact: np.ndarray) -> tuple[Row, Callable[[], object]]:
+        points = decoder.points(self.position)
+        if option == "exact, given order":
+            _in_given_order(points)
+        report, errors = self._decode(decoder, points, exact, fit.bytes)
+        spheres = " with the spheres of eq. 6" if option == "sphere" else ""
+        row = self.row(
+            "decode",
+            option,
+            f"profile {fit.option}{spheres}; time of all live probes, {self.mode}",
+            psnr=report.psnr,
+            gaussians=decoder.model.count,
+            list_entries=decoder.pairs,
+            **errors,
+        )
+        return row, self.replay(lambda: decoder.run(points))
+
+    def fit_rows(self, fit: Fit) -> list[Row]:
+        """The speed of the fit alone, and of the same fit in plain torch."""
+        p, model = fit.model.profile, fit.model
+        step_ms = 1e3 * fit.fit_seconds / p.steps
+        option = f"{fit.option} {p.steps:,} steps"
+        counts = {"steps": p.steps, "probes": len(self.position), "gaussians": model.count + model.dropped}
+        ours = self.row(
+            "fit", option, "with the first places", encode_seconds=fit.fit_seconds, step_ms=step_ms, **counts
+        )
+        self.note(f"{fit.option}: the fit in plain torch")
+        peer = DenseFit(
+            model.normalise(self.position),
+            self.values,
+            count=counts["gaussians"],
+            latent=p.latent,
+            hidden=p.hidden,
+            steps=p.steps,
+            rates=(p.centre_rate, p.scale_rate, p.rotation_rate, p.latent_rate, p.net_rate),
+            final=p.final_rate,
+            bits=p.bits,
+            seed=0,
+            device=self.device,
+        )
+        peer.step()  # loads what torch loads late
+        whole = self.device != "cpu"
+        steps = p.steps - 1 if whole else min(p.steps, _DENSE_STEPS)
+        peer.run(steps)
+        seconds = peer.seconds / steps
+        scaled = "" if whole else f"; time of {steps} steps scaled to {p.steps:,}"
+        dense = self.row(
+            "dense torch",
+            option,
+            f"every Gaussian at every probe, no file{scaled}",
+            encode_seconds=seconds * p.steps,
+            step_ms=1e3 * seconds,
+            times_ours=1e3 * seconds / step_ms,
+            psnr=score(self._all(peer.decoded()), self.probes, fit.bytes).psnr if whole else None,
+            **counts,
+        )
+        return [ours, dense]
+
+    def rival_rows(self, sizes: Mapping[str, int]) -> list[Row]:
+        """The rivals at the bytes of some files, by their option, and Unreal's packing at its own."""
+        rows = []
+        for option, size in sizes.items():
+            for name, (baseline, bits) in _RIVALS.items():
+                self.note(f"{name}, {option}")
+                encode = partial(at_bytes, baseline, budget_bytes=size - self._dead_bytes(), bits=bits)
+                rows.append(self._rival_row(name, option, encode))
+        return [*rows, self._rival_row("Unreal packing", "", unreal_packing)]
+
+    def _rival_row(self, method: str, option: str, encode: Callable[..., Rival]) -> Row:
+        try:
+            rival = encode(position=self.position, values=self.values)
+        except WlmError as error:  # nothing fits, or no L0, L1 or L2 in RGB
+            return self.missing_row(method, option, error)
+        report = score(self._all(rival.decoded), self.probes, rival.bytes + self._dead_bytes())
+        return self.row(
+            method,
+            option,
+            f"{rival.option}; on the CPU",
+            encode_seconds=rival.encode_seconds,
+            decode_ms=1e3 * rival.decode_seconds if self.device == "cpu" else None,
+            **_size_and_psnr(report),
+        )
+
+    def _decode(
+        self, decoder: Decoder, points: Points, exact: np.ndarray, size: int
+    ) -> tuple[Report, dict[str, float]]:
+        """The score, and the errors against float64."""
+        decoder.run(points)
+        values = points.values()
+        return score(self._all(values), self.probes, size), exact_errors(values, exact)
+
+    def _all(self, live: np.ndarray) -> np.ndarray:
+        """Values of all probes, the dead ones zero."""
+        values = np.zeros_like(self.probes.values)
+        values[self.probes.live] = live
+        return values
+
+    def _dead_bytes(self) -> int:
+        """What the list of dead probes takes, as in our file."""
+        return len(pack_dead(~self.probes.live))
+
+
+def _size_and_psnr(report: Report) -> dict[str, float]:
+    names = {"bytes": "bytes", "bpp": "bits_per_probe", "share_of_float32": "ratio", "psnr": "psnr"}
+    return {name: getattr(report, attribute) for name, attribute in names.items()}
+
+
+def _in_given_order(points: Points) -> None:
+    """Puts points back in the order in which they were given, in which neighbours may lie far apart."""
+    x = np.empty((len(points.order), 3), np.float32)
+    x[points.order] = points.x.numpy()
+    points.x = wp.array(x, dtype=wp.vec3, device=points.x.device)
+    points.order = np.arange(len(x))

@@ -1,0 +1,241 @@
+"""What compressed lightmaps over time are compared with, each tuned as well as ours is.
+
+`RIVALS` has them by name: block codecs that engines ship (`lightmap_blocks`), principal components over the hours
+(`lightmap_pca`), neural texture compression (`lightmap_ntc`), and a video codec (`lightmap_video`). `bytes` are those
+in a GPU's memory, with all that a decoder needs; `disk_bytes` the same under lossless compression, each lightmap of a
+block codec on its own. A video has only the latter, and no random access.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
+from benchmarks.rivals.lightmap_ntc import LADDER, encode_ntc
+from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
+from benchmarks.rivals.lightmap_video import encode_av1
+from benchmarks.rivals.rival import Rival
+from wlm.errors import WlmError
+from wlm.interop import check_device
+from wlm.lightmap.data import LightmapSet
+from wlm.lightmap.evaluation import SCORES, scored_mask
+from wlm.lightmap.model import TILE, LightmapModel
+from wlm.lightmap.seen import SeenScore, Tally
+from wlm.lightmap.views import VIEWS, views_of
+from wlm.metrics import FrameMetrics, evaluate_frame, summarise
+from wlm.system import Meter, OnProgress
+
+_Scored = TypeVar("_Scored")
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to compress a set of lightmaps.
+
+    Attributes:
+        title, option: What a table calls it.
+        encode: Makes a `Rival` of lightmaps and their mask [H, W].
+        alone: Whether it takes one lightmap [H, W, 3] at a time; else all, [T, H, W, 3].
+        fitted: Whether `encode` takes the `device` on which it fits and decodes; the others need none.
+        random_access: Whether a GPU reads a texel at an hour from what it holds.
+    """
+
+    title: str
+    option: str
+    encode: Callable[..., Rival]
+    alone: bool = True
+    fitted: bool = False
+    random_access: bool = True
+
+    @property
+    def label(self) -> str:
+        """Title and option."""
+        return f"{self.title} {self.option}".strip()
+
+
+_AV1_QUALITIES = (50, 65, 75, 85, 92, 97)
+
+
+def _av1(title: str, quality: int, ranges: str) -> Method:
+    encode = functools.partial(encode_av1, quality=quality, ranges=ranges)
+    return Method(title, f"{quality}", encode, alone=False, random_access=False)
+
+
+RIVALS: dict[str, Method] = {
+    "bc6h": Method("BC6H", "", encode_bc6h),
+    "bc7": Method("BC7", "", encode_bc7),
+    "bc6h-rdo-1": Method("BC6H", "RDO 1", functools.partial(encode_bc6h, loss=1.0)),
+    **{
+        f"bc7-rdo-{loss:g}": Method("BC7", f"RDO {loss:g}", functools.partial(encode_bc7, loss=loss))
+        for loss in (0.5, 1.0, 2.0)
+    },
+    **{
+        f"astc{side}": Method("ASTC", f"{side}x{side}", functools.partial(encode_astc, block=side))
+        for side in (4, 5, 6, 8, 10, 12)
+    },
+    "8bit": Method("8 bits", "", encode_8bit),
+    **{
+        f"pca-bc4-{count}": Method(
+            "PCA in BC4", f"{count}", functools.partial(encode_pca_bc4, components=count), alone=False
+        )
+        for count in (2, 4, 8, 16)
+    },
+    **{
+        f"pca-{step:g}": Method("PCA", f"step {step:g}", functools.partial(encode_pca, step=step), alone=False)
+        for step in (0.16, 0.08, 0.04, 0.02)
+    },
+    **{
+        f"ntc-{name}": Method("NTC", name, functools.partial(encode_ntc, latents=name), alone=False, fitted=True)
+        for name in LADDER
+    },
+    **{f"av1-{quality}": _av1("AV1", quality, "day") for quality in _AV1_QUALITIES},
+    **{f"av1-{quality}-hour": _av1("AV1 by hour", quality, "hour") for quality in _AV1_QUALITIES},
+}
+"""All methods by name."""
+
+FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
+"""Those of a quick look, which need no GPU."""
+
+_FEW_FITTED = ("ntc-medium",)
+
+
+def usual(device: str, quick: bool = False) -> tuple[str, ...]:
+    """The methods of a run that names none: on a CPU without those that are fitted, which takes hours there.
+
+    Args:
+        device: "cpu", "cuda" or "cuda:N".
+        quick: A third of them.
+    """
+    names = FEW + _FEW_FITTED if quick else tuple(RIVALS)
+    return tuple(name for name in names if device != "cpu" or not RIVALS[name].fitted)
+
+
+@dataclass(frozen=True)
+class Score(SeenScore):
+    """How wrong a rival is on a set, over the texels that ours is scored over.
+
+    Between stored times its light is the mix of the two lightmaps. The scores of `SeenScore` are attributes too.
+
+    Attributes:
+        psnr, ssim, flip: As in the report of `wlm.lightmap.evaluate`.
+        bpp: Bits in memory for each texel and time, of the whole map, also where only some tiles are scored.
+        bytes: Of all times of the whole map; a video's are those on the disk.
+        disk_bpp, disk_bytes: The same after lossless compression.
+    """
+
+    psnr: float
+    ssim: float
+    flip: float
+    bpp: float
+    bytes: int
+    disk_bpp: float
+    disk_bytes: int
+
+
+def check_rival(name: str) -> None:
+    """Raises a `WlmError` where `RIVALS` has no method of this name."""
+    if name not in RIVALS:
+        raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
+
+
+def encode_set(
+    name: str,
+    lightmaps: LightmapSet,
+    visit: Callable[[int, np.ndarray], _Scored],
+    chosen: Sequence[int] | np.ndarray | None = None,
+    *,
+    device: str = "cpu",
+) -> tuple[Rival, list[_Scored]]:
+    """Puts a set through a method.
+
+    Args:
+        name: A key of `RIVALS`.
+        lightmaps: The set.
+        visit: Called with the index of a time and its decoded lightmap, float32 [H, W, 3], in the order of `chosen`.
+        chosen: Indices of the times to visit, at least one; None for all. A method that takes one lightmap at a time
+            encodes these alone; the sizes and the seconds of all times are then estimated from them.
+        device: "cpu", "cuda" or "cuda:N", for methods that are fitted.
+
+    Returns:
+        The rival, with bytes and seconds of all times and without what was decoded, and what the visits returned.
+
+    Raises:
+        WlmError: An unknown name, a package is missing, or there is no such device.
+    """
+    check_rival(name)
+    method, count = RIVALS[name], len(lightmaps.frames)
+    chosen = range(count) if chosen is None else [int(i) for i in chosen]
+    # The whole map's mask: an engine would encode all of it, whatever we score.
+    if not method.alone:
+        options = {"device": device} if method.fitted else {}
+        rival = method.encode(lightmaps.frames, lightmaps.mask, **options)
+        return replace(rival, decoded=None), [visit(i, rival.decoded[i]) for i in chosen]
+    rivals, visits = [], []
+    for i in chosen:
+        rival = method.encode(lightmaps.frames[i], lightmaps.mask)
+        visits.append(visit(i, rival.decoded))
+        rivals.append(replace(rival, decoded=None))  # a set of them is too much memory
+
+    def total(key: str) -> float:
+        return sum(getattr(rival, key) for rival in rivals) * count / len(rivals)
+
+    options = sorted({rival.option for rival in rivals})
+    sizes = {key: round(total(key)) for key in ("bytes", "disk_bytes")}
+    seconds = {key: total(key) for key in ("encode_seconds", "decode_seconds")}
+    return replace(rivals[0], option=" and ".join(options), **sizes, **seconds), visits
+
+
+def evaluate_rivals(
+    model: LightmapModel,
+    lightmaps: LightmapSet,
+    names: Sequence[str] | None = None,
+    *,
+    metrics: Sequence[str] = SCORES,
+    views: int = VIEWS,
+    device: str = "cpu",
+    progress: OnProgress | None = None,
+) -> list[tuple[Rival, Score]]:
+    """Puts a set through rivals and scores the texels that `evaluate` scores.
+
+    Args:
+        model: The model to compare with: it says which tiles are scored.
+        lightmaps: The input.
+        names: Keys of `RIVALS`; None: a third of them, see `usual`.
+        metrics, views: As for `wlm.lightmap.evaluate`.
+        device: As for `encode_set`.
+        progress: Called about twice a second.
+
+    Returns:
+        For each name the rival, with bytes and seconds of all times and without what was decoded, and its score.
+
+    Raises:
+        WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
+    """
+    device = check_device(device)
+    names = usual(device, quick=True) if names is None else names
+    mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
+    plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
+    meter = Meter(progress, "baselines", len(names) * count)
+    results = []
+    for k, name in enumerate(names):
+        tally = Tally(lightmaps, mask, views=views_of(lightmaps, views if seen else 0)[0], name=name)
+
+        def score(i: int, decoded: np.ndarray, k: int = k, name: str = name, tally: Tally = tally) -> FrameMetrics:
+            inside = mask & lightmaps.valid(i)
+            frame = evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name)
+            if seen:
+                tally.add(i, decoded, frame)
+            if meter.due(k * count + i + 1):
+                meter.report(k * count + i + 1)
+            return frame
+
+        rival, frames = encode_set(name, lightmaps, score, device=device)
+        summary, texels = summarise(frames), lightmaps.mask.size * count
+        scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **vars(tally.score())}
+        sizes = rival.bytes * 8 / texels, rival.bytes, rival.disk_bytes * 8 / texels, rival.disk_bytes
+        keys = ("bpp", "bytes", "disk_bpp", "disk_bytes")
+        results.append((rival, Score(**scores, **dict(zip(keys, sizes, strict=True)))))
+    return results

@@ -1,0 +1,407 @@
+"""What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
+
+Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a `Rival` whose
+`decoded` is float32 [N, D], read from the byte string that `bytes` counts (gaussian-probe-compression, sections 2.2
+and 5.1). The positions are an engine's own and cost nothing here, as in the paper. The paper gives its rivals no bits
+to choose; weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so
+`at_bytes` tries them too.
+
+The settings that the functions share are the number of `components`, basis vectors of a part, 1 to D, and the
+`bits` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
+floats always. All raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a `ValueError` for
+wrong shapes or a setting out of range.
+"""
+
+import bisect
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from benchmarks.rivals import probe_mbd, probe_pca
+from benchmarks.rivals.rival import Rival, measure
+from wlm.errors import WlmError
+from wlm.probe.data import ProbeSet
+from wlm.probe.evaluation import Report, score
+from wlm.probe.unreal import pack_unreal, unpack_unreal
+from wlm.system import Meter, OnProgress
+
+# Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
+WEIGHT_BITS = (4, 5, 6, 8, 10, None)
+# `at_bytes` stops here: more parts are slow to find, and twice as many gain little.
+MAX_PARTS = 512
+MAX_GRID = 64
+# Component counts that may follow the best so far without an improvement.
+_PATIENCE = 2
+# Rounds of the moving basis while `at_bytes` searches: the order of the settings is clear after these.
+_SEARCH_ROUNDS = 4
+_ROUNDS = 10
+
+
+def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
+    """Principal components of all probes, which are one part (GPCA)."""
+    position, values = _checked(position, values, components, bits)
+    return _pca("global_pca", "part", position, values, components, bits, lambda: (probe_pca.whole(position), ()))
+
+
+def block_pca(
+    position: np.ndarray, values: np.ndarray, components: int, blocks: int, *, bits: int | None = None
+) -> Rival:
+    """Principal components of each cube of a regular grid (BPCA, Nishino et al. 2005).
+
+    Args:
+        position, values, components, bits: See the module.
+        blocks: The most cubes that hold a probe, at least 1. They have one size, so a few fewer come out.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("blocks", blocks, 1)
+
+    def divide() -> tuple[probe_pca.Partition, Sequence[np.ndarray]]:
+        return probe_pca.by_blocks(position, blocks)[0], ()
+
+    return _pca("block_pca", "blocks", position, values, components, bits, divide)
+
+
+def window_pca(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    blocks: int,
+    *,
+    overlap: float = 1.0,
+    bits: int | None = None,
+) -> Rival:
+    """Block PCA with the basis of a block and its surroundings (WBPCA, Nishino et al. 2005).
+
+    Neighbouring blocks then have similar bases and smaller seams, at the cost of a larger error; each probe is coded
+    once, in the basis of the block that it lies in.
+
+    Args:
+        position, values, components, bits: See the module.
+        blocks: As `block_pca`.
+        overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("blocks", blocks, 1)
+    _in_range("overlap", overlap, 0)
+
+    def divide() -> tuple[probe_pca.Partition, list[np.ndarray]]:
+        partition, side = probe_pca.by_blocks(position, blocks)
+        return partition, probe_pca.windows(position, partition, side, overlap)
+
+    return _pca("window_pca", f"blocks, overlap {overlap:g}", position, values, components, bits, divide)
+
+
+def clustered_pca(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    clusters: int,
+    seed: int = 0,
+    *,
+    signal: bool = False,
+    bits: int | None = None,
+) -> Rival:
+    """Principal components of each cluster (CPCA).
+
+    Args:
+        position, values, components, bits: See the module.
+        clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
+        seed: Of the first centres.
+        signal: False clusters the positions with k-means, as gaussian-probe-compression, section 5.1, has it: the
+            centres are stored, and a probe needs no index. True puts each probe where it is reconstructed best, as
+            Sloan et al. 2003 do: an index of ceil(log2 clusters) bits a probe is stored and counted.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("clusters", clusters, 1)
+    if signal:
+        name, divide = "clustered_pca_signal", lambda: probe_pca.by_signal(values, clusters, components, seed)
+    else:
+        name, divide = "clustered_pca", lambda: probe_pca.by_place(position, clusters, seed)
+    return _pca(name, "clusters", position, values, components, bits, lambda: (divide(), ()))
+
+
+def moving_basis(
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    grid: int,
+    iterations: int = _ROUNDS,
+    *,
+    bits: int | None = None,
+) -> Rival:
+    """Moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
+
+    Args:
+        position, values, components, bits: See the module; a part is a cell, the basis vectors are at its corners.
+        grid: Cells along the longest side of the probes' box, 1 to 2**20.
+        iterations: Rounds of alternating least squares from the PCA of all probes, at least 0.
+    """
+    position, values = _checked(position, values, components, bits)
+    _in_range("grid", grid, 1, probe_pca.MAX_CELLS)
+    _in_range("iterations", iterations, 0)
+    return measure(
+        "moving_basis",
+        lambda: probe_mbd.encode(position, values, components, grid, iterations, bits),
+        lambda payload: probe_mbd.decode(payload, position),
+        option=lambda payload: f"K={components}, grid {grid}, {_weights(bits)}",
+    )
+
+
+def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Rival:
+    """SH as the bricks of Unreal's volumetric lightmap store it, without sky occlusion: 28 bytes a probe at L2.
+
+    The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
+    have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,
+    but for the rounding of L0; a coefficient over an ambient of zero or less decodes to zero, and an ambient above
+    65,024 (64,512 in blue) becomes that. Ambient and ratios are rounded to nearest; the ratio is that to the ambient
+    as it is decoded, which costs nothing and is closer than the engine's own ratio.
+
+    Args:
+        position: Only their number counts.
+        values: D = 3, 12 or 27 (else a `WlmError`): SH coefficients from L00, for each its red, green and blue.
+        bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
+    """
+    position, values = _checked(position, values)
+    most = _unreal_bands(values.shape[1])
+    bands = most if bands is None else bands
+    _in_range("bands", bands, 1, most)
+    width = values.shape[1]
+    return measure(
+        "unreal",
+        lambda: pack_unreal(values, bands),
+        lambda payload: unpack_unreal(payload, width, bands),
+        option=lambda payload: f"L{bands - 1}",
+    )
+
+
+def at_bytes(
+    name: str,
+    position: np.ndarray,
+    values: np.ndarray,
+    budget_bytes: int,
+    bits: Sequence[int | None] = WEIGHT_BITS,
+) -> Rival:
+    """The settings of one method with the least squared error that a size allows, by a small search.
+
+    For each number of bits the component counts are tried from the largest downwards until two in a row gain
+    nothing, each with as many parts as fit, at most `MAX_PARTS` or `MAX_GRID` cells.
+
+    Args:
+        name: A key of `RIVALS`.
+        position, values: See the module.
+        budget_bytes: The largest size.
+        bits: Bits of a weight to try; `(None,)` keeps to half floats as gaussian-probe-compression's table has them.
+            The engine's packing has none to choose.
+
+    Returns:
+        The best result; its times are those of its settings alone, without the search.
+
+    Raises:
+        WlmError: An unknown name, or a budget that nothing fits.
+    """
+    if name not in RIVALS:
+        raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(RIVALS)}")
+    for number in bits:
+        _check_bits(number)
+    position, values = _checked(position, values)
+    best = RIVALS[name](position, values, budget_bytes, bits)
+    if best is None:
+        raise WlmError(f"probes: {name}: nothing fits into {budget_bytes} bytes for {len(values)} probes")
+    return best
+
+
+def evaluate_rivals(
+    probes: ProbeSet,
+    budget_bytes: int,
+    names: Sequence[str] = (),
+    *,
+    progress: OnProgress | None = None,
+    skipped: Callable[[WlmError], None] | None = None,
+) -> list[tuple[Rival, Report]]:
+    """Scores the rivals at one size.
+
+    Args:
+        probes: The input.
+        budget_bytes: The largest size, that of our file.
+        names: Keys of `RIVALS`; none: all.
+        progress: Called after each rival.
+        skipped: Called for a rival that can't be that small, or that can't hold such probes, with the reason.
+
+    Returns:
+        The others, with their reports.
+    """
+    names = names or tuple(RIVALS)
+    meter = Meter(progress, "baselines", len(names))
+    results = []
+    for done, name in enumerate(names, 1):
+        try:
+            rival = at_bytes(name, probes.position, probes.values, budget_bytes)
+        except WlmError as error:
+            if skipped is not None:
+                skipped(error)
+        else:
+            results.append((rival, score(rival.decoded, probes, rival.bytes)))
+        meter.report(done)
+    return results
+
+
+def _search(
+    values: np.ndarray,
+    bits: Sequence[int | None],
+    largest: Callable[[int, int | None], int],
+    make: Callable[[int, int, int | None], Rival],
+) -> tuple[Rival, tuple[int, int, int | None]] | None:
+    """`at_bytes` for a method with components, parts and bits.
+
+    `largest` gives the most parts for components and bits, 0 where nothing fits; `make` a result for all three.
+    Returns the best result with its three settings, or None.
+    """
+    tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []
+    for number in bits:
+        least, waited = np.inf, 0
+        for components in range(values.shape[1], 0, -1):
+            parts = largest(components, number)
+            if not parts:
+                continue
+            rival = make(components, parts, number)
+            error = _error(values, rival)
+            tried.append((error, rival, (components, parts, number)))
+            waited = 0 if error < least else waited + 1
+            least = min(least, error)
+            if waited == _PATIENCE:
+                break
+    return min(tried, key=lambda entry: (entry[0], entry[1].bytes))[1:] if tried else None
+
+
+def _pca_at(
+    kind: int,
+    make: Callable[..., Rival],
+    position: np.ndarray,
+    values: np.ndarray,
+    budget: int,
+    bits: Sequence[int | None],
+) -> Rival | None:
+    probes, width = values.shape
+    most = 1 if kind == probe_pca.WHOLE else min(probes, MAX_PARTS)
+
+    def largest(components: int, number: int | None) -> int:
+        size = functools.partial(probe_pca.payload_bytes, kind, probes, width, components, bits=number)
+        return bisect.bisect_right(range(1, most + 1), budget, key=lambda parts: size(count=parts))
+
+    def build(components: int, parts: int, number: int | None) -> Rival:
+        divided = () if kind == probe_pca.WHOLE else (parts,)
+        return make(position, values, components, *divided, bits=number)
+
+    best = _search(values, bits, largest, build)
+    return best[0] if best else None
+
+
+def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Rival | None:
+    probes, width = values.shape
+    grids: list[tuple[int, int]] = []
+    while len(grids) < MAX_GRID:
+        parts = probe_mbd.grid_parts(position, len(grids) + 1)
+        # A finer grid has more corners, so none after this one would fit.
+        if parts[0] * 4 * width > budget:
+            break
+        grids.append(parts)
+
+    def largest(components: int, number: int | None) -> int:
+        size = functools.partial(probe_mbd.payload_bytes, probes, width, components, bits=number)
+        return max((g for g, parts in enumerate(grids, 1) if size(parts=parts) <= budget), default=0)
+
+    def build(components: int, grid: int, number: int | None) -> Rival:
+        return moving_basis(position, values, components, grid, _SEARCH_ROUNDS, bits=number)
+
+    best = _search(values, bits, largest, build)
+    if best is None:
+        return None
+    first, (components, grid, number) = best
+    longer = moving_basis(position, values, components, grid, bits=number)
+    return min((first, longer), key=lambda rival: _error(values, rival))
+
+
+def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Rival | None:
+    for bands in range(_unreal_bands(values.shape[1]), 0, -1):
+        if len(values) * (4 + 3 * (bands**2 - 1)) <= budget:
+            return unreal_packing(position, values, bands)
+    return None
+
+
+RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Rival | None]] = {
+    "global_pca": functools.partial(_pca_at, probe_pca.WHOLE, global_pca),
+    "block_pca": functools.partial(_pca_at, probe_pca.BLOCKS, block_pca),
+    "window_pca": functools.partial(_pca_at, probe_pca.BLOCKS, window_pca),
+    "clustered_pca": functools.partial(_pca_at, probe_pca.PLACE, clustered_pca),
+    "clustered_pca_signal": functools.partial(_pca_at, probe_pca.SIGNAL, functools.partial(clustered_pca, signal=True)),
+    "moving_basis": _moving_at,
+    "unreal": _unreal_at,
+}
+"""By name, each as `at_bytes` calls it: positions, values, bytes and the bits to try, to the best `Rival`."""
+
+
+def _pca(
+    name: str,
+    parts: str,
+    position: np.ndarray,
+    values: np.ndarray,
+    components: int,
+    bits: int | None,
+    divide: Callable[[], tuple[probe_pca.Partition, Sequence[np.ndarray]]],
+) -> Rival:
+    def encode() -> bytes:
+        partition, members = divide()
+        return probe_pca.encode(values, partition, components, bits, members)
+
+    return measure(
+        name,
+        encode,
+        lambda payload: probe_pca.decode(payload, position),
+        option=lambda payload: f"K={components}, {probe_pca.part_count(payload)} {parts}, {_weights(bits)}",
+    )
+
+
+def _error(values: np.ndarray, rival: Rival) -> float:
+    return float(np.square(rival.decoded - values).sum())
+
+
+def _weights(bits: int | None) -> str:
+    return "half floats" if bits is None else f"{bits} bits"
+
+
+def _unreal_bands(width: int) -> int:
+    bands = {3: 1, 12: 2, 27: 3}.get(width)
+    if bands is None:
+        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (L0, L1 or L2 in RGB), got {width}")
+    return bands
+
+
+def _checked(
+    position: np.ndarray, values: np.ndarray, components: int = 1, bits: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both as float64, the values as float32 holds them."""
+    position = np.asarray(position, np.float64)
+    with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is refused as that
+        values = np.asarray(values).astype(np.float32).astype(np.float64)
+    if values.ndim != 2 or position.shape != (len(values), 3):
+        raise ValueError(f"expected positions [N, 3] and values [N, D], got {position.shape} and {values.shape}")
+    if 0 in values.shape:
+        raise WlmError(f"probes: expected at least one probe with at least one number, got {values.shape}")
+    for name, numbers in (("positions", position), ("values", values)):
+        bad = np.count_nonzero(~np.isfinite(numbers).all(1))
+        if bad:
+            raise WlmError(f"probes: the {name} of {bad} of {len(numbers)} probes are NaN or infinite")
+    _in_range("components", components, 1, values.shape[1])
+    _check_bits(bits)
+    return position, values
+
+
+def _check_bits(bits: int | None) -> None:
+    if bits is not None:
+        _in_range("bits", bits, 1, 16)
+
+
+def _in_range(name: str, value: float, low: float, high: float = np.inf) -> None:
+    if not low <= value <= high or not np.isfinite(value):
+        raise ValueError(f"expected {name} from {low} to {high}, got {value}")

@@ -1,0 +1,252 @@
+"""The rows that every benchmark reports, and the files that keep them.
+
+A row is one method with one option on one scene, with its figures by name. A result file is of one machine, and its
+runs are of different systems or scenes. It is JSON: ``{"format": "wlm-bench", "version": 3, "runs": [{"environment":
+{...}, "rows": [{"system": ..., "figures": {"psnr": 45.98, ...}, "notes": "..."}, ...]}, ...]}``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+from benchmarks.figures import FIGURES
+from benchmarks.timing import Timing
+from wlm import __version__
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+from wlm.formats.reading import read_json_file
+
+MEAN = "mean over"
+"""How the scene of a row begins that has means over several scenes."""
+
+_FORMAT = "wlm-bench"
+_VERSION = 3
+_PACKAGES = {"numpy": "numpy", "torch": "torch", "warp": "warp-lang"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method with one option on one scene.
+
+    Attributes:
+        system: `lightmap`, `atlas`, `probe`, `smoke` or `smoke-network`.
+        scene: Name of the data.
+        method: What was run, ours or a rival.
+        option: Profile or setting that tells rows of one method apart; may be empty.
+        figures: What was measured, by the names of `benchmarks.figures`. Those that are None, NaN or infinite were
+            not measured or have no meaning, and are left out.
+        notes: What a reader must know besides; free text.
+    """
+
+    system: str
+    scene: str
+    method: str
+    option: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        """Checks the figures' names.
+
+        Raises:
+            ValueError: A name is unknown.
+        """
+        for name in self.figures:
+            if name not in FIGURES:
+                raise ValueError(f"unknown figure {name!r}")
+        measured = {name: value for name, value in self.figures.items() if value is not None and math.isfinite(value)}
+        # NumPy's numbers don't fit JSON.
+        plain = {name: value if isinstance(value, int) else float(value) for name, value in measured.items()}
+        object.__setattr__(self, "figures", plain)
+
+    def __getitem__(self, name: str) -> float:
+        """A figure that the row has."""
+        return self.figures[name]
+
+    def get(self, name: str) -> float | None:
+        """A figure, or None."""
+        return self.figures.get(name)
+
+    def with_figures(self, **figures: float | None) -> Row:
+        """A copy with more figures."""
+        return replace(self, figures={**self.figures, **figures})
+
+    def with_timing(self, timing: Timing, name: str = "decode_ms", calls: int = 1) -> Row:
+        """A copy with a time, and with its spread where there is more than one sample.
+
+        Args:
+            timing: Of a call.
+            name: Of the figure.
+            calls: How many of what the row is about, such as steps, a timed call has.
+        """
+        spread = (timing.p90_ms - timing.p10_ms) / calls if timing.n > 1 else None
+        return self.with_figures(**{name: timing.median_ms / calls, f"{name}_spread": spread})
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows that were measured together.
+
+    Attributes:
+        environment: As `describe_environment` gives it.
+        rows: The results.
+    """
+
+    environment: dict[str, object]
+    rows: list[Row]
+
+
+def describe_environment(device: str, command: str) -> dict[str, object]:
+    """Describes what a figure depends on besides the code.
+
+    Args:
+        device: "cpu" or "cuda:0".
+        command: The command that made the rows, as a reader would repeat it.
+
+    Returns:
+        Values for JSON: `date` (UTC), `command`, `device`, `device_name`, versions of `python`, `numpy`,
+        `torch`, `warp`, `wlm` and, on CUDA, `cuda`; `threads` (torch's) and `omp_num_threads` (the
+        variable, or null).
+
+    Raises:
+        WlmError: No such device.
+    """
+    import torch
+
+    from wlm import interop
+
+    device = interop.check_device(device)
+    cuda = {"cuda": torch.version.cuda} if device != "cpu" else {}
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "device": device,
+        "device_name": torch.cuda.get_device_name(device) if cuda else _cpu_name(),
+        "python": platform.python_version(),
+        "wlm": __version__,
+        **{key: metadata.version(name) for key, name in _PACKAGES.items()},
+        "threads": torch.get_num_threads(),
+        "omp_num_threads": os.environ.get("OMP_NUM_THREADS"),
+        **cuda,
+    }
+
+
+def write_json(
+    path: str | Path, rows: Sequence[Row], environment: Mapping[str, object], *, partial: bool = False
+) -> None:
+    """Writes a run to a result file, atomically: a reader sees the old file or the whole new one.
+
+    What the file holds of other systems and scenes stays; what it holds of a system's scene is replaced.
+
+    Args:
+        path: File to write; its folder must exist.
+        rows: The results.
+        environment: As `describe_environment` gives it.
+        partial: Replace only the rows of the same method and option.
+
+    Raises:
+        WlmError: The environment does not fit JSON, the file can't be written, or what is there is no result file.
+    """
+    path = Path(path)
+
+    def key(row: Row) -> tuple[str, ...]:
+        return (row.system, row.scene, row.method, row.option) if partial else (row.system, row.scene)
+
+    measured = set(map(key, rows))
+    runs = []
+    for run in read_runs(path) if path.exists() else []:
+        others = [row for row in run.rows if key(row) not in measured]
+        if others:
+            runs.append(Run(run.environment, others))
+    runs.append(Run(dict(environment), list(rows)))
+    document = {"format": _FORMAT, "version": _VERSION, "runs": [asdict(run) for run in runs]}
+    try:
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    except (TypeError, ValueError) as error:
+        raise WlmError(f"{path}: the environment does not fit JSON: {error}") from error
+    atomic_write(path, text.encode())
+
+
+def read_runs(path: str | Path) -> list[Run]:
+    """Reads a result file.
+
+    Args:
+        path: File that `write_json` wrote.
+
+    Returns:
+        Its runs, from the oldest; at least one.
+
+    Raises:
+        WlmError: The file can't be read, is no result file of this version, or a row has an unknown, missing or
+            mistyped field or figure; the message names it.
+    """
+    document = read_json_file(path, "the results")
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise WlmError(f"{path}: not a result file, expected format {_FORMAT!r}")
+    if document.get("version") != _VERSION:
+        raise WlmError(
+            f"{path}: version: expected {_VERSION}, got {document.get('version')!r}: "
+            "files of another version of wlm have to be measured again"
+        )
+    runs = document.get("runs")
+    if not isinstance(runs, list) or not runs:
+        raise WlmError(f"{path}: expected a list 'runs' of at least one run")
+    return [_read_run(run, f"{path}: run {number}") for number, run in enumerate(runs)]
+
+
+def read_json(path: str | Path) -> tuple[list[Row], dict[str, object]]:
+    """Reads the rows of all runs of a result file, and the environment of the newest.
+
+    Raises:
+        WlmError: As `read_runs`.
+    """
+    runs = read_runs(path)
+    return [row for run in runs for row in run.rows], runs[-1].environment
+
+
+def _read_run(run: object, where: str) -> Run:
+    rows, environment = (run.get("rows"), run.get("environment")) if isinstance(run, dict) else (None, None)
+    if not isinstance(rows, list) or not isinstance(environment, dict):
+        raise WlmError(f"{where}: expected a list 'rows' and an object 'environment'")
+    return Run(environment, [_read_row(values, f"{where}: row {index}") for index, values in enumerate(rows)])
+
+
+def _read_row(values: object, where: str) -> Row:
+    if not isinstance(values, dict):
+        raise WlmError(f"{where}: expected an object")
+    for name in values:
+        if name not in Row.__dataclass_fields__:
+            raise WlmError(f"{where}: unknown field {name!r}")
+    for name in Row.__dataclass_fields__:
+        value, kind = values.get(name), dict if name == "figures" else str
+        if not isinstance(value, kind):
+            raise WlmError(f"{where}: field {name!r}: expected {kind.__name__}, got {value!r}")
+    for name, value in values["figures"].items():
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise WlmError(f"{where}: figure {name!r}: expected a number, got {value!r}")
+    try:
+        return Row(**values)
+    except (ValueError, OverflowError) as error:
+        raise WlmError(f"{where}: {error}") from error
+
+
+def _cpu_name() -> str:
+    # platform.processor() is empty or just the architecture on Linux.
+    if sys.platform.startswith("linux"):
+        try:
+            lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        except OSError:
+            lines = []
+        for line in lines:
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,185 @@
+"""What every benchmark does: report progress, fit and store models, time calls in turns, and make rows."""
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import wlm
+from benchmarks.rows import Row
+from benchmarks.timing import Timing, time_together
+from wlm.errors import WlmError
+from wlm.interop import StepGraph, check_device
+from wlm.system import Model, load
+
+Note = Callable[[str], None]
+"""Called with a line before each part of the work."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model that was fitted, written and read back.
+
+    Attributes:
+        option: What its row is called.
+        model: As loaded from the file.
+        fitted: As it was before.
+        bytes: Size of the file.
+        fit_seconds, write_seconds: Wall-clock times.
+    """
+
+    option: str
+    model: Any
+    fitted: Any
+    bytes: int
+    fit_seconds: float
+    write_seconds: float
+
+    @property
+    def seconds(self) -> float:
+        """Of both."""
+        return self.fit_seconds + self.write_seconds
+
+
+class Bench:
+    """One system on one device, and the scene that its rows are about.
+
+    Attributes:
+        system, scene: Of the rows.
+        device: "cpu" or "cuda:0".
+        mode: How a replayed call runs on this device, for the notes of a row.
+    """
+
+    def __init__(
+        self,
+        system: str,
+        device: str,
+        progress: Note | None = None,
+        *,
+        scene: str = "",
+        clock: str = "decode_ms",
+        warmup: int | None = None,
+        repeats: int | None = None,
+        few: int = 1,
+    ) -> None:
+        """Checks the device.
+
+        Args:
+            system: Of the rows.
+            device: "cpu" or "cuda:0".
+            progress: None for no lines of progress.
+            scene: Of the rows; progress begins with it.
+            clock: The figure that a timing is.
+            warmup: Calls before the first that is timed; None: 1 on the CPU, 5 on CUDA.
+            repeats: Samples of each time; None: 5 on the CPU, where a sample is long, 30 on CUDA.
+            few: Samples of what takes long.
+
+        Raises:
+            WlmError: No such device.
+        """
+        self.system, self.scene, self.device = system, scene, check_device(device)
+        self._progress, self._clock = progress, clock
+        slow = self.device == "cpu"
+        self._warmup = warmup if warmup is not None else 1 if slow else 5
+        self._repeats = repeats if repeats is not None else 5 if slow else 30
+        self._few = few
+        self.mode = "one thread" if slow else "replayed as a graph"
+
+    def note(self, line: str) -> None:
+        """Reports what is done next."""
+        if self._progress is not None:
+            self._progress(f"{self.scene}: {line}" if self.scene else line)
+
+    def row(
+        self,
+        method: str,
+        option: str = "",
+        notes: str = "",
+        *,
+        scene: str | None = None,
+        timing: Timing | None = None,
+        calls: int = 1,
+        **figures: float | None,
+    ) -> Row:
+        """Makes a row.
+
+        Args:
+            method, option, notes: As in `Row`.
+            scene: Another one than the bench's.
+            timing, calls: As for `Row.with_timing`.
+            figures: By name.
+        """
+        row = Row(self.system, self.scene if scene is None else scene, method, option, figures, notes)
+        return row if timing is None else row.with_timing(timing, self._clock, calls)
+
+    def missing_row(self, method: str, option: str, error: Exception) -> Row:
+        """Makes the row of what can't be measured: a package isn't installed, or nothing fits the size."""
+        return self.row(method, option, f"not measured: {error}")
+
+    def fit(self, option: str, compress: Callable[[], Model]) -> Fit:
+        """Fits a model, saves it and loads it again.
+
+        Args:
+            option: What its row is called.
+            compress: Fits it; everything that it needs has been compiled.
+        """
+        start = time.perf_counter()
+        model = compress()
+        fitted = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "model.wlm"
+            writing = time.perf_counter()
+            size = model.save(path)
+            written = time.perf_counter()
+            return Fit(option, load(path, model.SYSTEM), model, size, fitted - start, written - writing)
+
+    def replay(self, call: Callable[[], object]) -> StepGraph:
+        """Captures a call in a graph on CUDA, so that gaps between launches do not count."""
+        return StepGraph(call, self.device, warmup=1)
+
+    def time(self, calls: Mapping[Any, Callable[[], object]], *, few: bool = False) -> dict[Any, Timing]:
+        """Times calls in turns."""
+        warmup, repeats = (1, self._few) if few else (self._warmup, self._repeats)
+        return time_together(calls, self.device, warmup, repeats)
+
+    def time_rows(self, peers: Sequence[tuple[Row, Callable[[], object]]]) -> list[Row]:
+        """Times the calls of several rows in turns, and returns the rows with their times."""
+        self.note("timing the decoders, in turns")
+        timings = self.time({index: call for index, (_, call) in enumerate(peers)})
+        return [row.with_timing(timings[index], self._clock) for index, (row, _) in enumerate(peers)]
+
+
+def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
+    """Compares a decode with the float64 decode of the same model.
+
+    A point that rounding puts across a border, of a tile or of a Gaussian's reach, has an error far beyond all others.
+
+    Args:
+        decoded: [N, C].
+        exact: float64 [N, C].
+
+    Returns:
+        The figures `max_error` and `error_999`, the error that 99.9% of the points stay within.
+    """
+    error = np.abs(decoded - exact).max(1)
+    return {"max_error": float(error.max()), "error_999": float(np.percentile(error, 99.9))}
+
+
+def demo_data(name: str, option: str) -> Path:
+    """Finds data of the demos.
+
+    Args:
+        name: Its path in `demos/data`.
+        option: The option that names other data.
+
+    Raises:
+        WlmError: This is no checkout.
+    """
+    path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / name
+    if not path.exists():
+        raise WlmError(f"bench: the demo's data, {name}, come with a checkout alone; expected {option}")
+    return path

@@ -1,0 +1,381 @@
+"""Light of all orders in smoke, scored by the picture: each way to it against path tracing, with its whole time.
+
+The scenes, one at each albedo:
+
+- "plumes": unseen plumes and clouds from any side, each under three directional lights of random colours.
+- "jet": a jet past a sphere that was simulated, from some sides, two frames of each for the flicker.
+
+The methods, each a row; a picture's PSNR and FLIP are in sRGB, against path tracing with many samples:
+
+- "single scattering", and "single x gain", a factor on it;
+- "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
+- "fitted filter", a linear one of planes blurred at four scales;
+- "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
+- "diffusion" on a grid of 32^3 beside single scattering, which is a part of
+- "learned mix", what `wlm.smoke.transport.scatter` does.
+
+The gain and the weights of the fitted octaves and filter are those nearest to the very references that they are scored
+by: other smoke would give no better ones. A reference is the mean of two traced apart: "path tracing" is its own noise,
+which their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible,
+after the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
+
+Rows of what the mix adds to diffusion, light by light on grids of every size, are those of `smoke_grids`; of other
+phase functions, point lights in the smoke and fire those of `smoke_other_light`.
+
+A time is of a whole picture, from the smoke to the shaded image: on CUDA one graph, but for the path tracer and the
+denoiser, which are calls.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from benchmarks.path_tracer import denoised_picture, denoiser_device, has_denoiser
+from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octaves, three_octaves
+from benchmarks.rows import Row
+from benchmarks.runner import Bench, Note
+from benchmarks.smoke_grids import GridSizes, grid_rows
+from benchmarks.smoke_other_light import other_rows
+from benchmarks.timing import Timing
+from wlm.fluid.volume import DensityVolume
+from wlm.metrics.flip import flip_display
+from wlm.smoke.camera import Camera, unit
+from wlm.smoke.learn.losses import warp
+from wlm.smoke.learn.motion import motion
+from wlm.smoke.planes import to_srgb
+from wlm.smoke.scene import load_scene
+from wlm.smoke.shading import Light
+from wlm.smoke.simulation import advance, make_solver, volume_of
+from wlm.smoke.transport.features import orders_march
+from wlm.smoke.transport.learning import FAINT, psnr
+from wlm.smoke.transport.lighting import LitSmoke, light_smoke
+from wlm.smoke.transport.orders import scatter
+from wlm.smoke.transport.samples import draw_view
+from wlm.smoke.transport.tracing import trace
+
+METHOD = "all orders"
+"""The table of these rows."""
+
+ALBEDOS = (0.9, 1.0)
+
+_SEED = 8  # of views that nothing was fitted to
+_LIGHTS = 3
+_POWERS = 3  # of the cosine between light and camera, by which octaves are fitted
+_FOUR_PI = 4.0 * math.pi
+_KEPT = 40  # orders that an albedo below 1 is made of: at 0.9 what is left out is less than a thousandth
+_CURVE = 1.16  # as the mix's fit weighs errors
+_RIDGE = 1e-6
+_VISIBLE = 0.05  # opacity
+_OF_MEAN = 20.0 * math.log10(2.0)  # dB, by which the mean of two has less noise than their difference
+_TRACED, _DENOISED, _GAIN = "path tracing", "1 sample, denoised", "single x gain"
+_OCTAVES, _FILTER = "fitted octaves", "fitted filter"
+
+
+@dataclass(frozen=True)
+class OrdersSizes:
+    """Smoke, pictures and samples.
+
+    Attributes:
+        plumes: How many.
+        cells: Voxels along a plume's edge as it is drawn; None: 40 to 64.
+        voxels: That it is resampled to; None: it stays.
+        pixels: H and W.
+        samples: Paths a pixel of a reference.
+        scale, frames: Of the scene `jet-sphere`: cells as a multiple of its own, and frames before the first seen.
+        sides: From which it is seen.
+        repeats: Samples of a time.
+        single: Of the rows of `smoke_grids`.
+        other: Arguments of `smoke_other_light.other_rows`, by name.
+    """
+
+    plumes: int
+    cells: int | None
+    voxels: int | None
+    pixels: int
+    samples: int
+    scale: float
+    frames: int
+    sides: int
+    repeats: int
+    single: GridSizes
+    other: Mapping[str, int] = field(default_factory=dict)
+
+
+FULL = OrdersSizes(
+    plumes=12,
+    cells=128,
+    voxels=400,
+    pixels=512,
+    samples=3072,
+    scale=1.0,
+    frames=60,
+    sides=4,
+    repeats=10,
+    single=GridSizes((32, 64, 128, 256, 400, 512), extinctions=(2.5, 8.0, 25.0, 80.0), pixels=192, samples=512),
+)
+"""For a GPU."""
+
+QUICK = OrdersSizes(
+    plumes=4,
+    cells=None,
+    voxels=None,
+    pixels=32,
+    samples=1536,
+    scale=0.12,
+    frames=40,
+    sides=2,
+    repeats=2,
+    single=GridSizes((32, 64, 128), extinctions=(8.0, 25.0), pixels=24, samples=256),
+)
+"""For a CPU."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Smoke from one side under lights.
+
+    Attributes:
+        volume: Cold smoke.
+        camera: Orthographic.
+        lights: Directional, with their irradiance.
+        seed: Of paths.
+        motion: float32 tensor [2, H, W] that takes the shot before to this one; None: it is of other smoke.
+    """
+
+    volume: DensityVolume
+    camera: Camera
+    lights: tuple[Light, ...]
+    seed: int
+    motion: torch.Tensor | None = None
+
+
+def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
+    """Measures light of all orders.
+
+    Args:
+        quick: Small pictures and few, for a minute or two on a CPU. Otherwise 400^3 voxels at 512^2, for a GPU.
+        device: "cpu" or "cuda:0".
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, scene by scene.
+
+    Raises:
+        WlmError: The device isn't there, or hasn't the memory.
+    """
+    return run_rows(QUICK if quick else FULL, device=device, progress=progress)
+
+
+def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -> list[Row]:
+    """Measures it at the given sizes; the rest as for `run`."""
+    bench = Bench("smoke", device, progress, clock="time_ms", repeats=sizes.repeats, few=2)
+    if not has_denoiser():
+        bench.note(f"{_DENOISED}: left out, pyoidn isn't installed: wlm[bake]")
+    plumes, jet = [_plume(sizes, number, bench.device) for number in range(sizes.plumes)], _jet(sizes, bench)
+    rows = []
+    for name, shots in (("plumes", plumes), ("jet", jet)):
+        rows += _scored(bench, name, shots, sizes)
+    return rows + grid_rows(bench, sizes.single) + other_rows(bench, **sizes.other)
+
+
+def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
+    """The rows of one scene at both albedos."""
+    found: dict[float, dict[str, list[torch.Tensor]]] = {albedo: {} for albedo in ALBEDOS}
+    traced: list[tuple[dict[float, torch.Tensor], ...]] = []
+    opacity = []
+    for number, shot in enumerate(shots, 1):
+        bench.note(f"{name}: {number} of {len(shots)}")
+        traced.append(tuple(_trace(shot, sizes.samples // 2, salt) for salt in (0, 1)))
+        once = _once(shot)
+        opacity.append(1.0 - once.transparency)
+        fitted = {_GAIN: once.shade()[None], _OCTAVES: _octaves_by_angle(shot), _FILTER: _filter_by_angle(shot)}
+        for albedo in ALBEDOS:
+            pictures = {way: make(shot, albedo) for way, make in _ways().items()}
+            for way, picture in (pictures | fitted).items():
+                found[albedo].setdefault(way, []).append(picture)
+    bench.note(f"{name}: times")
+    times = _times(bench, shots[0], sizes)
+    rows = []
+    settings = {"voxels": max(shots[0].volume.shape), "pixels": sizes.pixels, "lights": _LIGHTS}
+    for albedo in ALBEDOS:
+        halves = [tuple(half[albedo] for half in pair) for pair in traced]
+        truth = [0.5 * (one + other) for one, other in halves]
+        for way in (_GAIN, _OCTAVES, _FILTER):
+            found[albedo][way] = _fitted(found[albedo][way], truth)
+        scene, notes = f"{name}, albedo {albedo:g}", f"{len(shots)} pictures"
+        for way, timing in times.items():
+            pictures = found[albedo][way]
+            figures = _score(pictures, truth) | _flicker(shots, pictures, halves, opacity) | settings
+            on_cpu = way == _DENOISED and denoiser_device(bench.device) == "cpu" != bench.device
+            note = f"{notes}, denoised on the CPU" if on_cpu else notes
+            rows.append(bench.row(METHOD, way, note, scene=scene, timing=timing, **figures))
+        noise = [psnr(*pair) + _OF_MEAN for pair in halves]
+        noise = {"psnr": float(np.mean(noise)), "psnr_min": min(noise), "psnr_max": max(noise)}
+        figures = noise | {"samples": sizes.samples} | settings
+        rows.append(bench.row(METHOD, _TRACED, "the references' noise", scene=scene, **figures))
+    return rows
+
+
+def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
+    """What makes a picture of a shot at an albedo, float32 [H, W, 3], with nothing to be fitted first."""
+    ways = {
+        "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
+        "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
+        "diffusion": lambda shot, albedo: diffused(shot.volume, shot.camera, shot.lights, albedo),
+        "learned mix": lambda shot, albedo: scatter(shot.volume, shot.camera, shot.lights, (albedo,) * 3).shade(),
+    }
+    return ways | ({_DENOISED: _denoised} if has_denoiser() else {})
+
+
+def _once(shot: Shot) -> LitSmoke:
+    return light_smoke(shot.volume, shot.camera, shot.lights, orders_march(shot.volume))
+
+
+def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
+    settings = {"albedo": (albedo,) * 3, "samples": 1, "orders": 0, "seed": shot.seed}
+    return denoised_picture(trace(shot.volume, shot.camera, shot.lights, **settings).total)
+
+
+def _octaves_by_angle(shot: Shot) -> torch.Tensor:
+    """The octaves of each light times powers of the cosine between it and the camera, [O * 3, H, W, 3]."""
+    height, width = shot.camera.height, shot.camera.width
+    parts = torch.zeros((_POWERS, len(FITTED), height, width, 3), device=shot.volume.device)
+    for light in shot.lights:
+        cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
+        made = octaves(shot.volume, shot.camera, [light])
+        for power in range(_POWERS):
+            parts[power] += cosine**power * made
+    return parts.flatten(0, 1)
+
+
+def _filter_by_angle(shot: Shot) -> torch.Tensor:
+    """The filter's planes of each light times powers of the cosine between it and the camera, [P * 3, H, W, 3]."""
+    parts = 0.0
+    for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
+        cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
+        powers = torch.cat([cosine**power * planes for power in range(_POWERS)])
+        parts = parts + powers[..., None] * torch.tensor(light.irradiance, device=planes.device) / _FOUR_PI
+    return parts
+
+
+def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
+    """All light at each of `ALBEDOS`, [H, W, 3]."""
+    seed = 2 * shot.seed + salt
+    made = trace(shot.volume, shot.camera, shot.lights, samples=samples, orders=_KEPT, seed=seed)
+    return {albedo: made.total if albedo == 1.0 else made.with_albedo((albedo,) * 3).total for albedo in ALBEDOS}
+
+
+def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """The pictures that one mix of features [N, H, W, 3] is, the nearest to the truth by least squares as in sRGB."""
+    left, right = 0.0, 0.0
+    for parts, wanted in zip(features, truth, strict=True):
+        weights = ((wanted.clamp(min=0.0) + FAINT) ** -_CURVE).flatten().double()
+        rows = parts.flatten(1).double()
+        left = left + (rows * weights) @ rows.T
+        right = right + rows @ (weights * wanted.flatten().double())
+    left = left + _RIDGE * torch.diag(left.diagonal())
+    mix = torch.linalg.solve(left, right).float()
+    return [torch.einsum("n,nhwc->hwc", mix, parts).clamp(min=0.0) for parts in features]
+
+
+def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
+    """The time of one picture by each way; on CUDA as a graph, where nothing on the way waits for the device."""
+    ways, albedo = _ways(), ALBEDOS[0]
+    calls = {way: lambda make=make: make(shot, albedo) for way, make in ways.items()}
+    calls[_OCTAVES] = lambda: octaves(shot.volume, shot.camera, shot.lights)
+    calls[_FILTER] = lambda: filter_planes(shot.volume, shot.camera, shot.lights)
+    waiting = {way: calls.pop(way) for way in (_DENOISED,) if way in calls}
+    if bench.device != "cpu":
+        calls = {way: bench.replay(call) for way, call in calls.items()}
+    times = bench.time(calls) | (bench.time(waiting, few=True) if waiting else {})
+    times[_GAIN] = times["single scattering"]
+    order = ("single scattering", _GAIN, "three octaves", _OCTAVES, _FILTER, _DENOISED, "diffusion", "learned mix")
+    return {way: times[way] for way in order if way in times}
+
+
+def _score(pictures: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> dict[str, float]:
+    values = [psnr(*pair) for pair in zip(pictures, truth, strict=True)]
+    flips = []
+    for pair in zip(truth, pictures, strict=True):
+        seen = (to_srgb(light).clamp(max=1.0).cpu().numpy() for light in pair)
+        flips.append(float(flip_display(*seen).mean()))
+    best = {"psnr": float(np.mean(values)), "psnr_min": min(values), "psnr_max": max(values)}
+    return best | {"flip": float(np.mean(flips)), "flip_max": max(flips)}
+
+
+def _flicker(
+    shots: Sequence[Shot],
+    pictures: Sequence[torch.Tensor],
+    halves: Sequence[tuple[torch.Tensor, torch.Tensor]],
+    opacity: Sequence[torch.Tensor],
+) -> dict[str, float]:
+    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'.
+
+    References that change by no more than their noise, whose product isn't above 0, have nothing to be compared with.
+    """
+    power, wanted, count = 0.0, 0.0, 0
+    for n, shot in enumerate(shots):
+        if shot.motion is None:
+            continue
+
+        def change(before: torch.Tensor, after: torch.Tensor, n: int = n, moved: torch.Tensor = shot.motion):
+            before, after = (to_srgb(light).clamp(max=1.0).permute(2, 0, 1)[None] for light in (before, after))
+            warped, inside = warp(before, moved[None])
+            return 255.0 * (after - warped)[0][:, (opacity[n] > _VISIBLE) & (inside[0, 0] > 0)]
+
+        changed = change(pictures[n - 1], pictures[n])
+        one, other = (change(halves[n - 1][half], halves[n][half]) for half in (0, 1))
+        power += float(changed.square().sum())
+        wanted += float((one * other).sum())
+        count += changed.numel()
+    if not count:
+        return {}
+    own = {"flicker": (power / count) ** 0.5}
+    return own | {"flicker_ratio": (power / wanted) ** 0.5} if wanted > 0 else own
+
+
+def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
+    """Lights in colours drawn at random."""
+    colours = random.dirichlet(np.ones(3), len(ways)) * 3.0 / len(ways) * _FOUR_PI
+    return tuple(Light(tuple(way), tuple(map(float, colour))) for way, colour in zip(ways, colours, strict=True))
+
+
+def _plume(sizes: OrdersSizes, number: int, device: str) -> Shot:
+    volume, camera, lights = draw_view(_SEED, number, pixels=sizes.pixels, lights=_LIGHTS, cells=sizes.cells)
+    density = volume.density.to(device)
+    if sizes.voxels is not None:
+        size = (sizes.voxels,) * 3
+        density = F.interpolate(density[None, None], size, mode="trilinear", align_corners=False)[0, 0].contiguous()
+        volume = replace(volume, voxel=volume.voxel * volume.shape[0] / sizes.voxels)
+    random = np.random.default_rng([_SEED, number, 1])
+    coloured = _lights(random, [light.toward for light in lights])
+    return Shot(replace(volume, density=density), camera, coloured, number)
+
+
+def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
+    """Two frames in turn from each of some sides."""
+    bench.note("jet: simulates")
+    scene = load_scene("jet-sphere").scaled(sizes.scale)
+    solver = make_solver(scene, device=bench.device)
+    for frame in range(1, sizes.frames + 1):
+        advance(scene, solver, frame)
+    volumes = []
+    for frame in (sizes.frames + 1, sizes.frames + 2):
+        advance(scene, solver, frame)
+        solver.check()
+        smoke = volume_of(scene, solver)
+        volumes.append(DensityVolume(smoke.density.clone(), smoke.extinction, smoke.voxel, smoke.origin))
+    random = np.random.default_rng([_SEED, 2])
+    shots = []
+    for side in range(sizes.sides):
+        toward = random.normal(size=3)
+        camera = Camera.around(volumes[1], toward=toward, pixels=sizes.pixels)
+        lights = _lights(random, random.normal(size=(_LIGHTS, 3)).tolist())
+        moved = motion(volumes[1], solver.velocity, camera, reach=scene.grid.cell * scene.steps)
+        shots.append(Shot(volumes[0], camera, lights, 100 + 2 * side))
+        shots.append(Shot(volumes[1], camera, lights, 101 + 2 * side, moved))
+    return shots

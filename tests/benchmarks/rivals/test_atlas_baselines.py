@@ -1,0 +1,311 @@
+"""What a compressed lightmap of a mesh is compared with: sizes, known answers, budgets, and what is refused."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
+
+from benchmarks.rivals.atlas import RIVALS, best_astc, block_codec, carving, downsampling, share_of, single_colour
+from wlm.atlas.data import from_arrays
+from wlm.atlas.display import screen_exposure
+from wlm.atlas.evaluation import compare
+from wlm.atlas.resize import FILTERS, resize
+from wlm.atlas.views import mesh_views, visible_uv
+from wlm.errors import WlmError
+from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.ops import raster
+from wlm.texels import fill_gaps
+
+FULL = np.ones((HEIGHT, WIDTH), bool)
+SEEN = {"views": 4, "resolution": 64}
+
+
+def _sheet(lightmap, mask=None):
+    """A square that shows the whole lightmap."""
+    position = np.array([[-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]], np.float64)
+    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
+    return from_arrays(position, np.array([[0, 1, 2], [2, 1, 3]]), uv, lightmap, mask, name="sheet")
+
+
+def _read(rival, mesh):
+    """What the rival decodes to at the lightmap's texels, float64 [H, W, 3]; for meshes whose triangles don't count."""
+    height, width = mesh.mask.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    uv = torch.tensor(np.stack([x / width, y / height], -1).reshape(-1, 2), dtype=torch.float32)
+    nothing = torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3)
+    return rival.decoded(uv, *nothing).numpy().astype(np.float64).reshape(height, width, 3)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("share", [0.17, 0.5])
+def test_every_one_within_its_budget(name, share):
+    mesh = lit_cube(2)
+    result = RIVALS[name](mesh, share)
+    # "astc" is the block of its choice.
+    assert result.name.startswith(name) and result.encode_seconds > 0.0
+    used = share_of(result, mesh)
+    assert used == result.bytes * 8 / (HEIGHT * WIDTH * 48)
+    # All it can: at least the budget less one row, column or rank of blocks, or its own size.
+    sizes = {"bc6h": 8, "bc6h own": 8, "astc": 8, "astc4x4": 8, "astc6x6": 3.84, "astc8x8": 2}
+    most = sizes.get(name, 32) / 48
+    assert min(share, most) * 0.8 < used <= share
+    report = compare(mesh, {"it": result.decoded}, views=4, resolution=64)["it"]
+    assert report.psnr > 25.0
+
+
+@pytest.mark.parametrize("filter", FILTERS)
+def test_resizing_keeps_one_colour_and_the_size(filter):
+    one = np.full((HEIGHT, WIDTH, 3), 0.7, np.float32)
+    for height, width in ((HEIGHT, WIDTH), (31, 47), (5, 3), (1, 1)):
+        small = resize(one, FULL, height, width, filter)
+        assert small.dtype == np.float64
+        np.testing.assert_allclose(small, np.full((height, width, 3), np.float32(0.7)), rtol=1e-9)
+    np.testing.assert_array_equal(resize(waves(), FULL, HEIGHT, WIDTH, filter), waves())
+
+
+def test_halves_by_hand():
+    line = np.array([[1.0, 3.0, 4.0, 8.0, 9.0, 5.0]])
+    image = np.repeat(np.repeat(line, 2, 0)[..., None], 3, 2)
+    mask = np.ones((2, 6), bool)
+    for filter in ("box", "bilinear"):
+        np.testing.assert_allclose(resize(image, mask, 1, 3, filter)[0, :, 0], [2.0, 6.0, 7.0])
+    # Centres at 1 and 4 of 6: bilinear reads 3 and 9 alone, box has thirds.
+    np.testing.assert_allclose(resize(image, mask, 1, 2, "bilinear")[0, :, 0], [3.0, 9.0])
+    np.testing.assert_allclose(resize(image, mask, 1, 2, "box")[0, :, 0], [8 / 3, 22 / 3])
+    np.testing.assert_allclose(resize(image, mask, 2, 4, "box")[0, :, 0], [5 / 3, 11 / 3, 25 / 3, 19 / 3])
+
+
+def test_lanczos_keeps_slow_waves_and_drops_fast_ones():
+    x = np.arange(96) + 0.5
+    slow, fast = (np.cos(2.0 * np.pi * x * k / 96.0) for k in (6, 40))
+    image = np.repeat((2.0 + np.stack([slow, fast, slow + fast], -1))[None], 4, 0)
+    small = resize(image, np.ones((4, 96), bool), 4, 48, "lanczos") - 2.0
+    centres = (np.arange(48) + 0.5) * 2.0
+    inner = slice(6, -6)
+    np.testing.assert_allclose(small[0, inner, 0], np.cos(2.0 * np.pi * centres * 6 / 96.0)[inner], atol=0.02)
+    assert np.abs(small[0, inner, 1]).max() < 0.05 and small.min() >= -2.0
+
+
+def test_the_fit_has_the_least_squares():
+    """Against NumPy's least squares on a small texture; and better than every filter where the mask is."""
+    random = np.random.default_rng(4)
+    image = (3.0 + waves(12, 15) + random.uniform(0.0, 0.2, (12, 15, 3))).astype(np.float32)
+    mask = np.zeros((12, 15), bool)
+    mask[1:11, 2:13] = True
+    size = (5, 6)
+    fitted = resize(image, mask, *size, "fit")
+    columns = []
+    for number in range(30):
+        unit = np.zeros((30, 3), np.float32)
+        unit[number] = 1.0
+        texture = torch.tensor(unit.reshape(*size, 3))
+        y, x = (np.argwhere(mask) + 0.5).T / np.array([[12], [15]])
+        columns.append(raster.texture(texture, torch.tensor(np.stack([x, y], 1), dtype=torch.float32)).numpy()[:, 0])
+    matrix = np.stack(columns, 1).astype(np.float64)
+
+    def squares(texels):
+        return ((matrix @ texels.reshape(30, 3) - image[mask]) ** 2).sum()
+
+    best, *_ = np.linalg.lstsq(matrix, image[mask].astype(np.float64), rcond=None)
+    assert squares(best) <= squares(fitted) < squares(best) * 1.01
+    for filter in ("bilinear", "box", "lanczos"):
+        assert squares(fitted) < 0.9 * squares(resize(image, mask, *size, filter))
+    # Texels that nothing in the mask reads keep the box filter's value.
+    unread = ~matrix.any(axis=0)
+    box = resize(image, mask, *size, "box")
+    assert not unread.all()
+    np.testing.assert_allclose(fitted.reshape(30, 3)[unread], box.reshape(30, 3)[unread])
+
+
+@pytest.mark.parametrize("filter", FILTERS)
+def test_what_is_in_the_gaps_counts_for_nothing(filter):
+    mask = FULL.copy()
+    mask[10:40, 20:70] = False
+    other = waves()
+    other[~mask] = 60000.0
+    clean, dirty = (downsampling(_sheet(image, mask), 0.3, filter) for image in (waves(), other))
+    np.testing.assert_array_equal(_read(clean, _sheet(waves())), _read(dirty, _sheet(waves())))
+
+
+def test_downsampling_keeps_the_shape_and_never_enlarges():
+    mesh = _sheet(waves())
+    small = downsampling(mesh, 1 / 6)
+    assert small.size == (HEIGHT // 2, WIDTH // 2) and share_of(small, mesh) == pytest.approx(1 / 6)
+    for share in (2 / 3, 3.0):
+        whole = downsampling(mesh, share)
+        assert whole.size == (HEIGHT, WIDTH) and share_of(whole, mesh) == pytest.approx(2 / 3)
+        np.testing.assert_allclose(_read(whole, mesh), unpack_rgb9e5(pack_rgb9e5(waves())), rtol=2e-6)
+    thin = _sheet(np.repeat(waves(1, 50), 1, 0))
+    assert downsampling(thin, 0.335).size == (1, 25) and downsampling(thin, 0.02).size == (1, 1)
+    # More texels, less error.
+    errors = [np.abs(_read(downsampling(mesh, share), mesh) - waves()).mean() for share in (0.05, 0.2, 0.6)]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_gaps_cost_nothing():
+    """Texels and blocks that charts don't read; what is paid for them gives the charts more."""
+    mask = FULL.copy()
+    mask[HEIGHT // 2 :] = False
+    mesh, whole = _sheet(waves(), mask), _sheet(waves())
+    for name in ("downsampling", "bc6h own"):
+        with_gaps, all_charts = RIVALS[name](mesh, 0.05), RIVALS[name](whole, 0.05)
+        assert 1.25 < with_gaps.size[0] / all_charts.size[0] < 1.5
+        assert share_of(with_gaps, mesh) <= 0.05
+    assert block_codec(mesh, 1.0, "bc6h own").bytes == HEIGHT // 8 * WIDTH // 4 * 16
+
+
+@pytest.mark.parametrize("codec", ["bc6h", *(f"astc{w}x{h}" for w, h in ASTC_BLOCKS)])
+def test_blocks(codec):
+    light = waves()[..., :1] * np.array([1.0, 0.8, 0.5], np.float32)
+    mesh = _sheet(light)
+    whole = block_codec(mesh, 1.0, codec)
+    width, height = (4, 4) if codec == "bc6h" else map(int, codec[4:].split("x"))
+    assert whole.size == (HEIGHT, WIDTH) and whole.name == codec
+    assert whole.bytes == math.ceil(WIDTH / width) * math.ceil(HEIGHT / height) * 16
+    # 2% of the mean; 3% with the largest blocks. Blocks in any other order are 30% off.
+    assert np.abs(_read(whole, mesh) - light).mean() < 0.03
+    small = block_codec(mesh, 0.01, codec)
+    assert 0.005 < share_of(small, mesh) <= 0.01 and small.size[0] < HEIGHT
+    odd = _sheet(light[:13, :10])
+    assert block_codec(odd, 20.0, codec).size == (13, 10)
+    assert np.abs(_read(block_codec(odd, 20.0, codec), odd) - light[:13, :10]).mean() < 0.03
+
+
+def test_faces_of_one_colour_become_a_texel_each():
+    """Six faces in four colours: four texels hold them all, and at a larger threshold all share one."""
+    colours = np.array([[1, 1, 1], [1, 0.5, 0], [1, 1, 1], [0, 0, 2], [0.25, 0, 0.25], [1, 1, 1]], np.float32)
+    light = np.empty((HEIGHT, WIDTH, 3), np.float32)
+    for number, colour in enumerate(colours):
+        light[number // 3 * 32 :, number % 3 * 32 :][:32, :32] = colour
+    mesh = lit_cube(2, light)
+    exact = single_colour(mesh, threshold=0.0, floor=-math.inf)
+    assert exact.bytes == 4 * 6 and exact.size is None
+    report = compare(mesh, {"it": exact.decoded}, views=6, resolution=64)["it"]
+    assert report.psnr > 100.0
+    light[: HEIGHT // 2, : WIDTH // 3] = waves()[: HEIGHT // 2, : WIDTH // 3]
+    mesh = lit_cube(2, light)
+    one_left = single_colour(mesh, threshold=1e-4, **SEEN)
+    kept = np.count_nonzero(mesh.mask[: HEIGHT // 2, : WIDTH // 3])
+    assert one_left.bytes == (4 + kept) * 6
+    assert compare(mesh, {"it": one_left.decoded}, views=6, resolution=64)["it"].psnr > 70.0
+    assert single_colour(mesh, threshold=10.0, floor=-math.inf).bytes == 6
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.1, 0.3])
+def test_the_error_of_shared_colours_is_bounded(threshold):
+    """All colours of a group are within four times the threshold of each other, on the scale of a square root."""
+    mesh = lit_cube(6)
+    result = single_colour(mesh, threshold=threshold, floor=-math.inf)
+    assert 0.0 < share_of(result, mesh) < 1.0
+    weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.triangle))
+    uv = torch.tensor((mesh.uv[mesh.triangle] * weight[..., None]).sum(1), dtype=torch.float32)
+    original = raster.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv)
+    decoded = result.decoded(uv, torch.arange(len(uv), dtype=torch.int32), torch.tensor(weight))
+    factor = screen_exposure(mesh)
+    error = ((decoded * factor).sqrt() - (original * factor).sqrt()).abs()
+    # Colours were looked at a texel apart; between these they may go a little further.
+    assert threshold * 0.5 < float(error.max()) < 4.0 * threshold * 1.1 + 2e-3
+
+
+def test_triangles_that_were_wrong_keep_their_texels():
+    mesh = lit_cube(6)
+    factor = screen_exposure(mesh)
+
+    def worst(rival):
+        values = []
+        for visible, _, uv in visible_uv(mesh, mesh_views(mesh, SEEN["views"], 1), SEEN["resolution"], "cpu"):
+            hit = visible >= 0
+            decoded = rival.decoded(uv[hit], visible[hit], uv[hit])
+            original = raster.texture(torch.tensor(mesh.filled), uv[hit])
+            squares = float(((decoded * factor).sqrt() - (original * factor).sqrt()).double().square().sum())
+            values.append(-10.0 * math.log10(squares / (3 * SEEN["resolution"] ** 2)))
+        return min(values)
+
+    all_of_them, fewer = (single_colour(mesh, threshold=0.2, floor=floor, **SEEN) for floor in (-math.inf, 30.0))
+    assert worst(all_of_them) < 25.0 and all_of_them.bytes < fewer.bytes
+    # The colours of groups changed as they lost triangles.
+    assert worst(fewer) > 29.0
+    # No more than needed.
+    assert (fewer.decoded.colour >= 0).sum() > 10
+
+
+def _columns(light):
+    """A flat grid of eight columns of quads over a lightmap."""
+    x = np.linspace(0.0, 1.0, 9)
+    uv = np.stack(np.meshgrid(x, [0.0, 1.0]), -1).reshape(-1, 2)
+    quad = np.arange(8)[:, None]
+    triangle = np.concatenate([quad + [0, 1, 9], quad + [9, 1, 10]])
+    return from_arrays(np.insert(2.0 * uv - 1.0, 2, 0.0, 1), triangle, uv, light, name="columns")
+
+
+def test_carving_keeps_what_a_smaller_lightmap_loses():
+    """Stripes over an eighth of a lightmap and a ramp over the rest: seams leave the stripes alone."""
+    x = np.arange(64)
+    row = np.where(x < 8, 0.5 + 0.4 * (x % 2), 1.0 + x / 64.0)
+    light = np.broadcast_to(row[None, :, None], (64, 64, 3)).astype(np.float32)
+    mesh = _columns(light)
+    carved, smaller = (RIVALS[name](mesh, 0.17) for name in ("carving", "downsampling"))
+    scores = compare(mesh, {"carved": carved.decoded, "smaller": smaller.decoded}, views=4, resolution=64)
+    assert scores["carved"].psnr > scores["smaller"].psnr + 10.0
+    corner = carved.decoded.corner.numpy() * carved.size[::-1]
+    width = corner[:8, 1, 0] - corner[:8, 0, 0]
+    assert width[0] > 7.5 and width[1:].mean() < 4.0
+    assert carved.size[0] < 40  # rows are all alike
+
+
+def test_carving_turns_no_triangle_over():
+    """Slivers across the way of all seams: they stay as they were wound, or carving ends."""
+    random = np.random.default_rng(2)
+    y = np.sort(random.uniform(0.0, 1.0, 40))
+    left = np.stack([np.zeros(40), y], 1)
+    right = np.stack([np.ones(40), y + random.uniform(0.0, 0.002, 40)], 1).clip(0.0, 1.0)
+    uv = np.concatenate([left, right, [[0.5, 0.0], [0.5, 1.0]]])
+    number = np.arange(39)
+    triangle = np.stack([number, number + 40, number + 1], 1)
+    mesh = from_arrays(np.insert(uv, 2, 0.0, 1), triangle, uv, random.random((48, 48, 3)), name="slivers")
+    carved = RIVALS["carving"](mesh, 0.3)
+    corner = carved.decoded.corner.double().numpy()
+    before, after = (np.linalg.det(c[:, 1:] - c[:, :1]) for c in (uv[triangle], corner))
+    assert carved.size[0] * carved.size[1] < 48 * 48 and (before * after > 0.0).all()
+    assert RIVALS["carving"](mesh, 2.0).size == (48, 48)
+
+
+def test_what_is_refused(monkeypatch):
+    mesh = _sheet(waves())
+    makers = (downsampling, carving, lambda mesh, share: block_codec(mesh, share, "astc12x12"))
+    tiny = 0.5 / (HEIGHT * WIDTH)
+    for share, message in (
+        (0.0, "share"),
+        (-1.0, "share"),
+        (math.nan, "share"),
+        (math.inf, "share"),
+        (tiny, "no room"),
+    ):
+        for make in makers:
+            with pytest.raises(ValueError, match=message):
+                make(mesh, share)
+    with pytest.raises(ValueError, match="'cubic'"):
+        downsampling(mesh, 0.5, "cubic")
+    for codec in ("bc7", "astc7x7", "astc"):
+        with pytest.raises(ValueError, match=f"'{codec}'"):
+            block_codec(mesh, 0.5, codec)
+    with pytest.raises(ValueError, match="threshold"):
+        single_colour(mesh, threshold=-0.1)
+    for size in ((0, 4), (4, 0), (HEIGHT + 1, 4)):
+        with pytest.raises(ValueError, match="size"):
+            resize(waves(), FULL, *size)
+    for codec, package in (("bc6h", "ispc_texcomp"), ("astc5x5", "astc_encoder")):
+        monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
+        with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
+            block_codec(mesh, 0.5, codec)
+
+
+def test_astc_keeps_the_lightmaps_size_where_it_can():
+    mesh = lit_cube(2)
+    rivals = {share: best_astc(mesh, share) for share in (0.17, 0.14, 0.12, 0.09, 0.02)}
+    assert [rival.name for rival in rivals.values()] == ["astc4x4", "astc5x4", "astc5x5", "astc6x6", "astc12x12"]
+    assert all(rival.size == mesh.mask.shape for share, rival in rivals.items() if share > 0.02)

@@ -1,0 +1,263 @@
+"""The block codecs on small lightmaps with known answers."""
+
+import builtins
+import sys
+
+import astc_encoder
+import imagecodecs
+import numpy as np
+import pytest
+import texture2ddecoder
+from builders.lightmaps import smooth_light
+
+from benchmarks.rivals.lightmap import RIVALS
+from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
+from wlm.errors import WlmError
+from wlm.formats import hdr_blocks
+from wlm.metrics import psnr
+
+BLOCKS = {name: method.encode for name, method in RIVALS.items() if method.alone}
+BITS = {f"astc{side}": 128.0 / side**2 for side in (4, 5, 6, 8, 10, 12)} | {"8bit": 24.0}
+BITS |= {name: 8.0 for name in BLOCKS if name.startswith("bc")}
+# What each reaches at least on the smooth image below; measured 2.5 to 4 dB above.
+FLOOR = {"bc6h": 61.0, "bc7": 58.5, "8bit": 59.0}
+FLOOR |= {"bc6h-rdo-1": 55.5, "bc7-rdo-0.5": 58.0, "bc7-rdo-1": 54.5, "bc7-rdo-2": 47.5}
+FLOOR |= {"astc4": 64.5, "astc5": 63.5, "astc6": 62.5, "astc8": 60.5, "astc10": 58.0, "astc12": 56.5}
+RANGES = 12  # bytes of a tile's range
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_size_and_error(name):
+    image = smooth_light()
+    result = BLOCKS[name](image, np.ones((120, 120), bool))
+    assert result.name == name and result.size == (120, 120)
+    assert result.decoded.shape == image.shape and result.decoded.dtype == np.float32
+    ranges = RANGES if name.startswith(("bc7", "8bit")) or result.option == "LDR" else 0
+    assert result.bytes - ranges == pytest.approx(BITS[name] / 8 * 120 * 120)
+    assert 0 < result.disk_bytes < 0.95 * result.bytes
+    assert FLOOR[name] < psnr(image, result.decoded) < 90.0
+    assert result.encode_seconds > 0.0 and result.decode_seconds > 0.0
+
+
+def test_more_bits_less_error():
+    # Noise, so that the blocks and not half float's rounding limit the quality.
+    image = smooth_light() * (1.0 + 0.05 * np.random.default_rng(0).standard_normal((120, 120, 3)))
+    mask = np.ones((120, 120), bool)
+    quality = [psnr(image, encode_astc(image, mask, block).decoded) for block in (4, 5, 6, 8, 10, 12)]
+    assert quality == sorted(quality, reverse=True)
+    assert psnr(image, encode_8bit(image, mask).decoded) > psnr(image, encode_bc7(image, mask).decoded)
+    low, high = (psnr(image, encode_astc(image, mask, 12, quality=q).decoded) for q in (0.0, 98.0))
+    assert low < high
+    low, high = (psnr(image, encode_bc6h(image, mask, profile).decoded) for profile in ("veryfast", "slow"))
+    assert low < high
+
+
+def test_a_range_for_each_tile():
+    """A dim tile beside a bright one: with one scale for both its levels would be 70 times as coarse."""
+    image = np.concatenate([1e-4 * smooth_light(128, 128), smooth_light(128, 128)], axis=1)
+    mask = np.ones((128, 256), bool)
+    for encode in (encode_8bit, encode_bc7, lambda *args: encode_astc(*args, 6, profile="ldr")):
+        result = encode(image, mask)
+        dim, bright = (psnr(image[:, side], result.decoded[:, side]) for side in (slice(0, 128), slice(128, 256)))
+        assert dim == pytest.approx(bright, abs=0.6)
+
+
+def test_ldr_is_not_stopped_at_the_presets_decibels():
+    """Smooth light in 12x12 blocks: with astcenc's own limit the search ends early."""
+    image, mask = smooth_light(), np.ones((120, 120), bool)
+    free = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
+    config = astc_encoder.ASTCConfig(astc_encoder.ASTCProfile.LDR, 12, 12, 1, hdr_blocks.ASTC_THOROUGH)
+    hdr_blocks._astc.cache_clear()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(hdr_blocks, "_NO_LIMIT_DB", config.tune_db_limit)
+        stopped = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
+    hdr_blocks._astc.cache_clear()
+    assert stopped < free - 1.0, (stopped, config.tune_db_limit)
+
+
+def test_astc_takes_the_better_profile():
+    mask = np.ones((48, 48), bool)
+    assert encode_astc(smooth_light(48, 48), mask).option == "LDR"
+    # A ramp over four decades: HDR's interpolation is nearly logarithmic.
+    ramp = np.broadcast_to(10.0 ** (np.arange(48) / 12.0), (48, 48))[..., None] * [1.0, 0.8, 0.5]
+    rivals = {profile: encode_astc(ramp, mask, profile=profile) for profile in ("ldr", "hdr", "best")}
+    quality = {profile: psnr(ramp, rival.decoded) for profile, rival in rivals.items()}
+    assert rivals["best"].option == "HDR" and quality["best"] == quality["hdr"] > quality["ldr"] + 1.0
+
+
+def test_optimised_for_rate():
+    """More loss, fewer bytes on disk, as many in memory; the added error is what was allowed."""
+    image = smooth_light() * (1.0 + 0.01 * np.random.default_rng(0).standard_normal((120, 120, 3)))
+    mask = np.ones((120, 120), bool)
+    for encode in (encode_bc7, encode_bc6h):
+        rivals = [encode(image, mask, loss=loss) for loss in (0.0, 0.5, 1.0, 4.0)]
+        sizes = [rival.disk_bytes for rival in rivals]
+        assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.5 * sizes[0]
+        assert len({rival.bytes for rival in rivals}) == 1
+        codes = [rival.decoded.astype(np.float64) ** (1.0 / 2.2) for rival in rivals]
+        wanted, span = image ** (1.0 / 2.2), np.ptp(image ** (1.0 / 2.2), axis=(0, 1))
+        plain, *others = (np.mean(np.square((code - wanted) / span * 255.0)) for code in codes)
+        for loss, error in zip((0.5, 1.0, 4.0), others, strict=True):
+            assert error <= plain + 1.02 * loss**2
+    with pytest.raises(WlmError, match="loss from 0 to 255, got -1"):
+        encode_bc7(image, mask, loss=-1.0)
+    with pytest.raises(WlmError, match="loss from 0 to 255, got nan"):
+        encode_bc6h(image, mask, loss=np.nan)
+
+
+def test_eight_bits_by_hand():
+    image = np.zeros((1, 3, 3), np.float32)
+    image[0, 1], image[0, 2] = 1.0, 5.0
+    decoded = encode_8bit(image, np.ones((1, 3))).decoded
+    nearest = np.float16(5.0 ** (1.0 / 2.2))
+    assert float(nearest) < 5.0 ** (1.0 / 2.2)
+    high = float(np.nextafter(nearest, np.float16(9.0)))
+    levels = np.floor(np.array([0.0, 1.0, 5.0]) ** (1.0 / 2.2) / high * 255.0 + 0.5)
+    np.testing.assert_allclose(decoded[0, :, 0], (levels / 255.0 * high) ** 2.2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_gaps_are_filled_before_encoding(name):
+    """Whatever lies outside the mask, even NaN, the valid texels come out the same, and their ring is like them."""
+    image = smooth_light(48, 48)
+    mask = np.ones((48, 48), bool)
+    mask[7:30, 18:35] = False
+    zeros, garbage = image.copy(), image.copy()
+    zeros[~mask] = 0.0
+    garbage[~mask] = np.nan
+    garbage[8, 20] = 1e30
+    a, b = BLOCKS[name](zeros, mask), BLOCKS[name](garbage, mask)
+    np.testing.assert_array_equal(a.decoded, b.decoded)
+    assert psnr(image, a.decoded, mask) > FLOOR[name] - 12.0
+    # The rows below the edge, away from the corners; one where blocks are repeated.
+    rows = 1 if "rdo" in name else 2
+    np.testing.assert_allclose(a.decoded[7 : 7 + rows, 21:32], np.stack([image[6, 21:32]] * rows), atol=0.25)
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_blocks_that_nobody_sees_cost_nothing_on_disk(name):
+    noise = np.random.default_rng(0).uniform(0.1, 1.0, (96, 96, 3))
+    mask = np.zeros((96, 96), bool)
+    mask[:24, :24] = True
+    result = BLOCKS[name](noise, mask)
+    assert result.bytes >= BITS[name] / 8 * 96 * 96 and result.disk_bytes < 0.25 * result.bytes
+    if "rdo" not in name:  # there they repeat any others
+        assert not np.ptp(result.decoded[48:, 48:], axis=(0, 1)).any()
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.parametrize("shape", [(130, 70), (1, 1), (5, 3)])
+def test_sizes_that_no_block_divides(name, shape):
+    image = smooth_light(130, 70)[: shape[0], : shape[1]]
+    result = BLOCKS[name](image, np.ones(shape, bool))
+    assert result.decoded.shape == image.shape
+    np.testing.assert_allclose(result.decoded, image, atol=0.25)
+    assert result.bytes * 8 >= BITS[name] * image[..., 0].size - 1e-9  # padding is paid for
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_empty_mask_one_texel_black_and_constant(name):
+    encode = BLOCKS[name]
+    image = np.full((16, 16, 3), np.nan, np.float32)
+    empty = np.zeros((16, 16), bool)
+    assert not encode(image, empty).decoded.any()
+    one = empty.copy()
+    one[3, 4] = True
+    image[3, 4] = [3.0, 2.0, 1.0]
+    np.testing.assert_allclose(encode(image, one).decoded[3, 4], [3.0, 2.0, 1.0], rtol=0.03)
+    assert not encode(np.zeros((16, 16, 3)), ~empty).decoded.any()
+    np.testing.assert_allclose(encode(np.full((16, 16, 3), 0.7), ~empty).decoded, 0.7, rtol=0.01)
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_the_ends_of_half_floats_range(name):
+    mask = np.ones((24, 24), bool)
+    bright = np.full((24, 24, 3), 60000.0)
+    np.testing.assert_allclose(BLOCKS[name](bright, mask).decoded, 60000.0, rtol=0.01)
+    decoded = BLOCKS[name](bright * 1e6, mask).decoded  # becomes 65,504, not infinity
+    np.testing.assert_allclose(decoded, 65504.0, rtol=0.01)
+    assert not BLOCKS[name](np.full((24, 24, 3), -5.0), mask).decoded.any()
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_firefly_leaves_the_other_tile_alone(name):
+    image, mask = smooth_light(24, 256), np.ones((24, 256), bool)
+    image[12, 30] = 1e4
+    decoded = BLOCKS[name](image, mask).decoded
+    assert decoded[12, 30].min() > 5e3
+    np.testing.assert_allclose(decoded[:, 132:], image[:, 132:], atol=0.2)  # past a block over the border
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_bad_valid_texels_are_refused(name, value):
+    image = smooth_light(16, 16)
+    image[3, 3, 1] = value
+    with pytest.raises(WlmError, match="NaN or infinite"):
+        BLOCKS[name](image, np.ones((16, 16), bool))
+
+
+def test_shapes_and_settings_are_checked():
+    image, mask = smooth_light(16, 16), np.ones((16, 16), bool)
+    for bad in (image[..., :2], image[..., 0], np.zeros((0, 16, 3))):
+        with pytest.raises(WlmError, match=r"\[..., H, W, 3\]"):
+            encode_bc6h(bad, np.ones(bad.shape[:2], bool))
+    with pytest.raises(WlmError, match="mask"):
+        encode_8bit(image, mask[:8])
+    with pytest.raises(WlmError, match="'best'"):
+        encode_bc6h(image, mask, profile="best")
+    with pytest.raises(WlmError, match="'best'"):
+        encode_bc7(image, mask, profile="best")
+    with pytest.raises(WlmError, match="got 7"):
+        encode_astc(image, mask, block=7)
+    with pytest.raises(WlmError, match="quality"):
+        encode_astc(image, mask, quality=101.0)
+    with pytest.raises(WlmError, match="'sdr'"):
+        encode_astc(image, mask, profile="sdr")
+
+
+@pytest.mark.parametrize("profile", ["ldr", "hdr"])
+def test_a_reused_astc_context_forgets_the_last_lightmap(profile):
+    mask = np.ones((36, 36), bool)
+    first = encode_astc(smooth_light(36, 36), mask, profile=profile)
+    encode_astc(1000.0 * smooth_light(36, 36)[::-1], mask, profile=profile)
+    again = encode_astc(smooth_light(36, 36), mask, profile=profile)
+    np.testing.assert_array_equal(first.decoded, again.decoded)
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [("bc6h", "ispc_texcomp"), ("bc7", "imagecodecs"), ("astc12", "astc_encoder"), ("8bit", "imagecodecs")],
+)
+def test_a_missing_package_names_the_extra(name, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
+    with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
+        BLOCKS[name](smooth_light(16, 16), np.ones((16, 16), bool))
+
+
+def test_bc7_is_decoded_as_another_decoder_does(monkeypatch):
+    """imagecodecs against texture2ddecoder, on the very blocks that were encoded."""
+    calls = []
+    original = imagecodecs.bcn_decode
+
+    def spy(data, *args, **kwargs):
+        texels = original(data, *args, **kwargs)
+        calls.append((builtins.bytes(data), texels))
+        return texels
+
+    monkeypatch.setattr(imagecodecs, "bcn_decode", spy)
+    encode_bc7(smooth_light(32, 48), np.ones((32, 48), bool))
+    data, texels = calls[0]
+    bgra = np.frombuffer(texture2ddecoder.decode_bc7(data, 48, 32), np.uint8).reshape(32, 48, 4)
+    np.testing.assert_array_equal(texels[..., :3], bgra[..., 2::-1])
+
+
+def test_ldr_astc_is_decoded_as_another_decoder_does():
+    """astcenc at 16 bits against texture2ddecoder's 8."""
+    codec = hdr_blocks.astc((6, 6), 60.0, "baselines", ldr=True)
+    levels = smooth_light(36, 48) / 5.0
+    data = codec.encode(levels.astype(np.float16))
+    texels = codec.decode(data, 36, 48).astype(np.float32)
+    bgra = np.frombuffer(texture2ddecoder.decode_astc(data, 48, 36, 6, 6), np.uint8).reshape(36, 48, 4)
+    np.testing.assert_allclose(texels, bgra[..., 2::-1] / 255.0, atol=1.0 / 255.0)
+    np.testing.assert_allclose(texels, levels, atol=0.03)

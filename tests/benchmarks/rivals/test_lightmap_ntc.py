@@ -1,0 +1,145 @@
+"""The neural texture codec on small sets with known answers."""
+
+import numpy as np
+import pytest
+from builders.small_sets import moving_light
+
+from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, evaluate_rivals, usual
+from benchmarks.rivals.lightmap_ntc import LADDER, Latents, encode_ntc
+from wlm.errors import WlmError
+from wlm.lightmap.data import from_arrays
+from wlm.metrics import psnr_from_mse
+
+SMALL = Latents(2, 4, 4, 4)
+NETWORK = 28 * 64 + 64 + 64 * 64 + 64  # weights and biases of two layers, of 4 * 4 + 4 + 8 inputs
+
+
+def encode(frames: np.ndarray, mask: np.ndarray | None = None, latents=SMALL, steps: int = 150, **options):
+    mask = np.ones(frames.shape[1:3], bool) if mask is None else mask
+    return encode_ntc(frames, mask, latents, steps=steps, samples=256, **options)
+
+
+def psnr(frames: np.ndarray, decoded: np.ndarray) -> float:
+    """Of all hours together."""
+    return psnr_from_mse(float(np.mean(np.square(frames - decoded))), float(np.ptp(frames)))
+
+
+def bytes_of(height: int, width: int, times: int, latents: Latents = SMALL) -> int:
+    """Latents at their bits, the network in halves, and half ranges of one tile."""
+    grids = [(-(-height // step) + 1) * (-(-width // step) + 1) for step in (latents.fine_step, latents.coarse_step)]
+    latent = (grids[0] * latents.fine + 1) // 2 + grids[1] * latents.coarse
+    return latent + 2 * (NETWORK + 65 * 3 * times) + 12
+
+
+def test_a_day_comes_back():
+    frames = moving_light(40, 60).frames
+    short, long = encode(frames, steps=20), encode(frames, steps=300)
+    assert short.name == "ntc-latents" and short.decoded.dtype == np.float32
+    mean = np.broadcast_to(frames.mean((1, 2), keepdims=True), frames.shape)
+    assert psnr(frames, mean) < psnr(frames, short.decoded) < psnr(frames, long.decoded) - 3.0
+    assert psnr(frames, long.decoded) > 28.0
+    assert long.bytes == bytes_of(40, 60, 5) and 0 < long.disk_bytes <= long.bytes
+    assert "6 bits of latents a texel, 300 steps on cpu" in long.option
+
+
+def test_one_seed_gives_one_result():
+    frames = moving_light(24, 24).frames
+    a, b, c = (encode(frames, steps=20, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a.decoded, b.decoded)
+    assert not np.array_equal(a.decoded, c.decoded)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (3, 5, 3), (2, 3, 131)])
+def test_sizes(shape):
+    frames = moving_light(*shape[1:], hours=tuple(range(shape[0]))).frames
+    rival = encode(frames)
+    assert rival.decoded.shape == frames.shape
+    assert psnr(frames, rival.decoded) > 12.0
+    assert rival.bytes == bytes_of(*shape[1:], shape[0]) + 12 * (shape[2] > 128)
+
+
+def test_empty_black_and_constant():
+    all_of = np.ones((8, 8), bool)
+    nothing = encode(np.full((2, 8, 8, 3), np.nan), ~all_of)
+    assert not nothing.decoded.any() and nothing.bytes == 12
+    assert not encode(np.zeros((2, 8, 8, 3)), steps=10).decoded.any()
+    np.testing.assert_allclose(encode(np.full((2, 8, 8, 3), 0.7), steps=10).decoded, 0.7, rtol=0.01)
+
+
+def test_what_lies_in_the_gaps_changes_nothing():
+    frames, mask = moving_light(24, 40).frames, np.ones((24, 40), bool)
+    mask[7:20, 10:35] = False
+    zeros, garbage = frames.copy(), frames.copy()
+    zeros[:, ~mask] = 0.0
+    garbage[:, ~mask] = np.nan
+    a, b = (encode(given, mask, steps=300) for given in (zeros, garbage))
+    np.testing.assert_array_equal(a.decoded, b.decoded)
+    # The ring that a filtered read reaches is like the texels beside it; beyond it nothing is stored.
+    np.testing.assert_allclose(a.decoded[:, 7, 12:33], frames[:, 6, 12:33], atol=0.25 * frames.max())
+    assert not np.ptp(a.decoded[:, 9:18, 12:33], axis=(1, 2)).any()
+    part, full = encode(zeros, mask, steps=2), encode(frames, steps=2)
+    assert part.bytes == full.bytes and part.disk_bytes < full.disk_bytes
+
+
+def test_a_network_for_each_region(monkeypatch):
+    frames = moving_light(20, 40).frames
+    whole = encode(frames, steps=20)
+    monkeypatch.setattr("benchmarks.rivals.lightmap_ntc.NETWORK_TEXELS", 20)
+    halves = encode(frames, steps=20)
+    networks = 2 * (NETWORK + 65 * 15)
+    assert whole.bytes == bytes_of(20, 40, 5) and halves.bytes == 2 * bytes_of(20, 20, 5) - 12
+    assert halves.bytes - whole.bytes > 0.9 * networks
+    alone = encode(frames[:, :, :20], steps=20)
+    # The first half is fitted as it would be alone, but for the ranges of the tile.
+    assert abs(psnr(frames[:, :, :20], halves.decoded[:, :, :20]) - psnr(frames[:, :, :20], alone.decoded)) < 2.0
+
+
+def test_more_latents_are_better_and_larger():
+    noise = np.random.default_rng(0).uniform(0.1, 1.0, (4, 32, 32, 3))
+    rivals = [encode(noise, latents=latents, steps=200) for latents in (Latents(4, 2, 8, 2), Latents(2, 16, 4, 16))]
+    quality = [psnr(noise, rival.decoded) for rival in rivals]
+    assert quality[0] + 2.0 < quality[1] and rivals[0].bytes < rivals[1].bytes
+    bits = [latents.bits for latents in LADDER.values()]
+    assert bits == sorted(bits) and 0.25 < bits[0] / 26 < 0.4 and 1.5 < bits[-1] / 26 < 3.0
+
+
+def test_ranges_are_of_tiles():
+    """A dark tile beside a bright one is as good, relative to its own light."""
+    frames = moving_light(16, 256, hours=(0.0, 12.0)).frames.copy()
+    frames[:, :, 128:] *= 1e-3
+    decoded = encode(frames, steps=300).decoded
+    bright, dark = psnr(frames[:, :, :128], decoded[:, :, :128]), psnr(frames[:, :, 128:], decoded[:, :, 128:])
+    assert abs(bright - dark) < 4.0 and dark > 20.0
+
+
+def test_it_is_a_method_that_takes_a_device(monkeypatch):
+    moving = moving_light(24, 24)
+    names = [name for name, method in RIVALS.items() if method.fitted]
+    assert names == [f"ntc-{name}" for name in LADDER]
+    assert usual("cpu", quick=True) == FEW and usual("cuda:0", quick=True) == (*FEW, "ntc-medium")
+    assert set(usual("cuda:0")) - set(usual("cpu")) == set(names) and usual("cuda:0") == tuple(RIVALS)
+    calls = []
+
+    def fake(frames, mask, **options):
+        calls.append(options)
+        return encode(frames, mask, steps=2)
+
+    method = RIVALS["ntc-medium"]
+    monkeypatch.setitem(RIVALS, "ntc-medium", type(method)("NTC", "medium", fake, alone=False, fitted=True))
+    rival, visits = encode_set("ntc-medium", moving, lambda i, decoded: decoded.shape, [1, 3], device="cuda:1")
+    assert calls == [{"device": "cuda:1"}] and visits == [(24, 24, 3)] * 2 and rival.decoded is None
+
+
+def test_settings_are_checked():
+    frames = moving_light(8, 8).frames
+    bad = frames.copy()
+    bad[1, 3, 3, 1] = np.nan
+    for call, words in (
+        (lambda: encode(frames, latents="huge"), "unknown latents 'huge', expected one of low, medium"),
+        (lambda: encode(frames, steps=0), "at least 1 step and 1 sample, got 0 and 256"),
+        (lambda: encode(frames, device="tpu"), "device 'tpu'"),
+        (lambda: encode(bad), "NaN or infinite"),
+        (lambda: evaluate_rivals(None, from_arrays(frames, moving_light(8, 8).times), (), device="tpu"), "'tpu'"),
+    ):
+        with pytest.raises(WlmError, match=words):
+            call()

@@ -1,0 +1,192 @@
+"""Temporal PCA and the video codec on small sets with known answers."""
+
+import sys
+
+import imagecodecs
+import numpy as np
+import pytest
+import texture2ddecoder
+from builders.lightmaps import smooth_light
+
+from benchmarks.rivals.lightmap import RIVALS
+from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
+from benchmarks.rivals.lightmap_video import encode_av1
+from wlm.errors import WlmError
+from wlm.metrics import psnr_from_mse
+from wlm.texels import fill_smoothly
+
+# One of each kind; the rest differ in a number.
+KINDS = ("pca-bc4-4", "pca-0.04", "av1-85", "av1-85-hour")
+
+
+def day(height=72, width=140, hours=5, seed=0) -> np.ndarray:
+    """Lights of three kinds, each with a rhythm of its own, and a little noise; over one tile's edge."""
+    light = smooth_light(height, width)
+    lights = np.stack([light, light[::-1], light[:, ::-1] ** 2])
+    share = 1.0 + np.sin(np.arange(hours)[:, None] * [1.0, 2.0, 0.7])
+    noise = np.random.default_rng(seed).normal(1.0, 0.01, (hours, height, width, 3))
+    return (np.einsum("tk,khwc->thwc", share, lights) * noise).astype(np.float32)
+
+
+def psnr(frames: np.ndarray, decoded: np.ndarray) -> float:
+    """Of all hours together."""
+    return psnr_from_mse(float(np.mean(np.square(frames - decoded))), float(np.ptp(frames)))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_day_comes_back(name):
+    frames = day()
+    rival = RIVALS[name].encode(frames, np.ones((72, 140), bool))
+    assert rival.name == name and rival.decoded.dtype == np.float32
+    assert psnr(frames, rival.decoded) > 36.0
+    assert 0 < rival.disk_bytes <= rival.bytes < frames.nbytes / 4
+    assert rival.encode_seconds > 0.0 and rival.decode_seconds > 0.0
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (1, 5, 3), (3, 5, 3), (2, 3, 131)])
+def test_sizes(name, shape):
+    frames = day(*shape[1:], hours=shape[0])
+    decoded = RIVALS[name].encode(frames, np.ones(shape[1:], bool)).decoded
+    assert decoded.shape == frames.shape
+    np.testing.assert_allclose(decoded, frames, atol=0.05 * frames.max())
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_what_lies_in_the_gaps_changes_nothing(name):
+    frames, mask = day(24, 40), np.ones((24, 40), bool)
+    mask[7:20, 18:35] = False
+    zeros, garbage = frames.copy(), frames.copy()
+    zeros[:, ~mask] = 0.0
+    garbage[:, ~mask] = np.nan
+    a, b = (RIVALS[name].encode(given, mask) for given in (zeros, garbage))
+    np.testing.assert_array_equal(a.decoded, b.decoded)
+    # The ring that a filtered read reaches is like the texels beside it.
+    np.testing.assert_allclose(a.decoded[:, 7, 20:33], frames[:, 6, 20:33], atol=0.12 * frames.max())
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_empty_black_constant_and_one_texel(name):
+    encode, all_of = RIVALS[name].encode, np.ones((16, 16), bool)
+    nothing = np.full((2, 16, 16, 3), np.nan)
+    assert not encode(nothing, ~all_of).decoded.any()
+    assert not encode(np.zeros((2, 16, 16, 3)), all_of).decoded.any()
+    np.testing.assert_allclose(encode(np.full((2, 16, 16, 3), 0.7), all_of).decoded, 0.7, rtol=0.01)
+    one = ~all_of
+    one[3, 4] = True
+    nothing[:, 3, 4] = [[3.0, 2.0, 1.0], [0.3, 0.2, 0.1]]
+    np.testing.assert_allclose(encode(nothing, one).decoded[:, 3, 4], nothing[:, 3, 4], rtol=0.03, atol=0.02)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_firefly_stays_and_leaves_the_other_tile_alone(name):
+    frames = day(40, 256)
+    quiet = RIVALS[name].encode(frames, np.ones((40, 256), bool)).decoded
+    frames[2, 20, 30] = 1e4
+    decoded = RIVALS[name].encode(frames, np.ones((40, 256), bool)).decoded
+    assert decoded[2, 20, 30].min() > 3e3
+    assert psnr(frames[:, :, 144:], decoded[:, :, 144:]) > psnr(frames[:, :, 144:], quiet[:, :, 144:]) - 3.0
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_bad_valid_texels_are_refused(name, value):
+    frames = day(16, 16)
+    frames[1, 3, 3, 1] = value
+    with pytest.raises(WlmError, match="NaN or infinite"):
+        RIVALS[name].encode(frames, np.ones((16, 16), bool))
+
+
+def test_pca_of_three_lights_needs_three_components():
+    """In codes lights don't add up: one light in two strengths is one component, and the levels are its own."""
+    light = smooth_light(64, 64)
+    frames = np.stack([light, 0.5 * light, 0.1 * light])
+    mask = np.ones((64, 64), bool)
+    rival = encode_pca(frames, mask, step=0.02)
+    # A byte a texel; then mean and axis of 9 halves, two floats a map, and 12 bytes of ranges.
+    assert rival.bytes == 64 * 64 + 18 + 18 + 8 + 12
+    assert psnr(frames, rival.decoded) > 45.0
+    blocks = encode_pca_bc4(frames, mask, components=1)
+    assert blocks.bytes == 64 * 64 // 2 + 18 + 18 + 8 + 12
+    assert psnr(frames, blocks.decoded) > 42.0
+
+
+def test_more_components_and_finer_steps_are_better():
+    frames, mask = day(), np.ones((72, 140), bool)
+    by_count = [encode_pca_bc4(frames, mask, count) for count in (1, 2, 4, 15)]
+    by_step = [encode_pca(frames, mask, step) for step in (0.16, 0.08, 0.04, 0.02)]
+    for rivals in (by_count, by_step):
+        quality = [psnr(frames, rival.decoded) for rival in rivals]
+        assert quality == sorted(quality) and quality[-1] > quality[0] + 10.0
+        assert [rival.disk_bytes for rival in rivals] == sorted(rival.disk_bytes for rival in rivals)
+    # 5 hours of 3 channels have 15 components, and no more.
+    assert encode_pca_bc4(frames, mask, 99).bytes == by_count[-1].bytes
+
+
+def test_better_video_is_larger():
+    frames, mask = day(), np.ones((72, 140), bool)
+    rivals = [encode_av1(frames, mask, quality) for quality in (30, 60, 90)]
+    quality = [psnr(frames, rival.decoded) for rival in rivals]
+    assert quality == sorted(quality) and [r.bytes for r in rivals] == sorted(r.bytes for r in rivals)
+    # The hours follow from each other: without loss, four more that are alike add little.
+    still = np.stack([frames[0]] * 5)
+    assert encode_av1(still, mask, 100).bytes < 1.2 * encode_av1(still[:1], mask, 100).bytes
+
+
+def test_a_range_by_hour_saves_a_dark_hour():
+    frames, mask = day(hours=2), np.ones((72, 140), bool)
+    frames[1] *= 1e-4
+    dark = [psnr(frames[1], encode_av1(frames, mask, 85, ranges).decoded[1]) for ranges in ("day", "hour")]
+    assert dark[1] > dark[0] + 5.0
+
+
+def test_bc4_is_decoded_as_another_decoder_does(monkeypatch):
+    calls = []
+    original = imagecodecs.bcn_decode
+
+    def spy(data, *args, **kwargs):
+        calls.append((bytes(data), original(data, *args, **kwargs)))
+        return calls[-1][1]
+
+    monkeypatch.setattr(imagecodecs, "bcn_decode", spy)
+    encode_pca_bc4(day(24, 32), np.ones((24, 32), bool), 2)
+    assert len(calls) == 2
+    for data, texels in calls:
+        bgra = np.frombuffer(texture2ddecoder.decode_bc4(data, 32, 24), np.uint8).reshape(24, 32, 4)
+        np.testing.assert_allclose(texels.astype(int), bgra[..., 2].astype(int), atol=1)  # rounding is theirs
+        assert np.ptp(texels) > 100
+
+
+def test_gaps_are_filled_smoothly():
+    image, mask = smooth_light(37, 50), np.ones((37, 50), bool)
+    mask[5:30, 5:45] = False
+    filled = fill_smoothly(np.where(mask[..., None], image, np.float32(np.nan)), mask)
+    np.testing.assert_array_equal(filled[mask], image[mask])
+    # Means of what is round them.
+    gap = filled[~mask]
+    assert image[mask].min() <= gap.min() and gap.max() <= image[mask].max() + 1e-5
+    assert np.abs(np.diff(filled[17, 5:45], axis=0)).mean() < 0.1
+    assert not fill_smoothly(image, np.zeros((37, 50), bool)).any()
+
+
+def test_settings_are_checked():
+    frames, mask = day(8, 8), np.ones((8, 8), bool)
+    for call, words in (
+        (lambda: encode_pca_bc4(frames, mask, 0), "at least 1 component, got 0"),
+        (lambda: encode_pca(frames, mask, 0.0), "step above 0, got 0"),
+        (lambda: encode_pca(frames, mask, np.nan), "step above 0, got nan"),
+        (lambda: encode_av1(frames, mask, 101), "quality from 0 to 100, got 101"),
+        (lambda: encode_av1(frames, mask, ranges="week"), "'week', expected one of day, hour"),
+        (lambda: encode_av1(frames, mask, speed=11), "speed from 0 to 10, got 11"),
+        (lambda: encode_av1(frames[..., :2], mask), r"lightmaps \[..., H, W, 3\]"),
+        (lambda: encode_pca(frames, mask[:4]), "mask"),
+    ):
+        with pytest.raises(WlmError, match=words):
+            call()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_missing_package_names_the_extra(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)  # makes the import fail
+    with pytest.raises(WlmError, match=r"imagecodecs is missing.*wlm\[baselines\]"):
+        RIVALS[name].encode(day(8, 8), np.ones((8, 8), bool))

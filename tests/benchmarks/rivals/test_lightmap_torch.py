@@ -1,0 +1,144 @@
+"""The plain torch peer: it fits what the kernels fit, and its maps can be others."""
+
+import numpy as np
+import pytest
+import torch
+from builders.small_sets import moving_light, tiny_profile
+
+from benchmarks.lightmap_ablation import VARIANTS
+from benchmarks.rivals.lightmap_torch import Features, PlainFit, through_bc7
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.exact import decode_tile64
+from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.trainer import Trainer
+
+HOURS = [0.0, 6.0, 12.0, 18.0]
+
+
+def band(steps: int):
+    """A bright band that moves over a tile during the day, and settings of a short fit."""
+    x = np.linspace(0.0, 1.0, 128)
+    frames = [np.exp(-40.0 * (x - hour / 24.0) ** 2)[None, :, None] + 0.1 * x[:, None, None] for hour in HOURS]
+    frames = np.stack([np.repeat(f, 3, 2) + 0.05 for f in frames]).astype(np.float32)
+    sizes = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 4}
+    profile = Profile(name="tiny", **sizes, metric_weight=0.0, steps=steps, samples=256)
+    return from_arrays(frames, HOURS, period=24.0), profile
+
+
+def plain_fit(lightmaps, profile, features: Features | None = None, seed: int = 0) -> PlainFit:
+    axis = TimeAxis(lightmaps.times, lightmaps.period, profile.time_axis)
+    return PlainFit(profile, axis, dynamic_targets(lightmaps, profile), features, seed=seed)
+
+
+def losses(steps: int, seed: int, count: int) -> np.ndarray:
+    fit = plain_fit(*band(steps), seed=seed)
+    return np.array([float(fit.step()) for _ in range(count)])
+
+
+def test_loss_falls_and_repeats():
+    first = losses(60, 3, 60)
+    # The targets have variance 1: a network that knows nothing loses about as much.
+    assert 0.5 < first[0] < 3.0 and first[-10:].mean() < 0.1
+    np.testing.assert_array_equal(losses(60, 3, 5), first[:5])
+    assert not np.array_equal(losses(60, 4, 5), first[:5])
+
+
+def put_into_trainer(fit: PlainFit, trainer: Trainer) -> None:
+    """Copies the parameters of a hybrid fit."""
+    *maps, w1, b1, w2, b2, w3, b3 = (values.detach() for values in fit.parameters)
+    maps[4:] = (plane.movedim(1, -1) for plane in maps[4:])
+    names = ("uv_endpoints", "uv_weights", "uvt_endpoints", "uvt_weights", "ut", "vt")
+    for name, values in zip(names, maps, strict=True):
+        trainer.views[name].copy_(values.reshape(trainer.views[name].shape))
+    with torch.no_grad():
+        trainer.hidden.copy_(torch.cat([w1, b1, w2, b2], 2).transpose(1, 2))
+        trainer.output.copy_(torch.cat([w3, b3], 2).transpose(1, 2))
+
+
+def test_what_it_decodes_to_is_what_the_product_decodes():
+    """Sampling, wrapping at midnight, levels, network and scales, against the float64 decode of the same parameters."""
+    lightmaps, profile = moving_light(128, 256), tiny_profile(gelu="exact")
+    fit = plain_fit(lightmaps, profile)
+    for _ in range(profile.steps):
+        fit.step()
+    decoded = fit.decode()
+    assert decoded.shape == (2, len(lightmaps.times), 128, 128, 3)
+    model = compress(lightmaps, profile)
+    trainer = Trainer(profile, model.axis, dynamic_targets(lightmaps, profile), True, 0, "cpu")
+    put_into_trainer(fit, trainer)
+    for name, values in trainer.quantised().items():
+        setattr(model, name, values)
+    trainer.close()
+    assert fit.tile_bytes * 2 == sum(value.nbytes for value in model.parts.values()) - model.kind.nbytes
+    for tile, k in ((0, 0), (1, 4)):
+        exact = decode_tile64(model, tile, lightmaps.times[k])
+        np.testing.assert_allclose(decoded[tile, k], exact, rtol=1e-4, atol=1e-4)
+
+
+def test_its_loss_is_that_of_the_kernels():
+    """The mean over many samples; both weight texels half-way to the metric."""
+    lightmaps = moving_light(128, 128)
+    profile = tiny_profile(samples=16384, steps=10, map_rate=1e-12, net_rate=1e-12)
+    fit, targets = plain_fit(lightmaps, profile), dynamic_targets(lightmaps, profile)
+    trainer = Trainer(profile, TimeAxis(lightmaps.times, 24.0, "frames"), targets, True, 0, "cpu")
+    put_into_trainer(fit, trainer)
+    trainer.run(1)
+    theirs = 50.0 * float(trainer.losses()[0])  # a running mean that begins at 0
+    trainer.close()
+    assert float(fit.step()) == pytest.approx(theirs, rel=0.05)
+
+
+def patch(frames: np.ndarray, steps: int):
+    """A set with some valid texels in a tile's corner, which few samples suffice for."""
+    mask = np.zeros((128, 128), bool)
+    mask[:32, :32] = True
+    profile = tiny_profile(steps=steps, samples=256, metric_weight=0.0)
+    return from_arrays(frames.astype(np.float32), HOURS, mask, 24.0), profile
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_each_variant_learns_and_ends_on_its_levels(name):
+    lightmaps, profile = patch(moving_light(128, 128, HOURS).frames, 120)
+    fit = plain_fit(lightmaps, profile, VARIANTS[name])
+    first = float(fit.step())
+    for _ in range(113):
+        fit.step()
+    maps = [values.detach().clone() for values in fit.parameters[:-6]]
+    last = np.mean([float(fit.step()) for _ in range(6)])
+    # A rough wall: F_uvt alone learns its light.
+    assert last < (0.8 if name == "3D alone" else 0.4) * first
+    # Frozen for the last twentieth.
+    assert all(torch.equal(a, b.detach()) for a, b in zip(maps, fit.parameters, strict=False))
+    wrong = (fit.decode()[0] - lightmaps.frames)[:, lightmaps.mask]
+    assert np.sqrt(np.mean(wrong**2)) < 0.8 * lightmaps.frames[:, lightmaps.mask].std()
+
+
+def test_variants_take_about_the_same_bytes():
+    sizes = {name: features.bytes for name, features in VARIANTS.items()}
+    assert sizes["hybrid"] == sizes["tri-plane"] == sizes["no block simulation"] == 34816
+    assert sizes["3D alone"] == 34560 and sizes["2D alone"] == 32768
+    assert sizes["8 channels of F_uv"] == 45056  # table 8: 0.86 bits a texel beside 0.67
+    assert [features.inputs for features in VARIANTS.values()] == [16, 12, 8, 20, 16, 16]
+    assert Features.of(Profile.load("M")) == VARIANTS["hybrid"]
+
+
+def test_texels_need_maps_of_their_size():
+    """Stripes of single texels that swap during the day: F_uv tells them apart, F_uvt alone doesn't."""
+    stripes = (np.arange(128) % 2)[None, :, None] * np.ones((128, 1, 3))
+    light = np.stack([share * stripes + (1.0 - share) * (1.0 - stripes) + 0.1 for share in (0.0, 0.2, 1.0, 0.6)])
+    errors = {}
+    for name in ("hybrid", "3D alone"):
+        fit = plain_fit(*patch(light, 200), VARIANTS[name])
+        errors[name] = np.mean([float(fit.step()) for _ in range(200)][-10:])
+    assert errors["hybrid"] < 0.3 * errors["3D alone"]
+
+
+def test_bc7_of_free_texels():
+    """Texels of one line come back; noise, which no block holds, doesn't."""
+    ramp = torch.linspace(0.0, 1.0, 16).reshape(1, 1, 16, 1) * torch.tensor([1.0, 0.5, 0.25, 1.0])
+    line = ramp.expand(2, 8, 16, 4)
+    assert (through_bc7(line) - line).abs().max() < 0.02
+    noise = torch.rand(2, 8, 16, 4, generator=torch.Generator().manual_seed(0))
+    back = through_bc7(noise)
+    assert back.shape == noise.shape and 0.05 < (back - noise).abs().mean() < 0.3

@@ -1,0 +1,472 @@
+"""Baselines of probe compression: known answers, sizes, hard cases, and the search at a size."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from benchmarks.rivals import probe as baselines
+from benchmarks.rivals import probe_mbd, probe_pca
+from benchmarks.rivals.probe import (
+    RIVALS,
+    at_bytes,
+    block_pca,
+    clustered_pca,
+    global_pca,
+    moving_basis,
+    unreal_packing,
+    window_pca,
+)
+from wlm.errors import WlmError
+from wlm.probe.unreal import pack_unreal, unpack_unreal
+
+HALF = 2.0**-11  # relative error of a half float
+SIGNAL = functools.partial(clustered_pca, signal=True)
+# Each as (positions, values, components, parts, bits=...).
+METHODS = {
+    "global_pca": lambda position, values, components, parts, **more: global_pca(position, values, components, **more),
+    "block_pca": block_pca,
+    "window_pca": window_pca,
+    "clustered_pca": clustered_pca,
+    "clustered_pca_signal": SIGNAL,
+    "moving_basis": moving_basis,
+}
+# A grid of 3 cells has more corners than 8 blocks; every other method gets 8 parts.
+PARTS = {"moving_basis": 3}
+
+
+def _probes(count: int = 400, width: int = 12, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Makes probes in a flat room whose values bend with the place, every direction with some spread."""
+    random = np.random.default_rng(seed)
+    position = random.uniform((-2.0, 0.0, 5.0), (6.0, 1.0, 9.0), (count, 3))
+    phase = position @ random.normal(size=(3, 6)) * 0.5
+    values = np.concatenate([np.sin(phase), np.cos(phase)], 1) @ random.normal(size=(12, width))
+    return position, (values * 0.5 ** np.arange(width) + 0.01 * random.normal(size=(count, width))).astype(np.float32)
+
+
+def _error(values: np.ndarray, decoded: np.ndarray) -> float:
+    return float(np.square(values.astype(np.float64) - decoded).mean())
+
+
+def _make(name: str, position: np.ndarray, values: np.ndarray, components: int, **more: object):
+    return METHODS[name](position, values, components, PARTS.get(name, 8), **more)
+
+
+@pytest.mark.parametrize("width", [3, 12])
+@pytest.mark.parametrize("name", METHODS)
+def test_all_components_reproduce_the_values(name, width):
+    position, values = _probes(width=width)
+    result = _make(name, position, values, width)
+    assert result.name == name and result.decoded.dtype == np.float32 and result.decoded.shape == values.shape
+    # Weights reach a few times the largest value, and each component adds its own rounding.
+    np.testing.assert_allclose(result.decoded, values, rtol=0, atol=4 * HALF * np.abs(values).max())
+    assert result.encode_seconds > 0.0 and result.decode_seconds > 0.0
+
+
+@pytest.mark.parametrize("name", ["global_pca", "block_pca", "window_pca"])
+def test_weights_make_up_for_rounded_means_and_bases(name):
+    position, values = _probes()
+    result = _make(name, position, values, 12, bits=16)
+    np.testing.assert_allclose(result.decoded, values, rtol=0, atol=0.2 * HALF * np.abs(values).max())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_error_falls_with_components_and_bits(name):
+    position, values = _probes()
+    errors = [_error(values, _make(name, position, values, k).decoded) for k in (1, 2, 4, 8)]
+    assert errors == sorted(errors, reverse=True) and errors[-1] < 0.1 * errors[0]
+    rounded = [_make(name, position, values, 6, bits=bits) for bits in (3, 5, 8, 12, None)]
+    assert [result.bytes for result in rounded] == sorted(result.bytes for result in rounded)
+    errors = [_error(values, result.decoded) for result in rounded]
+    assert errors[0] > errors[1] > errors[2] >= errors[3] * 0.999
+    assert errors[3] == pytest.approx(errors[4], rel=0.05)
+
+
+def test_global_pca_is_a_truncated_svd():
+    position, values = _probes()
+    wide = values.astype(np.float64)
+    u, s, v = np.linalg.svd(wide - wide.mean(0), full_matrices=False)
+    for k in (1, 3, 12):
+        mean, basis = probe_pca.fit_subspaces(wide, [np.arange(len(wide))], k)
+        found = (wide - mean) @ basis[0].T @ basis[0] + mean
+        np.testing.assert_allclose(found, (u[:, :k] * s[:k]) @ v[:k] + wide.mean(0), atol=1e-9)
+    best = np.square(s[3:]).sum() / wide.size
+    assert best <= _error(values, global_pca(position, values, 3).decoded) < best * 1.001
+
+
+def test_sizes_by_hand():
+    position, values = _probes(count=101)
+    n, d, k = 101, 12, 3
+    assert global_pca(position, values, k).bytes == 14 + (k + 1) * d * 2 + n * k * 2
+    assert global_pca(position, values, k, bits=5).bytes == 14 + (k + 1) * d * 2 + k * 4 + -(-n * k * 5 // 8)
+    blocks = probe_pca.by_blocks(position, 8)[0].count
+    assert block_pca(position, values, k, 8).bytes == 14 + 8 + blocks * (k + 1) * d * 2 + n * k * 2
+    assert window_pca(position, values, k, 8).bytes == block_pca(position, values, k, 8).bytes
+    # A centre is 6 bytes; an index of one of 8 is 3 bits a probe.
+    assert clustered_pca(position, values, k, 8).bytes == 14 + 8 * (6 + (k + 1) * d * 2) + n * k * 2
+    assert SIGNAL(position, values, k, 8).bytes == 14 + -(-n * 3 // 8) + 8 * (k + 1) * d * 2 + n * k * 2
+    corners, cells = probe_mbd.grid_parts(position, 2)
+    expected = 13 + corners * (k + 1) * d * 2 + cells * k * 4 + -(-n * k * 8 // 8)
+    assert moving_basis(position, values, k, 2, bits=8).bytes == expected
+
+
+def test_grid_corners_by_hand():
+    # Two cells of 4 along x: the first probe lies on a corner, the second on the far face, between 4 corners.
+    assert probe_mbd.grid_parts(np.array([[0.0, 0, 0], [8, 1, 3]]), 2) == (1 + 4, 2)
+    # One more between all 8 of the second cell, of which 4 are taken already.
+    assert probe_mbd.grid_parts(np.array([[0.0, 0, 0], [8, 1, 3], [7, 1, 3]]), 2) == (1 + 4 + 4, 2)
+    assert probe_mbd.grid_parts(np.ones((5, 3)), 7) == (1, 1)
+
+
+@pytest.mark.parametrize("bits", [None, 8, 10])
+def test_bytes_and_positions_are_all_that_decoding_needs(bits):
+    position, values = _probes()
+    wide = values.astype(np.float64)
+    cut = [probe_pca.whole(position), probe_pca.by_blocks(position, 9)[0], probe_pca.by_place(position, 9, 1)]
+    for partition in (*cut, probe_pca.by_signal(wide, 9, 2, 1)):
+        payload = probe_pca.encode(wide, partition, 2, bits)
+        assert len(payload) == probe_pca.payload_bytes(partition.kind, 400, 12, 2, partition.count, bits)
+        assert probe_pca.part_count(payload) == partition.count
+        decoded = probe_pca.decode(bytes(bytearray(payload)), position.copy())
+        assert _error(values, decoded) <= _error(values, global_pca(position, values, 2, bits=4).decoded)
+        # A probe's values depend on its place and weights, so other positions must not decode to the same.
+        if partition.kind in (probe_pca.BLOCKS, probe_pca.PLACE):
+            elsewhere = probe_pca.decode(payload, position[:, ::-1])
+            assert _error(values, elsewhere) > 2 * _error(values, decoded)
+        for wrong in (payload[:-1], payload + b"\0", payload[:5], b"", b"\xff" * 20):
+            with pytest.raises(WlmError, match="payload"):
+                probe_pca.decode(wrong, position)
+    payload = probe_mbd.encode(position, wide, 2, 3, 3, bits)
+    assert len(payload) == probe_mbd.payload_bytes(400, 12, 2, probe_mbd.grid_parts(position, 3), bits)
+    shown = moving_basis(position, values, 2, 3, 3, bits=bits).decoded
+    np.testing.assert_array_equal(probe_mbd.decode(payload, position), shown)
+    for wrong in (payload[:-1], payload[:5]):
+        with pytest.raises(WlmError, match="payload"):
+            probe_mbd.decode(wrong, position)
+
+
+def test_weights_keep_the_ends_of_each_range():
+    weight = np.array([[0.0, 5.0], [1.0, 5.0], [-4.0, 0.25], [4.0, 0.5], [0.1, 0.375]])
+    part = np.array([0, 0, 1, 1, 1])
+    read = probe_pca.read_weights(probe_pca.write_weights(weight, part, 2, 4), part, 2, 2, 4)
+    np.testing.assert_array_equal(read[:4], weight[:4])  # a range of zero too
+    np.testing.assert_allclose(read[4], weight[4], atol=8.0 / 15 / 2)
+    wild = probe_pca.read_weights(probe_pca.write_weights(weight * 1e6, part, 2, None), part, 2, 2, None)
+    assert np.isfinite(wild).all() and wild.max() == 65504.0
+
+
+def test_blocks_are_cubes_of_one_size():
+    position, _ = _probes(count=3000)
+    for most in (1, 2, 7, 40, 300):
+        partition, side = probe_pca.by_blocks(position, most)
+        assert 0.6 * most <= partition.count <= most
+        for probes in partition.members:
+            assert (np.ptp(position[probes], axis=0) <= side).all()
+    assert probe_pca.by_blocks(position, 3000)[0].count > 2000
+
+
+def test_windows_hold_the_cube_and_what_lies_around():
+    position, values = _probes()
+    partition, side = probe_pca.by_blocks(position, 20)
+    windows = probe_pca.windows(position, partition, side, 0.25)
+    corner = position.min(0) + np.floor((position - position.min(0)) / side) * side
+    for probes, near in zip(partition.members, windows, strict=True):
+        low = corner[probes[0]] - 0.25 * side
+        inside = ((position >= low) & (position <= low + 1.5 * side)).all(1)
+        np.testing.assert_array_equal(near, np.flatnonzero(inside))
+        assert set(probes) <= set(near)
+    errors = [_error(values, window_pca(position, values, 2, 20, overlap=o).decoded) for o in (0, 0.25, 1, 100)]
+    np.testing.assert_array_equal(
+        window_pca(position, values, 2, 20, overlap=0).decoded, block_pca(position, values, 2, 20).decoded
+    )
+    assert errors == sorted(errors)
+    # A window over everything is global PCA, to the rounding.
+    assert errors[-1] == pytest.approx(_error(values, global_pca(position, values, 2).decoded), rel=1e-3)
+
+
+def test_clusters_by_place_are_nearest_centres():
+    random = np.random.default_rng(3)
+    centre = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [10, 10, 10]])
+    truth = random.integers(0, 5, 300)
+    partition = probe_pca.by_place(centre[truth] + random.normal(size=(300, 3)), 5, 0)
+    assert partition.count == 5 and len(set(zip(truth, partition.label, strict=True))) == 5
+
+
+def test_clusters_by_signal_find_lines_that_share_one_place():
+    random = np.random.default_rng(4)
+    truth = random.integers(0, 4, 400)
+    point, direction = random.normal(size=(2, 4, 12))
+    values = (4 * point[truth] + direction[truth] * random.normal(size=(400, 1))).astype(np.float32)
+    position = random.uniform(size=(400, 3))
+    found = SIGNAL(position, values, 1, 4)
+    np.testing.assert_allclose(found.decoded, values, rtol=0, atol=4 * HALF * np.abs(values).max())
+    assert _error(values, clustered_pca(position, values, 1, 4).decoded) > 0.1
+    again = [SIGNAL(position, values, 1, 4, seed).decoded for seed in (7, 7)]
+    np.testing.assert_array_equal(*again)
+
+
+def test_parts_are_those_of_the_centres_as_stored(monkeypatch):
+    monkeypatch.setattr(probe_pca, "_CENTRE_LEVELS", 9)
+    position, values = _probes()
+    decoded = clustered_pca(position, values, 12, 12).decoded
+    np.testing.assert_allclose(decoded, values, rtol=0, atol=4 * HALF * np.abs(values).max())
+
+
+def test_closest_subspace_is_found():
+    random = np.random.default_rng(6)
+    values, mean = random.normal(size=(50, 7)), random.normal(size=(4, 7))
+    basis = np.stack([np.linalg.qr(random.normal(size=(7, 3)))[0].T for _ in range(4)])
+    away = values[:, None] - mean
+    left = away - np.einsum("nck,ckd->ncd", np.einsum("ncd,ckd->nck", away, basis), basis)
+    error = np.square(left).sum(2)
+    label, total = probe_pca._closest(values, mean, basis)
+    np.testing.assert_array_equal(label, error.argmin(1))
+    assert total == pytest.approx(error.min(1).sum())
+
+
+def test_comparison_in_chunks_changes_nothing(monkeypatch):
+    values = _probes()[1].astype(np.float64)
+    whole = probe_pca.by_signal(values, 6, 2, 0)
+    monkeypatch.setattr(probe_pca, "_CHUNK", 100)
+    np.testing.assert_array_equal(probe_pca.by_signal(values, 6, 2, 0).label, whole.label)
+
+
+@pytest.mark.parametrize("grid", [1, 4])
+def test_moving_basis_never_gets_worse_and_beats_pca(grid):
+    position, values = _probes()
+    wide = values.astype(np.float64)
+    for k in (1, 3):
+        solver = probe_mbd.Solver(position, wide, k, grid)
+        errors = [solver.error()]
+        for _ in range(6):
+            solver.solve_corners()
+            errors.append(solver.error())
+            solver.solve_weights()
+            errors.append(solver.error())
+        _, s, _ = np.linalg.svd(wide - wide.mean(0), full_matrices=False)
+        assert errors[0] == pytest.approx(np.square(s[k:]).sum(), rel=1e-9)
+        assert (np.diff(errors) <= 1e-9 * errors[0]).all()
+        assert errors[-1] < 0.8 * errors[0]
+        for bits in (None, 8):
+            found = _error(values, moving_basis(position, values, k, grid, bits=bits).decoded)
+            assert found < _error(values, global_pca(position, values, k).decoded)
+    none = moving_basis(position, values, 3, grid, 0).decoded
+    assert _error(values, none) == pytest.approx(_error(values, global_pca(position, values, 3).decoded), rel=1e-3)
+
+
+def test_corners_make_up_for_rounded_weights():
+    position, values = _probes()
+    wide = values.astype(np.float64)
+    solver = probe_mbd.Solver(position, wide, 3, 2)
+    solver.step(5)
+    cell = probe_mbd._interpolation(position, 2)[2]
+    count = cell.max() + 1
+    stored = probe_pca.write_weights(solver.weight, cell, count, 2)
+    solver.weight = probe_pca.read_weights(stored, cell, count, 3, 2)
+    found = _error(values, moving_basis(position, values, 3, 2, 5, bits=2).decoded)
+    assert found < 0.9 * solver.error() / wide.size
+
+
+def test_moving_basis_fits_a_basis_that_moves():
+    random = np.random.default_rng(5)
+    position = random.uniform(size=(300, 3))
+    ends = random.normal(size=(2, 12))
+    turning = ends[0] + position[:, :1] * (ends[1] - ends[0])
+    values = (random.normal(size=(300, 1)) * turning).astype(np.float32)
+    plain = _error(values, global_pca(position, values, 1).decoded)
+    assert _error(values, moving_basis(position, values, 1, 1, 60).decoded) < 2e-3 * plain
+
+
+@pytest.mark.parametrize("bits", [None, 8])
+@pytest.mark.parametrize("name", METHODS)
+def test_hard_cases(name, bits):
+    position, values = _probes(count=40)
+    cases = {
+        "one probe": (position[:1], values[:1]),
+        "two probes": (position[:2], values[:2]),
+        "fewer probes than parts": (position[:5], values[:5]),
+        "one place": (np.ones((40, 3)), values),
+        "a line": (position * (1, 0, 0), values),
+        "far from the origin": (position + 1e7, values),
+        "zero": (position, np.zeros_like(values)),
+        "constant": (position, np.full_like(values, 0.1)),
+        "doubled": (np.repeat(position[:6], 7, 0), np.repeat(values[:6], 7, 0)),
+        "huge": (position, values * np.float32(1e37)),
+        "above half": (position, values * np.float32(1e5)),
+        "tiny": (position, values * np.float32(1e-39)),
+    }
+    for case, (place, light) in cases.items():
+        for components in (1, 12):
+            result = METHODS[name](place, light, components, 8, bits=bits)
+            assert np.isfinite(result.decoded).all(), case
+            if components == 12 or case in ("one probe", "zero", "constant"):
+                limit = (4 * HALF if bits is None else 0.02) * np.abs(light).max()
+                np.testing.assert_allclose(result.decoded, light, rtol=0, atol=limit, err_msg=case)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_settings_that_cannot_be(name):
+    position, values = _probes(count=20)
+    for wrong in (0, 13):
+        with pytest.raises(ValueError, match="components"):
+            METHODS[name](position, values, wrong, 2)
+    for wrong in (0, 17):
+        with pytest.raises(ValueError, match="bits"):
+            METHODS[name](position, values, 1, 2, bits=wrong)
+    if name != "global_pca":
+        with pytest.raises(ValueError, match="blocks|clusters|grid"):
+            METHODS[name](position, values, 1, 0)
+    for place, light in ((position[:, :2], values), (position[1:], values), (position, values[:, :, None])):
+        with pytest.raises(ValueError, match="positions"):
+            METHODS[name](place, light, 1, 2)
+    with pytest.raises(WlmError, match="at least one probe"):
+        METHODS[name](position[:0], values[:0], 1, 2)
+    for bad in (np.nan, np.inf, 1e39):
+        light = values.astype(np.float64)
+        light[3, 1] = bad
+        with pytest.raises(WlmError, match="values of 1 of 20 probes"):
+            METHODS[name](position, light, 1, 2)
+    with pytest.raises(WlmError, match="positions of 20 of 20 probes"):
+        METHODS[name](position * np.nan, values, 1, 2)
+
+
+def test_other_settings_that_cannot_be():
+    position, values = _probes(count=20)
+    for overlap in (-0.5, np.nan, np.inf):
+        with pytest.raises(ValueError, match="overlap"):
+            window_pca(position, values, 1, 2, overlap=overlap)
+    with pytest.raises(ValueError, match="iterations"):
+        moving_basis(position, values, 1, 2, -1)
+    with pytest.raises(ValueError, match="grid"):
+        moving_basis(position, values, 1, 2**20 + 1)
+
+
+def _sh(direction: np.ndarray) -> np.ndarray:
+    """Real SH of a unit vector up to L2, in the order of the probe files, over Y00."""
+    x, y, z = direction
+    one, two = np.sqrt(3.0), np.sqrt(15.0)
+    band = (x * y, y * z, (3 * z * z - 1) / np.sqrt(12.0), x * z, (x * x - y * y) / 2)
+    return np.array([1.0, *(one * np.array([y, z, x])), *(two * np.array(band))])
+
+
+def test_unreal_by_hand():
+    light = _sh(np.array([0.0, 0.0, 1.0]))[:, None] * np.array([1.0, 0.5, 0.0])
+    light[:, 2] = 7.0
+    light[0, 2] = 0.0  # no ambient: nothing can be kept
+    payload = pack_unreal(light.reshape(1, 27), 3)
+    # 1.0, 0.5 and 0 with half float's exponent; z at its end, 3z²-1 at half of its range, 128 for zero.
+    assert payload[:4] == (0x3C00 >> 4 | 0x3800 >> 4 << 11).to_bytes(4, "little")
+    red = [128, 255, 128, 128, 128, 191, 128, 128]
+    assert list(payload[4:]) == red * 2 + [128] * 8
+    decoded = unpack_unreal(payload, 27, 3).reshape(9, 3)
+    zero = (128 / 127.5 - 1) * np.sqrt(3.0)
+    expected = [1.0, zero, np.sqrt(3.0), zero, *[zero * np.sqrt(5.0)] * 2, (191 / 127.5 - 1) * np.sqrt(20.0)]
+    np.testing.assert_allclose(decoded[:7, 0], expected, rtol=1e-6)
+    np.testing.assert_allclose(decoded[:, 1], decoded[:, 0] / 2, rtol=1e-6)
+    assert not decoded[:, 2].any()
+
+
+def test_unreal_ambient_is_rounded_to_nearest():
+    def through(ambient: np.ndarray) -> np.ndarray:
+        return unpack_unreal(pack_unreal(np.repeat(ambient[:, None], 3, 1), 1), 3, 1)
+
+    codes = np.arange(0x7C0, dtype=np.uint32)  # every finite number with 6 bits of mantissa
+    exact = (codes << 4).astype(np.uint16).view(np.float16).astype(np.float64)
+    np.testing.assert_array_equal(through(exact)[:, 0], exact)
+    np.testing.assert_array_equal(through(exact[::2])[:, 2], exact[::2])
+    value = np.random.default_rng(0).uniform(0.001, 60000.0, 1000)
+    relative = np.abs(through(value) / value[:, None] - 1.0)
+    assert relative[:, :2].max() <= 2.0**-7 and relative[:, 2].max() <= 2.0**-6
+    np.testing.assert_array_equal(through(np.array([1e9, -3.0])), [[65024, 65024, 64512], [0, 0, 0]])
+
+
+def test_unreal_keeps_all_light_and_clamps_what_is_none():
+    random = np.random.default_rng(1)
+    direction = random.normal(size=(200, 4, 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    colour = random.uniform(0.0, 3.0, (200, 4, 3))
+    light = np.einsum("nlk,nlc->nkc", np.apply_along_axis(_sh, 2, direction), colour)
+    values = light.reshape(200, 27).astype(np.float32)
+    result = unreal_packing(np.zeros((200, 3)), values)
+    assert result.bytes == 200 * 28 and result.option == "L2"
+    step = np.sqrt([0, 3, 3, 3, 15, 15, 20, 15, 15])[:, None] / 255
+    # Half a step, and blue's 2**-6 where the ambient was rounded down and L1 is at its end.
+    bound = light[:, :1] * (step * 1.02 + 2.0**-6)
+    assert (np.abs(result.decoded.reshape(200, 9, 3) - light) <= bound).all()
+    beyond = values.reshape(200, 9, 3) * np.where(np.arange(9) == 2, 50.0, 1.0)[:, None]
+    decoded = unreal_packing(np.zeros((200, 3)), beyond.reshape(200, 27)).decoded.reshape(200, 9, 3)
+    assert (np.abs(decoded[:, 2]) <= np.sqrt(3.0) * decoded[:, 0] * 1.000001).all()
+    # Fewer bands are the first bytes' values and then zeros.
+    less = unreal_packing(np.zeros((200, 3)), values, 2)
+    assert less.bytes == 200 * 13 and not less.decoded[:, 12:].any()
+    np.testing.assert_array_equal(less.decoded[:, :12], result.decoded[:, :12])
+
+
+def test_unreal_refuses():
+    position, values = _probes(count=20)
+    assert unreal_packing(position, values).bytes == 20 * 13
+    assert unreal_packing(position[:1], np.zeros((1, 27))).decoded.any() == np.False_
+    with pytest.raises(ValueError, match="bands"):
+        unreal_packing(position, values, 3)
+    with pytest.raises(WlmError, match="3, 12 or 27"):
+        unreal_packing(position, values[:, :5])
+    with pytest.raises(WlmError, match="values of"):
+        unreal_packing(position, values * np.inf)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_at_bytes_keeps_the_size_and_uses_it(name):
+    position, values = _probes(count=300)
+    budgets = [int(share * values.nbytes) for share in (0.09, 0.28, 0.5)]
+    results = [at_bytes(name, position, values, budget) for budget in budgets]
+    for result, budget in zip(results, budgets, strict=True):
+        assert result.name == name and result.bytes <= budget
+    errors = [_error(values, result.decoded) for result in results]
+    assert errors[0] > errors[1] >= errors[2]
+    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 300 probes"):
+        at_bytes(name, position, values, 20)
+
+
+def test_at_bytes_finds_the_best_of_all_settings():
+    position, values = _probes(count=300)
+    budget = int(0.15 * values.nbytes)
+    tried = [
+        result
+        for bits in (8, None)
+        for k in range(1, 13)
+        for blocks in range(1, 60, 4)
+        if (result := block_pca(position, values, k, blocks, bits=bits)).bytes <= budget
+    ]
+    best = min(_error(values, result.decoded) for result in tried)
+    found = at_bytes("block_pca", position, values, budget, (8, None))
+    assert _error(values, found.decoded) <= best * 1.1
+    half = at_bytes("block_pca", position, values, budget, (None,))
+    assert "half floats" in half.option and _error(values, half.decoded) >= _error(values, found.decoded)
+
+
+def test_at_bytes_stops_where_fewer_components_gain_nothing(monkeypatch):
+    position, values = _probes(count=50)
+    runs = []
+    measure = baselines.measure
+    monkeypatch.setattr(baselines, "measure", lambda *args, **more: runs.append(args) or measure(*args, **more))
+    found = at_bytes("global_pca", position, values, 10**6, (None,))
+    assert found.option == "K=12, 1 part, half floats" and len(runs) == 3
+
+
+def test_at_bytes_finishes_the_moving_basis():
+    position, values = _probes(count=300)
+    found = at_bytes("moving_basis", position, values, int(0.3 * values.nbytes), (None,))
+    components, grid = (int(word.strip("K=,")) for word in found.option.split()[0:3:2])
+    again = moving_basis(position, values, components, grid)
+    np.testing.assert_array_equal(found.decoded, again.decoded)
+
+
+def test_at_bytes_with_little_and_wrong_input():
+    position, values = _probes(count=300)
+    assert at_bytes("global_pca", position[:1], values[:1], 1000).bytes <= 1000
+    with pytest.raises(WlmError, match="unknown baseline 'zip', expected one of global_pca, "):
+        at_bytes("zip", position, values, 1000)
+    with pytest.raises(ValueError, match="bits"):
+        at_bytes("global_pca", position, values, 1000, (8, 0))
+    with pytest.raises(WlmError, match="3, 12 or 27"):
+        at_bytes("unreal", position, values[:, :5], 10**6)

@@ -1,0 +1,156 @@
+"""The dense fit in plain torch: its sum against float64, its fit, and the hard cases."""
+
+import numpy as np
+import pytest
+import torch
+from builders.probe_sets import synthetic
+from scipy.spatial.transform import Rotation
+
+from benchmarks.rivals.probe_torch import DenseFit
+
+
+def dense(x, values, steps=40, count=12, seed=0, device="cpu", **changes):
+    settings = dict(latent=4, hidden=16, rates=(1e-3, 1e-2, 1e-2, 3e-2, 2e-2), final=1e-3, bits=10)
+    return DenseFit(x, values, count=count, steps=steps, seed=seed, device=device, **(settings | changes))
+
+
+def room(count=150):
+    probes = synthetic(count)
+    low = probes.position.min(0)
+    return (probes.position - low) / (probes.position - low).max(), probes.values
+
+
+def answer64(fit, x, values, levels=None):
+    """What the fit's parameters come to, in float64, a Gaussian at a time; on levels for [centre, others] if given."""
+    parameters = [p.detach().numpy().astype(np.float64) for p in fit.parameters]
+    if levels is not None:
+        for i, part in enumerate(parameters[:4]):
+            low, high = part.min(0), part.max(0)
+            step = (high - low) / levels[min(i, 1)]
+            parameters[i] = np.where(step > 0, low + np.rint((part - low) / np.where(step > 0, step, 1)) * step, part)
+    centre, log_scale, q, latent, *net = parameters
+    f = np.zeros((len(x), latent.shape[1]))
+    for k in range(len(centre)):
+        turn = Rotation.from_quat(q[k, [1, 2, 3, 0]]).as_matrix()
+        covariance = turn @ np.diag(np.exp(2 * log_scale[k])) @ turn.T
+        away = x - centre[k]
+        f += np.exp(-0.5 * (away * np.linalg.solve(covariance, away.T).T).sum(1))[:, None] * latent[k]
+    h = np.concatenate([f, x], 1)
+    for weight, bias in zip(net[0:4:2], net[1:4:2], strict=True):
+        h = 1.0 / (1.0 + np.exp(-(h @ weight + bias)))
+    return (h @ net[4] + net[5]) * values.astype(np.float64).std(0) + values.astype(np.float64).mean(0)
+
+
+def stretched(fit):
+    """Makes the Gaussians turned ellipsoids of strong latents, so that no axis and no sign goes unnoticed."""
+    random = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for part in fit.parameters[1:4]:
+            part += torch.randn(part.shape, generator=random)
+    return fit
+
+
+def test_the_sum_and_the_loss_are_those_of_float64():
+    x, values = room()
+    fit = stretched(dense(x, values))
+    x = x.astype(np.float32).astype(np.float64)
+    spread = values.astype(np.float64).std(0)
+    error = answer64(fit, x, values) - values
+    loss = (error**2).mean() / spread.max() ** 2
+    assert float(fit.step()) == pytest.approx(loss, rel=1e-4)
+
+
+def test_decoded_is_on_the_levels_of_a_file():
+    x, values = room()
+    fit = stretched(dense(x, values, bits=6))
+    x = x.astype(np.float32).astype(np.float64)
+    exact = answer64(fit, x, values, (2**16 - 1, 2**6 - 1))
+    peak = np.ptp(values)
+    assert np.abs(fit.decoded() - exact).max() < 1e-6 * peak
+    # Levels this coarse are not lost in rounding.
+    assert np.abs(fit.decoded() - answer64(fit, x, values)).max() > 1e-4 * peak
+
+
+def test_the_last_sixth_is_on_levels_and_gradients_pass_through():
+    x, values = room(60)
+    fit = dense(x, values, steps=12, bits=4)
+    for _ in range(10):
+        fit.step()
+    before = [p.detach().clone() for p in fit.parameters]
+    error = (fit.decoded() - values).astype(np.float64)
+    expected = (error**2).mean() / values.astype(np.float64).std(0).max() ** 2
+    assert float(fit.step()) == pytest.approx(expected, rel=1e-3)
+    assert all((a != b).any() for a, b in zip(before, fit.parameters, strict=True))
+
+
+def test_loss_falls_and_seeds_repeat():
+    x, values = room()
+
+    def losses(seed):
+        fit = dense(x, values, steps=300, seed=seed)
+        return [float(fit.step()) for _ in range(300)]
+
+    first = losses(3)
+    # From the variance that there is to about a third.
+    assert first[-1] < 0.4 * first[0]
+    assert losses(3) == first and losses(4) != first
+
+
+def test_run_counts_steps_and_seconds(device):
+    x, values = room(40)
+    fit = dense(x, values, device=device)
+    fit.run(3)
+    once = fit.seconds
+    assert fit.steps_done == 3 and once > 0.0
+    fit.run(2)
+    assert fit.steps_done == 5 and fit.seconds > once
+    fit.run(0)
+    assert fit.steps_done == 5
+
+
+def test_the_start_is_k_means_and_the_nearest_centre():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5]])
+    x = np.repeat(corners, 10, 0) + 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
+    fit = dense(x, np.ones((40, 3)), count=4, seed=1)
+    centre, log_scale = (p.detach().numpy() for p in fit.parameters[:2])
+    means = x.astype(np.float32).reshape(4, 10, 3).mean(1)
+    nearest = np.linalg.norm(centre[:, None] - means, axis=2).argmin(1)
+    away = np.linalg.norm(centre[:, None] - centre, axis=2) + np.diag([9.0] * 4)
+    np.testing.assert_allclose(np.exp(log_scale), away.min(1)[:, None].repeat(3, 1), rtol=1e-5)
+    # Two clusters may share a centre, as k-means does, but a centre is the mean of what is nearest to it.
+    own = np.linalg.norm(x[:, None] - centre, axis=2).argmin(1)
+    for k in range(4):
+        np.testing.assert_allclose(centre[k], x[own == k].mean(0), atol=1e-6)
+    assert len(set(nearest.tolist())) >= 3
+
+
+def test_one_probe_and_probes_at_one_place():
+    for x, values, count in (
+        (np.full((1, 3), 0.5), np.ones((1, 1)), 1),
+        (np.full((5, 3), 0.5), np.arange(10.0).reshape(5, 2), 1),
+        (np.random.default_rng(0).random((6, 3)), np.full((6, 3), 7.0), 4),
+    ):
+        fit = dense(x, values, count=4, steps=200)
+        losses = [float(fit.step()) for _ in range(200)]
+        assert np.isfinite(losses).all() and len(fit.parameters[0]) == count
+        # Where all is one place, or one value, the best there is, is the mean.
+        np.testing.assert_allclose(fit.decoded(), values.mean(0)[None].repeat(len(x), 0), atol=1e-2)
+
+
+def test_a_number_that_never_changes_is_exact():
+    x, values = room(60)
+    values = values.copy()
+    values[:, 4] = 3.0
+    fit = dense(x, values)
+    fit.run(5)
+    np.testing.assert_array_equal(fit.decoded()[:, 4], np.float32(3.0))
+
+
+def test_what_is_refused():
+    x, values = np.zeros((4, 3)), np.zeros((4, 2))
+    for bad in ((x[:3], values), (x[:, :2], values), (x, values[:, 0]), (x[:0], values[:0])):
+        with pytest.raises(ValueError, match="expected positions"):
+            dense(*bad)
+    for changes in ({"count": 0}, {"steps": 0}, {"latent": 0}, {"hidden": 0}):
+        with pytest.raises(ValueError, match="at least 1 of each"):
+            dense(x, values, **changes)

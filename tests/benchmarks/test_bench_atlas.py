@@ -1,0 +1,237 @@
+"""The atlas benchmark on two small lightmaps: every row has its figures, and they agree with what they are of."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from builders.atlas_meshes import charts, constant, image, sheet, soft
+from builders.bench_rows import check_command, check_outputs, keys
+
+import benchmarks.atlas as bench
+from benchmarks import write_json
+from benchmarks.atlas import PANELS, plotted, run, run_rivals, run_rows
+from benchmarks.atlas_inputs import Lightmap, load
+from benchmarks.rivals.atlas import single_colour
+from wlm.atlas.data import LightmappedMesh, write_mesh
+from wlm.atlas.evaluation import compare
+from wlm.atlas.fit import compress
+from wlm.atlas.model import Profile
+from wlm.errors import WlmError
+from wlm.formats.exr import write_exr
+
+FEW = {"views": 2}
+PROFILES = [
+    Profile(name="standard", **FEW),
+    Profile(name="bc6h", colour="bc6h", budget=0.3, fallback=False, **FEW),
+    Profile(name="paper", method="cascade", steps=6, resolution=32, fallback=False, colour_scale=0.6),
+]
+RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC", "carving"]
+OWN = ("single colour", "its own size")
+SMALLER = ["standard, CR 92.5%", "standard, CR 95%"]
+MEAN = "mean over 2 lightmaps"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_views():
+    """50 large views for single-colour merging show nothing here that two small ones don't."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(bench.OWN_SIZE, "single colour", partial(single_colour, views=2, resolution=64))
+        yield
+
+
+@pytest.fixture(scope="module")
+def lightmaps():
+    return [Lightmap("sheet day", sheet(height=64, width=64)), Lightmap("cube night", charts())]
+
+
+@pytest.fixture(scope="module")
+def rows(lightmaps):
+    return run_rows(lightmaps, PROFILES, device="cpu", views=3, resolution=64, whole=True, points=5000, repeats=1)
+
+
+def test_every_row_has_its_figures(rows):
+    ours = [("ours", name) for name in ("standard", "bc6h", "paper", *SMALLER, "standard, bits of paper")]
+    tuned = [("fit", "paper, space views"), ("fit", "paper, space uv")]
+    for scene, extra in (("sheet day", tuned), ("cube night", [])):
+        measured = keys(row for row in rows if row.scene == scene)
+        before = [*ours, *extra, ("lightmap", "half floats"), *((name, "bits of standard") for name in RIVALS)]
+        assert measured[: len(before)] == before
+        assert measured[-1] == OWN
+        rest = measured[len(before) : -1]
+        for method in ("downsampling", "ASTC"):
+            options = [option for name, option in rest if name == method]
+            # One that has the whole lightmap in the bits of standard isn't measured in more.
+            assert options[-3:] == [f"bits of {option}" for option in ("paper", *SMALLER)]
+            assert options[:-3] in ([], ["bits of bc6h"])
+        assert {name for name, _ in rest} == set(RIVALS)
+    means = keys(row for row in rows if row.scene == MEAN)
+    assert means[: len(ours) + 1 + len(RIVALS)] == [
+        *ours,
+        ("lightmap", "half floats"),
+        *((name, "bits of standard") for name in RIVALS),
+    ]
+    assert OWN in means
+    for row in rows:
+        assert row.system == "atlas" and "not measured" not in row.notes
+        assert (row.method == "lightmap") == (row.get("psnr") is None)
+        if row.method in ("ours", "lightmap"):
+            assert row["decode_ms"] > 0.0 and row["max_error"] < 0.5
+        if row.method != "lightmap":
+            assert row["psnr"] > 8.0 and row["one_minus_ssim"] >= 0.0 and row["encode_seconds"] > 0.0
+        if row.method == "ours":
+            # The file has a header besides, streams, and half floats of three channels where a GPU has four.
+            assert row["bytes"] > row["bpp"] * 64 * 48 / 8 * 0.4
+
+
+def test_rows_are_of_what_they_name(lightmaps, rows):
+    """The same compression, scored apart from the others."""
+    mesh = lightmaps[0].mesh
+    model = compress(mesh, PROFILES[0])
+    row = rows[0]
+    assert row["bpp"] == pytest.approx(48 * (1 - model.compression_ratio))
+    assert row["compression_ratio"] == model.compression_ratio
+    report = compare(mesh, {"a": bench.Decoder(model)}, views=3, resolution=64)["a"]
+    for name in ("psnr", "psnr_worst", "texel_psnr", "one_minus_ssim", "tone_psnr", "flip"):
+        assert row[name] == pytest.approx(getattr(report, name)), name
+    assert "seam_ratio" not in row.figures  # a sheet has no seam
+
+
+def test_rivals_keep_to_the_bits(rows):
+    bpp = {(row.scene, f"bits of {row.option}"): row["bpp"] for row in rows if row.method == "ours"}
+    rivals = [row for row in rows if row.method in RIVALS and row.scene != MEAN]
+    assert len(rivals) >= 2 * (len(RIVALS) + 2)
+    for row in rivals:
+        assert row["bpp"] <= bpp[row.scene, row.option] * (1 + 1e-9)
+        assert row["bytes"] == pytest.approx(row["bpp"] / 8 * (64 * 64 if row.scene == "sheet day" else 48 * 64), abs=1)
+
+
+def test_means(rows):
+    for row in rows:
+        if row.scene == MEAN:
+            both = [r for r in rows if (r.method, r.option) == (row.method, row.option) and r is not row]
+            assert len(both) == row["lightmaps"] == 2
+            for name in (
+                "bpp",
+                "psnr",
+                "texel_psnr",
+                "tone_psnr",
+                "flip",
+                "one_minus_ssim",
+                "seam_ratio",
+                "decode_ms",
+                "encode_seconds",
+            ):
+                values = [r[name] for r in both if name in r.figures]
+                assert row.get(name) == (pytest.approx(np.mean(values)) if values else None), name
+            if row.get("psnr"):
+                assert (row["psnr_min"], row["psnr_max"]) == tuple(sorted(r["psnr"] for r in both))
+            if row.get("max_error") is not None:
+                assert row["max_error"] == max(r["max_error"] for r in both)
+
+
+def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
+    check_outputs(rows, tmp_path, PANELS, plotted(rows))
+    assert {row.scene for row in plotted(rows)} == {MEAN}
+    assert plotted(rows[:5]) == rows[:5]
+
+
+def test_a_lightmap_of_one_colour_has_no_scores():
+    """There is no range to measure against, and the rows say nothing instead of infinity."""
+    lightmap = Lightmap("flat", sheet(constant(0.5, 0.5, 0.5), 32, 32))
+    profile = PROFILES[0].model_copy(update={"fallback": False})
+    rows = run_rows([lightmap], [profile], device="cpu", views=2, resolution=32, whole=False, points=100, repeats=1)
+    assert all("psnr" not in row.figures for row in rows)
+    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS, OWN[0]]
+
+
+def test_no_room_for_a_rival_or_a_table():
+    """Eight texels of a lightmap: what doesn't fit is named, and the others are measured."""
+    cascade = PROFILES[2].model_copy(update={"scale": 0.2, "colour_scale": 0.2, "lut_scale": 0.2})
+    lightmap = Lightmap("small", sheet(height=24, width=24))
+    alone = PROFILES[0].model_copy(update={"fallback": False})
+    rows = run_rows(
+        [lightmap], [alone, cascade], device="cpu", views=1, resolution=32, whole=True, points=100, repeats=1
+    )
+    missing = [row for row in rows if "not measured" in row.notes]
+    assert ("ours", "standard, bits of paper") in keys(missing)
+    assert not any(row.figures for row in missing) and "psnr" in rows[0].figures
+
+
+def _files(folder, mesh: LightmappedMesh, *names: str, masked: bool = False) -> None:
+    from PIL import Image
+
+    folder.mkdir()
+    write_mesh(folder / "mesh.glb", mesh, mesh.uv[mesh.triangle])
+    for i, name in enumerate(names):
+        write_exr(folder / f"{name}.exr", image(soft, *mesh.mask.shape) * (i + 1))
+    if masked:
+        Image.fromarray(mesh.mask.astype(np.uint8) * 255).save(folder / "mask.png")
+
+
+def test_folders(tmp_path):
+    """A folder of a mesh, a folder of such folders, and one mesh with its files named."""
+    _files(tmp_path / "Cube", charts(), "day", "night", masked=True)
+    _files(tmp_path / "Sheet", sheet(), "day")
+    (tmp_path / "notes").mkdir()
+    assert [lightmap.scene for lightmap in load(tmp_path)] == ["Cube day", "Cube night", "Sheet day"]
+    assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube day", "Cube night"]
+    day, night = (lightmap.mesh for lightmap in load(tmp_path / "Cube"))
+    np.testing.assert_allclose(night.lightmap, 2 * day.lightmap, rtol=2e-3)
+    np.testing.assert_array_equal(day.mask, charts().mask)
+    mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "night.exr"
+    (named,) = load(None, mesh, [exr], tmp_path / "Cube" / "mask.png")
+    assert named.scene == "Cube night" and named.mesh.source == night.source
+    exr.rename(exr.with_stem("Cube"))
+    assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube", "Cube day"]
+
+
+def test_what_is_refused(tmp_path, lightmaps):
+    _files(tmp_path / "Cube", charts(), "day")
+    mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "day.exr"
+    for paths, line in (
+        ((tmp_path / "absent",), "absent: no such folder"),
+        ((tmp_path / "Cube", mesh, [exr]), "expected --mesh FILE with --lightmap FILE, or --meshes DIR alone"),
+        ((None, mesh), "expected --mesh FILE with --lightmap FILE"),
+        ((None, None, [exr]), "--lightmap and --mask need --mesh FILE"),
+        ((None, tmp_path / "absent.glb", [exr]), "absent.glb"),
+    ):
+        with pytest.raises(WlmError, match=line):
+            load(*paths)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(WlmError, match="expected a .glb and its .exr in it or in folders of it, found none"):
+        load(tmp_path / "empty")
+    (tmp_path / "Cube" / "second.glb").write_bytes(mesh.read_bytes())
+    with pytest.raises(WlmError, match="Cube: expected one .glb a folder, found 2"):
+        load(tmp_path)
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        run(lightmaps, quick=True, device="tpu")
+    with pytest.raises(WlmError, match="profile"):
+        run(lightmaps, ["absent"], quick=True, device="cpu")
+    with pytest.raises(ValueError, match="at least one lightmap and one profile"):
+        run_rows(lightmaps, [], device="cpu", views=1, resolution=32, whole=False)
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    _files(tmp_path / "Cube", charts(), "day")
+    words = ["atlas", "--quick", "--meshes", tmp_path / "Cube", "--profile", "bc6h"]
+    command, (lightmaps, names), options = check_command(monkeypatch, bench, rows[:5], words, tmp_path)
+    assert command == "python -m benchmarks atlas --quick --device cpu --meshes Cube --profile bc6h"
+    assert [lightmap.scene for lightmap in lightmaps] == ["Cube day"] and names == ["bc6h"]
+    assert options["quick"] and options["device"] == "cpu" and options["rivals"]
+
+
+def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
+    """At the bits that a result file has, with the scores that they have in a whole run."""
+    monkeypatch.setattr(bench, "VIEWS", 3)
+    monkeypatch.setattr(bench, "RESOLUTION", 64)
+    write_json(tmp_path / "rows.json", rows, {})
+    alone = run_rivals(tmp_path / "rows.json", lightmaps[:1])
+    beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]
+    beside = [row for row in beside if row.option in {f"bits of {option}" for option in ("standard", *SMALLER)}]
+    beside += [row for row in rows if row.scene == "sheet day" and row.method == OWN[0]]
+    assert keys(alone) == keys(beside)
+    for name in ("bytes", "psnr"):
+        assert [row[name] for row in alone] == [row[name] for row in beside]
+    write_json(tmp_path / "few.json", [row for row in rows if row.scene == "cube night"], {})
+    with pytest.raises(WlmError, match="expected a row of method ours of sheet day"):
+        run_rivals(tmp_path / "few.json", lightmaps)

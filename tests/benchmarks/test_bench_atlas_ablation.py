@@ -1,0 +1,94 @@
+"""Ablation of the cascade on two small lightmaps: rows are of what they name."""
+
+import sys
+
+import pytest
+from builders.atlas_meshes import charts, sheet
+from builders.bench_rows import check_command, check_outputs, keys
+from builders.running import fails
+
+import benchmarks.atlas_ablation as bench
+from benchmarks import Panel
+from benchmarks.atlas_ablation import ABLATION, run, run_rows
+from benchmarks.atlas_inputs import Lightmap
+from wlm.atlas.evaluation import evaluate
+from wlm.atlas.fit import compress
+from wlm.atlas.model import Profile
+from wlm.errors import WlmError
+
+PROFILE = Profile(name="small", method="cascade", steps=6, resolution=32, fallback=False, space="uv")
+VIEWS = {"views": 2, "resolution": 48}
+SWEPT = ["scale 0.3", "colour_scale 0.8", "lut_scale 1"]
+
+
+@pytest.fixture(scope="module")
+def lightmaps():
+    return [Lightmap("sheet day", sheet(height=64, width=64)), Lightmap("cube night", charts())]
+
+
+@pytest.fixture(scope="module")
+def rows(lightmaps):
+    return run_rows(lightmaps, PROFILE, [*ABLATION, *SWEPT], device="cpu", **VIEWS)
+
+
+def test_rows_and_means(rows):
+    names = [*(("ablation", name) for name in ABLATION), *(("sweep", name) for name in SWEPT)]
+    scenes = [f"{scene}, ablation of small" for scene in ("sheet day", "cube night", "mean over 2 lightmaps")]
+    assert keys(rows) == names * 3
+    assert [row.scene for row in rows] == [scene for scene in scenes for _ in names]
+    for row in rows:
+        assert row["psnr"] > 5.0 and row["bpp"] == pytest.approx(48 * (1 - row["compression_ratio"]))
+
+
+def test_the_whole_is_the_profile(lightmaps, rows):
+    """The same compression, scored by itself under its own charts."""
+    report = evaluate(compress(lightmaps[1].mesh, PROFILE), lightmaps[1].mesh, **VIEWS)
+    row = next(row for row in rows if row.scene.startswith("cube night") and row.option == "whole")
+    assert row["compression_ratio"] == report.cr
+    for name in ("psnr", "texel_psnr", "one_minus_ssim", "seam_ratio"):
+        assert row[name] == pytest.approx(getattr(report, name)), name
+
+
+def test_each_row_lacks_its_part(rows):
+    cube = {row.option: row for row in rows if row.scene.startswith("cube night")}
+    whole, kept = cube["whole"], cube["no repacking"]
+    # Sides of 48 x 64 by epsilon_p and epsilon_c, without epsilon.
+    sides = ("colour_height", "colour_width", "lut_height", "lut_width")
+    assert [kept[side] for side in sides] == [19, 26, 34, 45] and kept["steps"] == 6
+    assert "pack_seconds" not in kept.figures and "pack_seconds" in whole.figures
+    bare = cube["no cascade"]
+    assert "lut_width" not in bare.figures and bare["steps"] == 0
+    assert bare["colour_width"] > 2 * whole["colour_width"]
+    assert cube["not tuned"]["psnr"] != whole["psnr"] and cube["not tuned"]["bpp"] == whole["bpp"]
+    assert cube["ASTC"]["bpp"] < whole["bpp"] and cube["ASTC"]["colour_width"] == whole["colour_width"]
+    assert cube["scale 0.3"]["lut_width"] < whole["lut_width"] < cube["lut_scale 1"]["lut_width"]
+    assert cube["colour_scale 0.8"]["colour_width"] == pytest.approx(2 * whole["colour_width"], abs=1)
+
+
+def test_rows_make_a_file_and_tables(rows, tmp_path):
+    check_outputs(rows, tmp_path, (Panel("bpp"),))
+
+
+def test_a_missing_package(lightmaps, monkeypatch):
+    monkeypatch.setitem(sys.modules, "astc_encoder", None)  # as if it weren't installed
+    missing, kept = run_rows(lightmaps[:1], PROFILE, ["ASTC", "no repacking"], device="cpu", **VIEWS)[::-1]
+    assert not missing.figures and "astc_encoder is missing" in missing.notes and kept["psnr"] > 5.0
+
+
+def test_what_is_refused(lightmaps):
+    with pytest.raises(WlmError, match="--profile: expected one of method cascade, found half, of tiles"):
+        run(lightmaps, "half", quick=True, device="cpu")
+    with pytest.raises(WlmError, match="--only: expected one of whole, .*lut_scale 1; found 'lut_scale 0.7'"):
+        run(lightmaps, "paper", ["lut_scale 0.7"], quick=True, device="cpu")
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    words = ["atlas-ablation", "--quick", "--profile", "cascade", "--only", "ASTC", "--steps", "9"]
+    command, (lightmaps, *names), options = check_command(monkeypatch, bench, rows[:5], words, tmp_path)
+    assert command == "python -m benchmarks atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC"
+    assert [lightmap.scene for lightmap in lightmaps] == ["room"] and names == ["cascade", ["ASTC"]]
+    assert options["quick"] and options["steps"] == 9
+    # Before any mesh is read.
+    assert "--only: expected one of whole" in fails(
+        "bench", *words[:1], "--only", "none", "--meshes", tmp_path / "none"
+    )

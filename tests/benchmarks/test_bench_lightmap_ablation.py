@@ -1,0 +1,109 @@
+"""The ablation of feature maps on a set of a dynamic tile and one that needs no fit."""
+
+import sys
+
+import numpy as np
+import pytest
+from builders.bench_rows import check_command, check_outputs
+from builders.small_sets import moving_light, static_light, tiny_profile
+from typer.testing import CliRunner
+
+import benchmarks.lightmap_ablation as bench
+from benchmarks import Panel
+from benchmarks.lightmap_ablation import KERNELS, VARIANTS, run, run_rows
+from wlm.errors import WlmError
+from wlm.lightmap.data import from_arrays
+from wlm.metrics import evaluate_frame, summarise
+
+
+@pytest.fixture(scope="module")
+def lightmaps():
+    """The first tile has a pattern whose strength alone changes; of the second, the map has 64 x 50 texels."""
+    parts = [static_light(64, 128), moving_light(64, 50)]
+    frames = np.concatenate([part.frames for part in parts], axis=2)
+    return from_arrays(frames, parts[0].times, period=24.0, name="two")
+
+
+@pytest.fixture(scope="module")
+def made(lightmaps):
+    """All rows, and what was told while they were made."""
+    lines, counts = [], []
+    options = {"progress": lines.append, "done": lambda rows: counts.append(len(rows))}
+    rows = run_rows(lightmaps, tiny_profile(steps=30), device="cpu", **options)
+    return rows, lines, counts
+
+
+def test_every_row_has_its_figures(made, lightmaps):
+    rows, lines, counts = made
+    names = [*VARIANTS, KERNELS]
+    assert [row.option for row in rows] == names and counts == list(range(1, len(names) + 1))
+    assert lines == [f"two, ablation: fits {name}" for name in names]
+    for row in rows:
+        assert (row.system, row.scene, row.method) == ("lightmap", "two, ablation", "ablation")
+        assert row["psnr"] > 10.0 and 0.0 < row["ssim"] < 1.0 and row["dynamic_tiles"] == 1
+        assert row["step_ms"] == pytest.approx(1e3 * row["encode_seconds"] / 30)
+        # The dynamic tile alone is weighed, over what the map has of it.
+        assert row["bpp"] == pytest.approx(8 * row["bytes"] / (64 * 50 * 5))
+    by_name = {row.option: row for row in rows}
+    network = {name: 2 * (features.inputs * 16 + 16 * 16 + 16 * 3 + 35) for name, features in VARIANTS.items()}
+    for name, features in VARIANTS.items():
+        assert by_name[name]["bytes"] == features.bytes + network[name] + 4 * 5 + 12
+
+
+def test_scores_are_those_of_the_dynamic_tile(made, lightmaps):
+    """A fit knows more than its mean; the static tile, which it would score as black, doesn't count."""
+    inside = np.zeros_like(lightmaps.mask)
+    inside[:, 128:] = True
+    means = [np.broadcast_to(frame[inside].mean(0), frame.shape) for frame in lightmaps.frames]
+    flat = summarise([evaluate_frame(a, b, inside) for a, b in zip(lightmaps.frames, means, strict=True)])
+    for row in made[0]:
+        if row.option != KERNELS:  # its maps are smaller here
+            assert row["psnr"] > flat.psnr - 3.0, row.option
+
+
+def test_rows_make_a_file_and_tables(made, tmp_path):
+    check_outputs(made[0], tmp_path, (Panel("bpp"),))
+
+
+def test_one_row_and_a_missing_package(lightmaps, monkeypatch):
+    (row,) = run_rows(lightmaps, tiny_profile(steps=10), ["3D alone"], device="cpu")
+    assert row.option == "3D alone" and row["steps"] == 10
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)  # as if it weren't installed
+    (row,) = run_rows(lightmaps, tiny_profile(steps=10), ["no block simulation"], device="cpu")
+    assert not row.figures and "ispc_texcomp is missing" in row.notes
+
+
+def test_what_is_refused(lightmaps, tmp_path):
+    with pytest.raises(WlmError, match="expected one of hybrid, 2D alone.*found '4D'"):
+        run_rows(lightmaps, tiny_profile(), ["4D"], device="cpu")
+    with pytest.raises(WlmError, match="static: expected a tile whose light changes"):
+        run_rows(static_light(), tiny_profile(), device="cpu")
+    with pytest.raises(WlmError, match="no such file or folder"):
+        run(quick=True, device="cpu", set_path=tmp_path / "absent")
+
+
+def test_lengths(monkeypatch):
+    calls = []
+    monkeypatch.setattr(bench, "load", lambda path: path)
+    monkeypatch.setattr(bench, "run_rows", lambda *args, **options: calls.append(args))
+    run(quick=True, device="cpu", set_path="set")
+    run(["hybrid"], quick=False, device="cpu", set_path="set", steps=70)
+    (_, short, every), (_, long, only) = calls
+    assert (short.steps, short.samples, tuple(every)) == (200, 512, ())
+    assert (long.steps, long.samples, long.name, only) == (70, 4096, "M", ["hybrid"])
+
+
+def test_names_are_checked_before_a_set_is_read(tmp_path):
+    with pytest.raises(WlmError, match="--only: expected one of hybrid, .*; found 'none'"):
+        bench.run(["none"], quick=True, device="cpu", set_path=tmp_path / "none")
+
+
+def test_the_command(made, monkeypatch, tmp_path):
+    from benchmarks.app import app
+
+    words = ["lightmap-ablation", "--quick", "--set", tmp_path / "city", "--steps", "20", "--only", "3D alone"]
+    command, arguments, options = check_command(monkeypatch, bench, made[0], words, tmp_path)
+    expected = "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'"
+    assert command == f"python -m benchmarks {expected}"
+    assert arguments == (["3D alone"],) and options["set_path"] == tmp_path / "city" and options["steps"] == 20
+    assert CliRunner().invoke(app, ["lightmap-ablation", "--steps", "0"]).exit_code == 2

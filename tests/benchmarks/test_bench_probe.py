@@ -1,0 +1,132 @@
+"""The probe benchmark on a small room: every row has its figures, and they agree with the systems that they are of."""
+
+import numpy as np
+import pytest
+from builders.bench_rows import check_command, check_outputs, keys
+from typer.testing import CliRunner
+
+import benchmarks.probe as bench
+from benchmarks import write_json
+from benchmarks.app import app
+from benchmarks.probe import PANELS, run, run_rivals, run_rows, run_volume
+from wlm.errors import WlmError
+from wlm.probe.data import from_arrays
+from wlm.probe.model import Profile
+from wlm.probe.seen import KINDS
+
+STEPS = 60
+PROBES = {"room": 300, "hall": 100}
+PROFILES = [
+    Profile(name="standard", ratio=0.1, latent=3, hidden=8, steps=STEPS),
+    Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
+]
+RIVALS = ["CPCA in halves", "global PCA", "block PCA", "window PCA", "clustered PCA", "CPCA by signal", "moving basis"]
+
+
+def room(seed: int, name: str):
+    """Probes in a room with a lamp, a tenth of them inside a wall."""
+    random, count = np.random.default_rng(seed), PROBES[name]
+    position = random.uniform([0, 0, 0], [6, 2.5, 5], (count, 3))
+    near = np.exp(-((position - [2, 2, 3]) ** 2).sum(1) / 4)
+    values = near[:, None] * random.uniform(0.5, 1.0, 27) + 0.2 * np.sin(position @ random.normal(size=(3, 27)))
+    values[: count // 10] = 0.0
+    return from_arrays(position, values.astype(np.float32), name=name)
+
+
+@pytest.fixture(scope="module")
+def sets():
+    return [room(0, "room"), room(1, "hall")]
+
+
+@pytest.fixture(scope="module")
+def rows(sets):
+    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), shares=(5, 10), frames=4, repeats=1)
+
+
+def test_every_row_has_its_figures(rows):
+    ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20"), ("transform", "5%"), ("transform", "10%")]
+    ways = ["none", "sphere", "sphere lists", "box", "exact", "exact, given order", "cut 2.5", "cut 2"]
+    fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
+    rivals = [(name, size) for size in ("5%", "10%") for name in RIVALS] + [("Unreal packing", "")]
+    held = [("held out", "standard"), ("held out", "5%")]
+    volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours", "5%")]
+    views = [("views", f"balls, {light}") for light in KINDS]
+    for scene, speed in (("room", fits), ("hall", [])):
+        assert keys(row for row in rows if row.scene == scene) == [
+            *ours,
+            *(("decode", way) for way in ways),
+            *speed,
+            *rivals,
+            *held,
+            *volume,
+            *views,
+        ]
+    for row in rows:
+        assert row.system == "probe" and row.notes
+        if row.method in ("ours", "decode"):
+            assert row["psnr"] > 10.0 and row["decode_ms"] > 0.0
+            assert row["error_999"] <= row["max_error"] < (1.0 if "cut" in row.option else 1e-4)
+        if row.method == "ours":
+            assert row["bpp"] == pytest.approx(row["bytes"] * 8 / PROBES[row.scene]) and row["encode_seconds"] > 0.0
+            assert row["probes"] == 0.9 * PROBES[row.scene]
+            assert row["share_of_float32"] == pytest.approx(row["bpp"] / (27 * 32))
+        if row.method == "volume":
+            assert 0.0 <= row["coverage"] <= 1.0 and row["frames"] == 4
+            assert row["psnr"] < row["light_psnr"] + 1.0 and (row["light_psnr"] == 120.0) == ("lossless" in row.option)
+
+
+def test_rivals_keep_to_the_bytes(rows):
+    ours = {(row.scene, row.option): row for row in rows if row.method == "transform"}
+    for row in rows:
+        if row.method in RIVALS and row.figures:
+            transform = ours[row.scene, row.option]
+            assert row["bytes"] <= transform["bytes"] <= 0.1 * PROBES[row.scene] * 27 * 4
+            assert 5.0 < row["psnr"] < transform["psnr"]
+        if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
+            assert row["distance_psnr"] < row["kriging_psnr"] and row["half_way_psnr"] > 10.0
+            assert row.option == "standard" or row["distance_psnr"] < row["psnr"] < row["kriging_psnr"] + 0.5
+
+
+def test_rivals_alone_are_the_same(sets, rows, tmp_path, monkeypatch):
+    write_json(tmp_path / "rows.json", rows, {})
+    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
+    alone = run_rivals(tmp_path / "rows.json", probes_path="room.npz")
+    beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
+    assert keys(alone) == keys(beside)
+    for name in ("bytes", "psnr"):
+        assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
+    write_json(tmp_path / "hall.json", [row for row in rows if row.scene == "hall"], {})
+    with pytest.raises(WlmError, match="expected rows of transforms of room"):
+        run_rivals(tmp_path / "hall.json", probes_path="room.npz")
+
+
+def test_the_volume_alone_is_the_same(sets, rows, monkeypatch):
+    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
+    alone = run_volume(device="cpu", probes_path="room.npz", frames=4)
+    names = [f"{light}, walk of 4 frames" for light in ("lossless", "5%")]
+    beside = [row for row in rows if row.scene == "room" and row.method == "volume" and row.option in names]
+    assert keys(alone) == keys(beside) and len(alone) == 2
+    for name in ("psnr", "light_psnr", "blocks", "coverage"):
+        assert [row[name] for row in alone] == [row[name] for row in beside]
+
+
+def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
+    check_outputs(rows, tmp_path, PANELS)
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    words = ["probe", "--no-rivals", "--probes", tmp_path / "room.npz", "--key", "sh", "--key", "sh_noon"]
+    command, _, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    assert command == "python -m benchmarks probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon"
+    assert options["keys"] == ["sh", "sh_noon"] and not options["rivals"] and not options["quick"]
+
+
+def test_what_is_refused(sets, tmp_path):
+    with pytest.raises(WlmError, match="No such file"):
+        run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
+    result = CliRunner().invoke(app, ["probe", "--volume-only", "--quick"])
+    assert result.exit_code != 0 and "--volume-only: expected without" in str(result.exception)
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
+    with pytest.raises(ValueError, match="at least one set and one profile"):
+        run_rows(sets, [], device="cpu", ratios=(), shares=(), frames=1)

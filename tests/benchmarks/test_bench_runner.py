@@ -1,0 +1,249 @@
+"""Rows, their files, tables and pages, and what all benches share."""
+
+import json
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders.bench_rows import ENVIRONMENT
+
+from benchmarks import Row, Run, Timing, describe_environment, pages, read_json, read_runs, tables, write_json
+from benchmarks.figures import FIGURES, Figure
+from benchmarks.runner import Bench, demo_data, exact_errors
+from wlm.errors import WlmError
+
+OURS = Row("lightmap", "city", "ours", "M", {"bytes": 1234567, "bpp": 0.676, "psnr": 42.5, "max_error": 2e-4}, "a note")
+BARE = Row("probe", "city", "PCA")
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "results.json"
+    environment = {"device": "cpu", "threads": 2, "cuda": None}
+    write_json(path, [OURS, BARE], environment)
+    assert read_json(path) == ([OURS, BARE], environment)
+    assert os.listdir(tmp_path) == ["results.json"]  # nothing temporary is left
+    assert path.read_bytes().endswith(b"\n")
+
+
+def test_figures_are_known_finite_and_plain():
+    row = Row(
+        "l", "s", "m", figures={"psnr": np.float32(2.5), "bytes": 3, "ssim": None, "flip": math.nan, "bpp": math.inf}
+    )
+    assert row.figures == {"psnr": 2.5, "bytes": 3} and type(row["psnr"]) is float and type(row["bytes"]) is int
+    assert row.get("ssim") is None and row.with_figures(ssim=1.0, psnr=None).figures == {"bytes": 3, "ssim": 1.0}
+    with pytest.raises(ValueError, match="unknown figure 'speed'"):
+        row.with_figures(speed=1.0)
+
+
+def test_what_does_not_fit_json_leaves_the_old_file(tmp_path):
+    path = tmp_path / "results.json"
+    write_json(path, [OURS], {})
+    before = path.read_bytes()
+    for value in (math.nan, object()):
+        with pytest.raises(WlmError, match="environment"):
+            write_json(path, [OURS], {"x": value})
+    assert path.read_bytes() == before
+    with pytest.raises(WlmError, match="nowhere"):
+        write_json(tmp_path / "nowhere" / "r.json", [OURS], {})
+
+
+def test_a_run_keeps_what_other_systems_and_scenes_left(tmp_path):
+    path = tmp_path / "results.json"
+    write_json(path, [OURS, replace(OURS, option="H")], {"date": "1"})
+    write_json(path, [BARE], {"date": "2"})
+    assert read_runs(path) == [Run({"date": "1"}, [OURS, replace(OURS, option="H")]), Run({"date": "2"}, [BARE])]
+    assert read_json(path) == ([OURS, replace(OURS, option="H"), BARE], {"date": "2"})
+    # A run of a system replaces the one before.
+    write_json(path, [OURS.with_figures(psnr=50.0)], {"date": "3"})
+    assert read_runs(path) == [Run({"date": "2"}, [BARE]), Run({"date": "3"}, [OURS.with_figures(psnr=50.0)])]
+    write_json(path, [OURS, BARE], {"date": "4"})
+    assert read_runs(path) == [Run({"date": "4"}, [OURS, BARE])]
+    # A run of some rows replaces those alone.
+    better = replace(OURS, option="H").with_figures(psnr=50.0)
+    write_json(path, [better], {"date": "5"}, partial=True)
+    assert read_runs(path) == [Run({"date": "4"}, [OURS, BARE]), Run({"date": "5"}, [better])]
+    write_json(path, [OURS, BARE], {"date": "4"})
+    # Of a run of both, the other system's rows stay with its environment.
+    write_json(path, [BARE.with_figures(psnr=1.0)], {"date": "5"})
+    assert read_runs(path) == [Run({"date": "4"}, [OURS]), Run({"date": "5"}, [BARE.with_figures(psnr=1.0)])]
+    write_json(path, [replace(OURS, scene="another")], {"date": "6"})
+    assert [run.environment["date"] for run in read_runs(path)] == ["4", "5", "6"]
+
+
+def test_what_is_no_result_file_is_not_replaced(tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text('{"mine": 1}')
+    with pytest.raises(WlmError, match="mine.json: not a result file"):
+        write_json(path, [OURS], {})
+    assert path.read_text() == '{"mine": 1}'
+
+
+def rows(*changes):
+    """The document with its one row changed, and maybe more of them."""
+    return lambda d: (
+        d | {"runs": [d["runs"][0] | {"rows": [{**d["runs"][0]["rows"][0], **change} for change in changes]}]}
+    )
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda d: d | {"format": "other"}, "not a result file"),
+        (lambda d: [], "not a result file"),
+        (lambda d: d | {"version": 2}, "version: expected 3, got 2: files of another version .* measured again"),
+        (lambda d: d | {"runs": []}, "expected a list 'runs'"),
+        (lambda d: d | {"runs": [7]}, "run 0: expected a list 'rows'"),
+        (lambda d: d | {"runs": [{"rows": {}, "environment": {}}]}, "'rows'"),
+        (lambda d: d | {"runs": [{"rows": [], "environment": []}]}, "'environment'"),
+        (lambda d: d | {"runs": [*d["runs"], {"rows": [3], "environment": {}}]}, "run 1: row 0: expected an object"),
+        (rows({}, {"speed": 1}), "row 1: unknown field 'speed'"),
+        (rows({"method": None}), "row 0: field 'method': expected str, got None"),
+        (rows({"figures": [1]}), "field 'figures': expected dict"),
+        (rows({"figures": {"psnr": "42"}}), "figure 'psnr': expected a number, got '42'"),
+        (rows({"figures": {"psnr": True}}), "figure 'psnr': expected a number, got True"),
+        (rows({"figures": {"speed": 1.0}}), "unknown figure 'speed'"),
+    ],
+)
+def test_a_broken_file_is_named_with_its_fault(tmp_path, edit, message):
+    path = tmp_path / "results.json"
+    write_json(path, [OURS], {})
+    path.write_text(json.dumps(edit(json.loads(path.read_text()))))
+    with pytest.raises(WlmError, match=message) as caught:
+        read_json(path)
+    assert "results.json" in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe"])
+def test_no_json_at_all(tmp_path, content):
+    path = tmp_path / "results.json"
+    path.write_bytes(content)
+    for file in (path, tmp_path / "absent.json"):
+        with pytest.raises(WlmError, match="cannot read|not valid JSON"):
+            read_json(file)
+
+
+def test_environment_says_what_a_figure_depends_on(tmp_path):
+    import torch
+    import warp
+
+    environment = describe_environment("cpu", "python -m benchmarks city")
+    assert environment["numpy"] == np.__version__ and environment["warp"] == warp.config.version
+    assert environment["torch"].split("+")[0] == torch.__version__.split("+")[0]
+    assert environment["threads"] == torch.get_num_threads()
+    assert environment["command"] == "python -m benchmarks city" and environment["device_name"]
+    write_json(tmp_path / "r.json", [], environment)
+    assert read_json(tmp_path / "r.json") == ([], environment)
+    with pytest.raises(WlmError):
+        describe_environment("cuda:77", "")
+
+
+def test_a_bench_times_its_rows_and_stores_its_fits():
+    counts, said = [0, 0], []
+    bench = Bench("probe", "cpu", said.append, scene="city", warmup=1, repeats=2)
+
+    def call(index):
+        def run():
+            counts[index] += 1
+
+        return run
+
+    # Equal rows must not be confused with each other.
+    row = bench.row("PCA")
+    timed = bench.time_rows([(row, call(0)), (row, call(1))])
+    assert row == BARE and len(timed) == 2 and min(counts) >= 4 and said == ["city: timing the decoders, in turns"]
+    for row in timed:
+        assert set(row.figures) == {"decode_ms", "decode_ms_spread"} and row["decode_ms"] > 0.0
+    assert bench.missing_row("PCA", "half", WlmError("no room")).notes == "not measured: no room"
+    with pytest.raises(WlmError, match="tpu"):
+        Bench("probe", "tpu")
+
+
+def test_times_of_a_call_that_does_several_things():
+    timing = Timing(median_ms=8.0, p10_ms=7.0, p90_ms=9.0, n=3)
+    assert BARE.with_timing(timing, "time_ms", 4).figures == {"time_ms": 2.0, "time_ms_spread": 0.5}
+    assert BARE.with_timing(replace(timing, n=1)).figures == {"decode_ms": 8.0}  # one sample has no spread
+
+
+def test_errors_against_float64():
+    exact = np.zeros((2000, 2))
+    decoded = np.full((2000, 2), 0.25)
+    decoded[7] = 3.0
+    assert exact_errors(decoded, exact) == {"max_error": 3.0, "error_999": 0.25}
+
+
+def test_data_of_the_demos():
+    assert demo_data("city", "--set").is_dir()
+    with pytest.raises(WlmError, match="absent.npz, come with a checkout alone; expected --probes FILE"):
+        demo_data("probes/absent.npz", "--probes FILE")
+
+
+def test_figures_have_units_and_formats():
+    cases = {
+        ("mlups", 23825.4): "23,825",
+        ("mlups", 6.036): "6.04",
+        ("of_copy", 0.90961): "91",
+        ("bytes", 1e6): "1,000,000",
+    }
+    cases |= {("bias", 0.031): "+3.1", ("psnr", 42.456): "42.46", ("rms", 6.3e-5): "0.0063"}
+    for (name, value), text in cases.items():
+        assert FIGURES[name].text(value) == text
+    assert FIGURES["psnr"].text(42.456, ".0f") == "42"
+    assert Figure("size", "bpp").heading == "size, bpp" and Figure("size", "bpp").label == "size (bpp)"
+    assert Figure("SSIM").heading == Figure("SSIM").label == "SSIM"
+
+
+def test_a_narrow_table_has_its_notes():
+    fast = Row("smoke", "jet", "lattice", "a", {"cells": 16, "time_ms": 1.0})
+    slow = Row("smoke", "jet", "lattice", "b", {"cells": 16, "mlups": 7.0}, "s | w\nx")
+    rule = Row("smoke", "plume", "weights", "c", {"bias": 0.01})
+    assert tables([fast, slow, rule]) == (
+        "#### lattice: jet\n\n"
+        "|  | time, ms | MLUPS | edge, cells | notes |\n"
+        "| --- | ---: | ---: | ---: | --- |\n"
+        "| a | 1 |  | 16 |  |\n"
+        "| b |  | 7 | 16 | s \\| w x |\n"
+        "\n#### weights: plume\n\n"
+        "|  | bias, % |\n"
+        "| --- | ---: |\n"
+        "| c | +1.0 |\n"
+    )
+    assert tables([]) == ""
+
+
+def test_a_wide_table_is_parted_and_has_footnotes():
+    plain = replace(OURS.with_figures(decode_ms=0.5), notes="")
+    wide = [OURS.with_figures(encode_seconds=2.0), replace(plain, method="strip"), replace(OURS, notes="words " * 30)]
+    assert tables(wide) == (
+        "#### city\n\n"
+        "Size and error:\n\n"
+        "|  |  | size, bytes | size, bpp | PSNR, dB | largest error | note |\n"
+        "| --- | --- | ---: | ---: | ---: | ---: | --- |\n"
+        "| ours | M | 1,234,567 | 0.676 | 42.50 | 0.0002 | 1 |\n"
+        "| strip | M | 1,234,567 | 0.676 | 42.50 | 0.0002 |  |\n"
+        "| ours | M | 1,234,567 | 0.676 | 42.50 | 0.0002 | 2 |\n"
+        "\nTime:\n\n"
+        "|  |  | encode, s | decode time, ms | note |\n"
+        "| --- | --- | ---: | ---: | --- |\n"
+        "| ours | M | 2 |  | 1 |\n"
+        "| strip | M |  | 0.5 |  |\n"
+        "\n1. a note\n"
+        f"2. {'words ' * 30}\n"
+    )
+
+
+def test_pages_by_system(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_json("a.json", [OURS], ENVIRONMENT)
+    write_json("a.json", [Row("smoke-network", "s", "frame", "x", {"time_ms": 1.0})], ENVIRONMENT)
+    write_json("b.json", [OURS], ENVIRONMENT | {"device_name": "", "cuda": "13.0"})
+    made = pages(["a.json", "b.json"], "docs/all.md")
+    assert list(made) == ["all.md", "all/lightmap.md", "all/smoke.md"]
+    head = "Made by `python -m benchmarks report a.json b.json -o docs/all.md`; changes by hand are lost."
+    assert all(head in page for page in made.values())
+    assert "- [lightmap](all/lightmap.md): a CPU, cpu" in made["all.md"]
+    assert "## a CPU: `a.json`" in made["all/lightmap.md"] and "## cpu: `b.json`" in made["all/lightmap.md"]
+    heading = "### smoke-network, 2026-01-02\n\n`python -m benchmarks --json a.json`; 1 threads, Python 3"
+    assert heading in made["all/smoke.md"]
+    assert "torch 2, CUDA 13.0.\n\n#### city\n" in made["all/lightmap.md"]

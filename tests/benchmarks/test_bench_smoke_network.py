@@ -1,0 +1,221 @@
+"""The networks' benchmark on tiny grids: every row has its figures, and they agree with what they are of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from builders.bench_rows import by_option, check_command, check_outputs
+
+import benchmarks.path_tracer as path_tracer
+import benchmarks.smoke_network as bench
+import benchmarks.smoke_network_rivals as rivals
+from benchmarks.path_tracer import PathTracer, denoise
+from benchmarks.smoke_network import PANELS, plotted, run, run_rows
+from benchmarks.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
+from wlm.config import profile_names
+from wlm.errors import WlmError
+from wlm.smoke.baking import bake
+from wlm.smoke.codec import shipped
+from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
+from wlm.smoke.scene import CameraSettings, make_camera
+
+TINY = replace(
+    QUICK,
+    refine=2,
+    resolution=32,
+    kinds=("jet",),
+    frames=2,
+    six=(4.0, 1.0, 0.5),
+    coarse=(4.0, 0.8),
+    swept=((4.0, 1.0), (0.8, 4.0)),
+    turns=(0.0, 60.0),
+    scales=(1.0, 2.0),
+    profile=16,
+    samples=(1,),
+    repeats=1,
+)
+STEP = 0.8  # of a guiding map of 32 voxels
+NETWORK = NetworkSettings(guide="six", width=8, levels=2, stem=2)
+SETTINGS = DatasetSettings(guide="six")
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    """A file with a network that is as it begins: its outputs are the guide's own planes."""
+    path = tmp_path_factory.mktemp("networks") / "young.safetensors"
+    torch.manual_seed(1)
+    SmokeModel(SixWayNetwork(NETWORK), {"dataset": SETTINGS.model_dump(mode="json")}).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def rows(network):
+    """Without a path tracer, whether there is one or not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rivals, "has_tracer", lambda: False)
+        untrained = Subject("raw", SmokeModel(SixWayNetwork(NETWORK), {}), SETTINGS, False)
+        return run_rows(TINY, [*open_subjects([network], []), untrained], device="cpu")
+
+
+def test_every_row_has_its_figures(rows):
+    methods = ["time against error", "frame", "flip book", "profiles", "density"]
+    assert list(dict.fromkeys(row.method for row in rows)) == methods
+    labels = [(row.method, row.option) for row in rows]
+    assert len(set(labels)) == len(labels)
+    for row in rows:
+        assert (row.system, row.scene) == ("smoke-network", "unseen smoke")
+        assert row.method == "density" or row["time_ms"] > 0.0
+        assert "psnr" not in row.figures or row["psnr_min"] <= row["psnr"] <= row["psnr_max"]
+
+
+def test_time_against_error(rows):
+    table = by_option(rows, "time against error")
+    psnr = {option: row.get("psnr") for option, row in table.items()}
+    assert psnr["six ways, step 0.5"] is None and table["six ways, step 0.5"].notes == "the reference"
+    assert psnr["six ways, step 1"] > psnr["six ways, step 4"] + 6.0
+    assert psnr["coarse, h 0.8"] > psnr["coarse, h 4"] + 6.0
+    between = psnr["coarse, h 4, nodes 1"], psnr["coarse, h 0.8, nodes 4"]
+    assert psnr["coarse, h 4"] < min(between) and max(between) < psnr["coarse, h 0.8"]
+    # A network that hasn't learned yet gives back its guide, which is the coarse march.
+    assert psnr["young, fp32"] == pytest.approx(psnr["coarse, h 0.8"], abs=0.01)
+    assert psnr["raw, fp32"] is None and table["raw, fp32"].notes == "not trained"
+
+
+def test_parts_of_a_frame(rows):
+    frame = by_option(rows, "frame")
+    for name in ("young", "raw"):
+        parts = [frame[f"{name}, {part}"]["time_ms"] for part in ("guide", "network", "decode")]
+        assert frame[f"{name}, all four"]["time_ms"] == pytest.approx(sum(parts) + frame["shade"]["time_ms"])
+    assert "32x32x32" in frame["simulation"].notes
+
+
+def test_flip_book(rows):
+    """Right from where it was baked, and wrong from elsewhere, where march and network are as good as ever."""
+    turned = by_option(rows, "flip book")
+    assert turned["turned 0°"]["psnr"] > 60.0 > 35.0 > turned["turned 60°"]["psnr"]
+    for row in turned.values():
+        assert row.notes == "coarse march of h 0.8, network young"
+        assert row["coarse_psnr"] > 40.0 and row["network_psnr"] == pytest.approx(row["coarse_psnr"], abs=0.01)
+
+
+def test_profiles(rows):
+    profiles = by_option(rows, "profiles")
+    names = [name.removeprefix("network-") for name in profile_names("smoke") if name.startswith("network-")]
+    assert list(profiles) == [f"{name}, fp32" for name in names] and {"16", "24", "32", "fast"} <= set(names)
+    for row in profiles.values():
+        assert row["file_size"] == pytest.approx(2e-6 * row["parameters"])
+
+
+def test_density_and_flicker(rows):
+    density = by_option(rows, "density")
+    marches = [f"coarse, h {h}" for h in ("0.8", "0.4", "0.24")]
+    assert list(density) == [f"{name}, x{scale}" for scale in (1, 2) for name in ("young", *marches)]
+    for scale in (1, 2):
+        network, march = density[f"young, x{scale}"], density[f"coarse, h 0.8, x{scale}"]
+        assert network["psnr"] == pytest.approx(march["psnr"], abs=0.05)
+        assert 0.9 < march["flicker_ratio"] < 1.5 and march["flicker"] > 0.0
+    assert density["coarse, h 0.8, x2"]["psnr"] < density["coarse, h 0.8, x1"]["psnr"]
+
+
+def test_a_score():
+    references = [torch.zeros(8, 4, 4), torch.ones(8, 4, 4)]
+    predicted = [torch.full((8, 4, 4), 0.1), torch.ones(8, 4, 4) - 0.01]
+    predicted[0][6:] = 9.0  # opacity and emission don't count
+    expected = {"psnr": 30.0, "psnr_min": 20.0, "psnr_max": 40.0}
+    assert score(predicted, references) == pytest.approx(expected, abs=1e-3)
+
+
+def test_scenes_that_do_not_come_up():
+    with pytest.raises(WlmError, match="expected scenes of jet, whirl, got "):
+        NetworkBench("cpu", replace(TINY, kinds=("jet", "whirl"), cells=16, refine=1, resolution=8), [])
+
+
+def test_networks_are_named_and_read(network, tmp_path):
+    (subject,) = open_subjects([network], [])
+    assert subject.name == "young" and subject.trained and subject.settings == SETTINGS
+    (raw,) = open_subjects([], ["16"])
+    assert raw.name == "network-16 untrained" and not raw.trained and raw.model.settings.width == 16
+    with pytest.raises(WlmError, match="got young 2 times"):
+        open_subjects([network, network], [])
+    with pytest.raises(WlmError, match="nosuch"):
+        open_subjects([], ["nosuch"])
+    path = tmp_path / "bare.safetensors"
+    SmokeModel(SixWayNetwork(NETWORK), {}).save(path)
+    with pytest.raises(WlmError, match="summary.dataset"):
+        open_subjects([path], [])
+
+
+def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
+    points = plotted(rows)
+    check_outputs(rows, tmp_path, PANELS, points)
+    assert [row.method for row in points] == ["six ways"] * 3 + ["coarse"] * 4 + ["young", "raw"]
+    assert points[0].option == "step 4" and points[-3].option == "h 0.8, nodes 4"
+
+
+def test_the_command(rows, network, tmp_path, monkeypatch):
+    words = ["smoke-network", "--quick", "--network", network, "--profile", "16"]
+    command, arguments, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    assert command == "python -m benchmarks smoke-network --quick --device cpu --network young.safetensors --profile 16"
+    assert arguments == ([network], ["16"]) and options["quick"] and options["device"] == "cpu"
+    # Without any, the network that ships; a profile alone stays alone.
+    for words, expected in (([], ([shipped()], ())), (["--profile", "16"], ([], ["16"]))):
+        assert check_command(monkeypatch, bench, rows, ["smoke-network", *words], tmp_path)[1] == expected
+
+
+def test_networks_or_profiles_are_needed(monkeypatch):
+    calls = []
+    monkeypatch.setattr(bench, "run_rows", lambda sizes, subjects, **options: calls.append((sizes, subjects)))
+    with pytest.raises(WlmError, match="^bench: expected --network FILE or --profile NAME, found neither$"):
+        run(quick=True, device="cpu")
+    run([], ["16"], quick=True, device="cpu")
+    ((sizes, (subject,)),) = calls
+    assert sizes == QUICK and subject.name == "network-16 untrained"
+
+
+def test_without_the_extra(monkeypatch):
+    monkeypatch.setattr(path_tracer, "has_tracer", lambda: False)
+    monkeypatch.setattr(path_tracer, "has_denoiser", lambda: False)
+    volume, camera = _plume()
+    with pytest.raises(WlmError, match=r"mitsuba: install wlm\[bake\]"):
+        PathTracer(volume, camera)
+    with pytest.raises(WlmError, match=r"pyoidn: install wlm\[bake\]"):
+        denoise(np.zeros((6, 8, 8)))
+    with pytest.raises(ValueError, match="orthographic"):
+        PathTracer(volume, replace(camera, perspective=True))
+
+
+def test_a_path_tracer_finds_the_same_light():
+    """Its noise is the most of what it differs by, and where that is much a denoiser takes most of it away."""
+    pytest.importorskip("mitsuba")
+    volume, camera = _plume()
+    # A tracer's pixels are means over their area.
+    march = bake(volume, camera, step=0.5, supersample=4, estimate=False)
+    trace = PathTracer(volume, camera)
+    lightmaps, transparency = trace(256)
+    exact = march.lightmaps.numpy()
+    np.testing.assert_allclose(lightmaps.mean((1, 2)), exact.mean((1, 2)), rtol=0.04)
+    assert np.abs(transparency - march.transparency.numpy()).mean() < 0.02
+    few, _ = trace(4)
+    fine, rough = (float(np.square(images - exact).mean()) for images in (lightmaps, few))
+    # 64 times the samples, and as many times less of the mean square.
+    assert fine < 2e-4 and rough == pytest.approx(64.0 * fine, rel=0.4)
+    pytest.importorskip("pyoidn")
+    assert float(np.square(denoise(few) - exact).mean()) < 0.3 * rough
+
+
+def test_rows_of_a_path_tracer():
+    pytest.importorskip("mitsuba")
+    traced = by_option(rivals.traced_rows(NetworkBench("cpu", TINY, [])), "path tracing")
+    plain = traced["1 sample"]
+    assert 5.0 < plain["psnr"] < 30.0 and plain["time_ms"] > 0.0
+    if path_tracer.has_denoiser():
+        cleaned = traced["1 sample, denoised"]
+        assert cleaned["psnr"] > plain["psnr"] + 3.0 and cleaned["time_ms"] > plain["time_ms"]
+
+
+def _plume():
+    volume = make_plume(24, hot=False, extinction=14.0)
+    return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))

@@ -1,0 +1,165 @@
+"""The benchmark of light of all orders on tiny pictures: every row, who is nearest."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from builders.bench_rows import ENVIRONMENT, check_command
+from builders.orders import input_alone
+from builders.smoke_plumes import facing, plume
+
+import benchmarks.rivals.smoke_orders as rivals
+import benchmarks.smoke_orders as bench
+from benchmarks import read_json, tables, write_json
+from benchmarks.path_tracer import denoised_picture
+from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves, three_octaves
+from benchmarks.runner import Bench
+from benchmarks.smoke_grids import METHOD as GRIDS
+from benchmarks.smoke_grids import GridSizes, grid_rows
+from benchmarks.smoke_orders import ALBEDOS, METHOD, QUICK, run, run_rows
+from benchmarks.smoke_other_light import INSIDE, PHASES
+from wlm.errors import WlmError
+from wlm.smoke.camera import Camera
+from wlm.smoke.shading import Light
+from wlm.smoke.transport.learning import psnr
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.orders import OrdersModel, load_orders
+from wlm.smoke.transport.tracing import trace
+
+SINGLE = GridSizes((12, 16), extinctions=(20.0,), pixels=10, samples=64)
+SMALL = {"plumes": 1, "pixels": 10, "samples": 96, "scale": 0.08, "frames": 20, "sides": 1}
+OTHER = {"views": 1, "samples": 32, "cells": 12}
+TINY = replace(QUICK, **SMALL, repeats=1, single=SINGLE, other=OTHER)
+WAYS = (
+    "single scattering",
+    "single x gain",
+    "three octaves",
+    "fitted octaves",
+    "fitted filter",
+    "diffusion",
+    "learned mix",
+)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    with pytest.MonkeyPatch.context() as patch:
+        # Of fifteen octaves a few: each is a march.
+        for module in (bench, rivals):
+            patch.setattr(module, "FITTED", FITTED[::4])
+        return run_rows(TINY, device="cpu")
+
+
+def test_every_row_has_its_figures(rows):
+    """Of each scene and albedo each way, what a frame takes by it, and the references' noise; flicker of the jet."""
+    scenes = [f"{name}, albedo {albedo:g}" for name in ("plumes", "jet") for albedo in ALBEDOS]
+    assert list(dict.fromkeys(row.scene for row in rows)) == [*scenes, "single lights", "plumes", "plume and cloud"]
+    assert [row.option for row in rows if row.method == GRIDS] == ["12 voxels", "16 voxels"]
+    phases, inside = ([row for row in rows if row.method == method] for method in (PHASES, INSIDE))
+    assert len(phases) == 8 and len(inside) == 9 and all(np.isfinite(row["psnr"]) for row in phases + inside)
+    assert all(row["gain"] > 3.0 for row in phases) and all(abs(row["bias"]) < 1.0 for row in inside)
+    for scene in scenes:
+        found = {row.option: row for row in rows if row.scene == scene}
+        denoised = {"1 sample, denoised"} if importlib.util.find_spec("pyoidn") else set()
+        assert set(found) == {*WAYS, "path tracing"} | denoised
+        for option, row in found.items():
+            assert (row.system, row.method) == ("smoke", METHOD) and row["pixels"] == 10 and row["lights"] == 3
+            assert row["psnr_min"] <= row["psnr"] <= row["psnr_max"]
+            if option == "path tracing":
+                assert row["samples"] == 96 and row["psnr"] > 30.0
+                continue
+            assert 0 < row["flip"] <= row["flip_max"] and row["time_ms"] > 0
+            assert ("flicker" in row.figures) == scene.startswith("jet")
+
+
+def test_who_is_nearest(rows):
+    """The mix to all light of a plume, then diffusion, and single scattering farthest off."""
+    for albedo in ALBEDOS:
+        found = {row.option: row for row in rows if row.scene == f"plumes, albedo {albedo:g}"}
+        rivals = {"single scattering": 8.0, "single x gain": 4.0, "three octaves": 4.0, "diffusion": 1.0}
+        for rival, gain in rivals.items():
+            assert found["learned mix"]["psnr"] > found[rival]["psnr"] + gain
+            assert found["learned mix"]["flip"] < found[rival]["flip"]
+        assert found["single x gain"]["psnr"] > found["single scattering"]["psnr"] + 3.0
+        assert found["fitted octaves"]["psnr"] > found["three octaves"]["psnr"] + 1.0
+
+
+def test_a_mix_that_takes_from_its_input_is_seen():
+    """By the least gain of any light; one that hands on its input has none."""
+    bench_ = Bench("smoke", "cpu", None, clock="time_ms", warmup=0, repeats=1, few=1)
+    model = load_orders()
+    wild, none = OrdersModel(1.5 * model.weights, model.known), input_alone()
+    sizes = replace(SINGLE, grids=(12,))
+    worst, still = (grid_rows(bench_, sizes, each)[0] for each in (wild, none))
+    assert worst["gain_min"] < -0.5 and abs(still["gain_min"]) < 1e-3 and abs(still["gain"]) < 1e-3
+    assert worst["voxels"] == 12 and still["psnr_min"] <= still["psnr"]
+
+
+def test_flicker_is_what_the_smokes_motion_leaves():
+    """Of a picture that moves as its smoke does there is none; of one that stays, the reference's and more."""
+    random = torch.Generator().manual_seed(2)
+    picture = torch.rand(16, 16, 3, generator=random)
+    later = picture.roll(2, 1)
+    motion = torch.stack([torch.full((16, 16), 2.0), torch.zeros(16, 16)])
+    volume, camera = plume(), facing(plume(), size=16)
+    shots = [bench.Shot(volume, camera, (), 0), bench.Shot(volume, camera, (), 1, motion)]
+    noise = [0.02 * torch.randn(16, 16, 3, generator=random) for _ in range(4)]
+    light = torch.full((16, 16, 3), 0.3)
+    halves = [(light + noise[0], light + noise[1]), (1.5 * light + noise[2], 1.5 * light + noise[3])]
+    opacity = [torch.ones(16, 16)] * 2
+    assert bench._flicker(shots, [picture, later], halves, opacity)["flicker"] < 1e-3
+    brighter = bench._flicker(shots, [light, 1.5 * light], halves, opacity)
+    # The references' noise isn't counted as their change.
+    assert brighter["flicker"] > 20 and brighter["flicker_ratio"] == pytest.approx(1.0, abs=0.06)
+    # Those that stay have nothing that a picture's flicker could be compared with.
+    still = [(0.0 * light, 0.0 * light)] * 2
+    assert set(bench._flicker(shots, [light, 1.5 * light], still, opacity)) == {"flicker"}
+
+
+def test_plumes_of_finer_voxels_are_the_same_smoke():
+    """What a GPU's rows are of: resampled, as opaque as before from the same side."""
+    plain, fine = (bench._plume(replace(TINY, cells=20, voxels=voxels), 3, "cpu") for voxels in (None, 50))
+    assert fine.volume.shape == (50, 50, 50) and fine.camera == plain.camera
+    assert [light.irradiance for light in fine.lights] == [light.irradiance for light in plain.lights]
+    assert fine.volume.size == pytest.approx(plain.volume.size)
+    clear = [light_smoke(shot.volume, shot.camera, ()).transparency for shot in (plain, fine)]
+    assert clear[0].min() < 0.8 and torch.allclose(*clear, atol=0.05)
+    assert sum(np.sum(light.irradiance) for light in fine.lights) == pytest.approx(12 * np.pi)
+
+
+def test_rows_make_a_file_and_a_table(rows, tmp_path):
+    write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
+    assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT)
+    assert "| learned mix |" in tables(rows)
+
+
+def test_the_command(rows, tmp_path, monkeypatch):
+    command, _, options = check_command(monkeypatch, bench, rows, ["smoke-orders", "--quick"], tmp_path)
+    assert command == "python -m benchmarks smoke-orders --quick --device cpu" and options["quick"]
+
+
+def test_what_is_refused(monkeypatch):
+    with pytest.raises(WlmError, match="device 'tpu'"):
+        run(quick=True, device="tpu")
+    monkeypatch.setattr("benchmarks.path_tracer.has_denoiser", lambda: False)
+    with pytest.raises(WlmError, match=r"needs pyoidn: install wlm\[bake\]"):
+        denoised_picture(torch.zeros(4, 4, 3))
+
+
+def test_rivals_are_nearer_than_single_scattering(device: str):
+    """A thick plume from aside; octaves of the smoke's own extinction are single scattering."""
+    volume = plume(device=device)
+    camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=16)
+    lights = [Light((1.0, 0.5, 0.6))]
+    wanted = trace(volume, camera, lights, samples=256).total
+    once = light_smoke(volume, camera, lights).shade()
+    assert psnr(three_octaves(volume, camera, lights, 1.0), wanted) > psnr(once, wanted) + 2.0
+    planes = filter_planes(volume, camera, lights)
+    assert planes.shape == (1, 12 * (1 + len(SCALES)), 16, 16)
+    # A blur keeps what doesn't leave the image.
+    assert float(planes[0, 6].sum()) == pytest.approx(float(planes[0, 0].sum()), rel=0.02)
+    assert torch.allclose(planes[0, 30:], planes[0, 3] * planes[0, :30], atol=1e-6)
+    made = octaves(volume, camera, lights)
+    assert made.shape == (len(FITTED), 16, 16, 3) and torch.allclose(made[0], once, atol=0.02)

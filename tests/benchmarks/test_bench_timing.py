@@ -1,0 +1,98 @@
+"""Timing: what is called how often and in which order; no test asserts a time."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from benchmarks import Timing, time_together, timing
+from wlm.errors import WlmError
+
+
+def fake_clock(monkeypatch, seconds_a_call):
+    """A clock that only calls move, by name."""
+    now = [0.0]
+    log = []
+
+    def make(name):
+        def call():
+            log.append(name)
+            now[0] += seconds_a_call[name]
+
+        return call
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    return {name: make(name) for name in seconds_a_call}, log
+
+
+def test_distribution_is_of_one_call(monkeypatch):
+    now = [0.0]
+    durations = iter([9.0, 9.0, 9.0, *(k / 1000.0 for k in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22))])
+
+    def call():
+        now[0] += next(durations)
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    # Two calls to warm up and one to see how long a call is are not in the distribution.
+    result = time_together({"": call}, warmup=2, repeats=11)[""]
+    assert result.n == 11
+    assert (result.median_ms, result.p10_ms, result.p90_ms) == pytest.approx((12.0, 4.0, 20.0))
+
+
+def test_short_calls_are_batched_to_a_millisecond(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.0003})
+    result = time_together(calls, warmup=1, repeats=3)["a"]
+    assert len(log) == 1 + 1 + 3 * 4
+    assert result.median_ms == pytest.approx(0.3)
+
+
+def test_a_call_that_takes_no_time_ends(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.0})
+    assert time_together(calls, warmup=1, repeats=1)["a"].median_ms == 0.0
+    assert len(log) == 2 + 1000
+
+
+def test_peers_take_turns_and_the_first_changes(monkeypatch):
+    calls, log = fake_clock(monkeypatch, {"a": 0.01, "b": 0.02, "c": 0.03})
+    result = time_together(calls, warmup=2, repeats=3)
+    assert log[:9] == ["a"] * 3 + ["b"] * 3 + ["c"] * 3
+    assert "".join(log[9:]) == "abcbcacab"
+    assert {name: t.median_ms for name, t in result.items()} == pytest.approx({"a": 10, "b": 20, "c": 30})
+
+
+def test_no_peers():
+    assert time_together({}) == {}
+
+
+@pytest.mark.parametrize(("warmup", "repeats"), [(0, 5), (5, 0)])
+def test_counts_are_checked(warmup, repeats):
+    with pytest.raises(WlmError, match="at least 1"):
+        time_together({"": lambda: None}, warmup=warmup, repeats=repeats)
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:77", "cuda:x", ""])
+def test_unknown_devices_are_refused(name):
+    with pytest.raises(WlmError):
+        time_together({"": lambda: None}, name)
+
+
+def test_an_error_in_a_call_is_not_hidden():
+    def broken():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        time_together({"": broken})
+
+
+def test_every_device_gives_a_finite_time_and_does_the_work(device):
+    """The calls are made, and what comes back is an ordered distribution."""
+    x = torch.zeros(1, device=device)
+    size = 2048 if device != "cpu" else 64
+    a = torch.ones(size, size, device=device)
+    calls = {"little": lambda: x.add_(1.0), "much": lambda: a @ a}
+    result = time_together(calls, device, warmup=2, repeats=5)
+    assert x.item() >= 2 + 1 + 5
+    for t in result.values():
+        assert all(math.isfinite(v) and v > 0.0 for v in dataclasses.astuple(t))
+        assert isinstance(t, Timing) and t.p10_ms <= t.median_ms <= t.p90_ms
