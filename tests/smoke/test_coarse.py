@@ -9,11 +9,10 @@ import torch
 from builders.smoke_plumes import facing, plume
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import march, march_planes
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
+from wlm.smoke.march.fine import bake
 from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke.settings import March
 
@@ -27,7 +26,7 @@ def _camera(volume: DensityVolume, size: int = 24, toward: tuple[float, float, f
 
 
 def _march(volume: DensityVolume, camera: Camera, **settings) -> SixWay:
-    return march(volume, camera, March(**settings))
+    return bake_coarse(volume, camera, March(**settings))
 
 
 def _planes(volume: DensityVolume, camera: Camera, **settings) -> torch.Tensor:
@@ -151,10 +150,10 @@ def test_sums_are_the_guiding_map(device: str):
     volume = plume(device=device)
     camera = _camera(volume)
     settings = {"jitter": 0.0, "threshold": 0.05, "g": -0.2}
-    six, maps = (method(volume, camera, March(2.5, **settings)) for method in (march, guide))
+    six, maps = (method(volume, camera, March(2.5, **settings)) for method in (bake_coarse, guide))
     torch.testing.assert_close(six.transparency, maps.transparency, rtol=0, atol=1e-6)
     torch.testing.assert_close(six.depth, maps.depth, rtol=0, atol=1e-5)
-    six, maps = (method(volume, camera, March(1.0, **settings)) for method in (march, guide))
+    six, maps = (method(volume, camera, March(1.0, **settings)) for method in (bake_coarse, guide))
     light = six["front"] + six["top"] + six["bottom"]
     assert float((light - maps.light).abs().mean()) < 0.005 * float(maps.light.max())
 

@@ -1,16 +1,4 @@
-"""A path tracer of volumes: light of every order of scattering in a density grid, without bias.
-
-Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick, through which an optical
-depth that is drawn once is spent. Where a density is needed, one of the eight voxels around the place is drawn by its
-weight: either tracking asks for no more than its mean, which is that of `density_at`. At each scattering every
-light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
-by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
-
-Units are those of `march`. Light of order n has been
-scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
-Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
-"""
+"""Random numbers and directions of paths: a phase function's, and a sky's by its brightness."""
 
 import functools
 import math
@@ -21,9 +9,222 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, Medium, View, density_at, phase, ray
-from wlm_kernels.smoke.path_walk import drawn, enter, onward
-from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
+from wlm_kernels.smoke.march import BRICK, Medium, View, clip, density_at, phase, ray
+
+_TWO_PI = wp.constant(2.0 * math.pi)
+
+
+@wp.struct
+class Sky:
+    """Light from infinitely far off, a map of texels of one radiance each.
+
+    Row 0 is around +y; column 0 begins at +x and columns go on towards +z. `rows` and `columns` are running sums of the
+    chances of a row, and of a column within its row. `total` is the integral of the mean radiance over the sphere.
+    """
+
+    radiance: wp.array2d[wp.vec3]
+    rows: wp.array1d[float]
+    columns: wp.array2d[float]
+    total: float
+
+
+@wp.struct
+class Way:
+    """A direction, its chance per solid angle, and the random state after it."""
+
+    direction: wp.vec3
+    chance: float
+    random: wp.uint64
+
+
+@wp.func
+def stir(x: wp.uint64) -> wp.uint64:
+    x = x ^ (x >> wp.uint64(31))
+    x = x * wp.uint64(6364136223846793005)
+    x = x ^ (x >> wp.uint64(29))
+    x = x * wp.uint64(3935559000370003845)
+    return x ^ (x >> wp.uint64(32))
+
+
+@wp.func
+def following(random: wp.uint64) -> wp.uint64:
+    return random * wp.uint64(6364136223846793005) + wp.uint64(1442695040888963407)
+
+
+@wp.func
+def bits(random: wp.uint64) -> wp.uint32:
+    """32 random bits (PCG-XSH-RR, O'Neill 2014)."""
+    x = wp.uint32(((random >> wp.uint64(18)) ^ random) >> wp.uint64(27))
+    turn = wp.uint32(random >> wp.uint64(59))
+    return (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
+
+
+@wp.func
+def uniform(random: wp.uint64) -> float:
+    """A number of at least 0 and below 1, of 24 bits."""
+    return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
+
+
+@wp.func
+def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
+    """A direction by the Henyey-Greenstein phase function of a path that goes along d."""
+    cosine = 1.0 - 2.0 * u
+    if wp.abs(g) > 1.0e-3:
+        share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
+        cosine = (1.0 + g * g - share * share) / (2.0 * g)
+    cosine = wp.clamp(cosine, -1.0, 1.0)
+    sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
+    # Two directions across d without a division by nearly 0 (Duff et al. 2017).
+    sign = wp.where(d[2] >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + d[2])
+    b = d[0] * d[1] * a
+    across = wp.vec3(1.0 + sign * d[0] * d[0] * a, sign * b, -sign * d[0])
+    beside = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
+    angle = _TWO_PI * v
+    return wp.normalize(cosine * d + sine * (wp.cos(angle) * across + wp.sin(angle) * beside))
+
+
+@wp.func
+def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
+    """The sky's radiance in a direction."""
+    rows = sky.radiance.shape[0]
+    columns = sky.radiance.shape[1]
+    row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
+    turn = wp.atan2(d[2], d[0])
+    if turn < 0.0:
+        turn += _TWO_PI
+    column = int(turn / _TWO_PI * float(columns))
+    return sky.radiance[wp.clamp(row, 0, rows - 1), wp.clamp(column, 0, columns - 1)]
+
+
+@wp.func
+def chance_of(sky: Sky, radiance: wp.vec3) -> float:
+    """Chance per solid angle of a direction in a texel."""
+    return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
+
+
+@wp.func
+def toward_sky(sky: Sky, random: wp.uint64) -> Way:
+    """A direction by the sky's brightness."""
+    way = Way()
+    rows = sky.radiance.shape[0]
+    columns = sky.radiance.shape[1]
+    random = following(random)
+    u = uniform(random)
+    row = int(0)
+    past = rows - 1
+    while row < past:
+        middle = (row + past) // 2
+        if sky.rows[middle] > u:
+            past = middle
+        else:
+            row = middle + 1
+    random = following(random)
+    u = uniform(random)
+    column = int(0)
+    past = columns - 1
+    while column < past:
+        middle = (column + past) // 2
+        if sky.columns[row, middle] > u:
+            past = middle
+        else:
+            column = middle + 1
+    top = wp.cos(0.5 * _TWO_PI * float(row) / float(rows))
+    bottom = wp.cos(0.5 * _TWO_PI * float(row + 1) / float(rows))
+    random = following(random)
+    height = wp.lerp(top, bottom, uniform(random))
+    random = following(random)
+    turn = _TWO_PI * (float(column) + uniform(random)) / float(columns)
+    across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
+    way.direction = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
+    way.chance = chance_of(sky, sky.radiance[row, column])
+    way.random = random
+    return way
+
+
+_NEVER = wp.constant(1.0e30)
+_TENTH_BIT = wp.constant(1.0 / 1024.0)
+
+
+@wp.struct
+class Walk:
+    """A ray's walk through bricks: the one that it is in, from `t` to `border` along the ray, which ends at `end`.
+
+    `leave` has the distances at which it leaves the brick along each axis, `across` those that it takes through one.
+    """
+
+    cell: wp.vec3i
+    leave: wp.vec3
+    across: wp.vec3
+    t: float
+    border: float
+    end: float
+    most: float
+
+
+@wp.func
+def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
+    """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
+    if d > 1.0e-9 and cell < count - 1:
+        return (float(cell + 1) * edge - p) / d
+    if d < -1.0e-9 and cell > 0:
+        return (float(cell) * edge - p) / d
+    return _NEVER
+
+
+@wp.func
+def enter(bounds: wp.array3d[float], edge: float, size: wp.vec3, p: wp.vec3, d: wp.vec3, limit: float) -> Walk:
+    """The brick in which a ray begins; none where it misses the smoke, or up to its limit."""
+    w = Walk()
+    span = clip(size, p, d)
+    w.t = wp.max(span[0], 0.0)
+    w.end = wp.min(span[1], limit)
+    for axis in range(3):
+        at = int(wp.floor((p[axis] + w.t * d[axis]) / edge))
+        w.cell[axis] = wp.clamp(at, 0, bounds.shape[axis] - 1)
+        w.leave[axis] = _border(w.cell[axis], bounds.shape[axis], edge, p[axis], d[axis])
+        w.across[axis] = edge / wp.max(wp.abs(d[axis]), 1.0e-9)
+    w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+    w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
+    return w
+
+
+@wp.func
+def _further(cell: int, count: int, leave: float, across: float) -> float:
+    """Distance at which a ray leaves the brick that it has come to along an axis."""
+    return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
+
+
+@wp.func
+def onward(w: Walk, bounds: wp.array3d[float], d: wp.vec3) -> Walk:
+    """The walk in the next brick, or at its end."""
+    w.t = w.border
+    if w.t < w.end:
+        if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
+            w.cell[0] += wp.where(d[0] > 0.0, 1, -1)
+            w.leave[0] = _further(w.cell[0], bounds.shape[0], w.leave[0], w.across[0])
+        elif w.leave[1] <= w.leave[2]:
+            w.cell[1] += wp.where(d[1] > 0.0, 1, -1)
+            w.leave[1] = _further(w.cell[1], bounds.shape[1], w.leave[1], w.across[1])
+        else:
+            w.cell[2] += wp.where(d[2] > 0.0, 1, -1)
+            w.leave[2] = _further(w.cell[2], bounds.shape[2], w.leave[2], w.across[2])
+        w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+        w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
+    return w
+
+
+@wp.func
+def drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
+    """The density of one of the voxels around a place, whose mean is that of `density_at`."""
+    x = bits(random)
+    i = int(wp.floor(p[0] + (float(x & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    j = int(wp.floor(p[1] + (float((x >> wp.uint32(10)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    k = int(wp.floor(p[2] + (float((x >> wp.uint32(20)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    if i < 0 or j < 0 or k < 0 or i >= density.shape[0] or j >= density.shape[1] or k >= density.shape[2]:
+        return 0.0
+    return float(density[i, j, k])
+
 
 _OPTIONS = {"enable_backward": False}
 _NEVER = wp.constant(1.0e30)

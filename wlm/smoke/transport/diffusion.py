@@ -14,10 +14,10 @@ import warp as wp
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import to_warp
-from wlm.smoke.marching import medium_of
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.transport.lighting import Depths, Marching
 from wlm.smoke.transport.lights import AnyLight, PointLight, in_voxels
-from wlm_kernels.smoke import diffusion, fluence
+from wlm_kernels.smoke import diffusion
 
 CELLS = 32
 """Of a grid of diffusion, along the longest edge."""
@@ -147,7 +147,7 @@ class CoarseSmoke:
             return light
         extinction, source, out = (to_warp(part) for part in (self.extinction, source.contiguous(), light))
         three = wp.vec3(*albedos, *[0.0] * (3 - len(albedos)))
-        fluence.spread(self.medium, extinction, source, wp.vec3(*self.edges), three, len(albedos), out)
+        diffusion.spread(self.medium, extinction, source, wp.vec3(*self.edges), three, len(albedos), out)
         return light
 
     def seen(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

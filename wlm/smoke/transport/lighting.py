@@ -17,7 +17,7 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera
-from wlm.smoke.marching import medium_of
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
 from wlm_kernels.smoke import march_lights
