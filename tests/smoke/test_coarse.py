@@ -13,7 +13,8 @@ from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
 from wlm.smoke.march.fine import bake
-from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke import depth_lattice, march_coarse
+from wlm_kernels.smoke import march as kernels
 from wlm_kernels.smoke.settings import March
 
 TURNED = (0.5, 0.3, 1.0)
@@ -180,8 +181,8 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     camera = _camera(volume)
     skipped = _planes(volume, camera, step=1.5)
     made = []
-    occupied = march_coarse.occupied
-    monkeypatch.setattr(march_coarse, "occupied", lambda medium: made.append(occupied(medium)) or made[-1])
+    occupied = kernels.occupied
+    monkeypatch.setattr(kernels, "occupied", lambda medium: made.append(occupied(medium)) or made[-1])
     _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
@@ -244,11 +245,12 @@ def test_nodes_are_bounded(device: str):
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
         box = SimpleNamespace(origin=np.zeros(3), voxel=1.0, shape=shape)
         view = _camera(volume, toward=VIEWS["diagonal"]).view(box)
-        lattice, counts = march_coarse._lattice(shape, view, spacing)
+        axes = (view.right, view.up, view.forward)
+        lattice, counts = depth_lattice.make_lattice(shape, axes, spacing, view.origin)
         assert min(counts) >= 2 and np.prod(counts, dtype=float) < 1.01 * 2**28
         # They cover the eight corners.
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(shape) + 1.0) - 0.5 - np.array(view.origin)
-        for axis, along in enumerate((view.right, view.up, view.forward)):
+        for axis, along in enumerate(axes):
             ends = lattice.low[axis], lattice.low[axis] + (counts[axis] - 1) * lattice.gap[axis]
             reach = corners @ np.array(along)
             assert ends == pytest.approx((reach.min(), reach.max()), rel=1e-5, abs=1e-2)
