@@ -75,7 +75,7 @@ _DIMENSION_2D, _DIMENSION_3D = 3, 4
 # Size, flags, height, width; pixel format: size, flags, code; caps 2. Then the DX10 header.
 _READ_HEADER = struct.Struct("<4s 4I 56x 2I 4s 24x I 12x")
 _DX10 = struct.Struct("<5I")  # format, dimension, flags, array size, alpha mode
-_DEPTH, _DEPTH_AT = struct.Struct("<I"), 24
+_DEPTH_FIELD, _DEPTH_AT = struct.Struct("<I"), 24
 _MOST_VOLUME_BYTES = 1 << 26
 _CAPS2_CUBE = 0x200
 _FLAG_CUBE = 0x4
@@ -244,7 +244,7 @@ def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, in
     expected = (b"DX10", DXGI_FORMATS[fmt], _DIMENSION_3D)
     if (code, number, dimension) != expected or not caps2 & _CAPS2_VOLUME:
         raise WlmError(f"{path}: expected a volume texture of {fmt}, found another kind")
-    found = (columns, rows, *_DEPTH.unpack_from(data, _DEPTH_AT))
+    found = (columns, rows, *_DEPTH_FIELD.unpack_from(data, _DEPTH_AT))
     if found != size or len(data) != head + 4 * width * height * depth:
         raise WlmError(
             f"{path}: expected {width} x {height} x {depth} texels, found {' x '.join(map(str, found))} "
