@@ -12,7 +12,13 @@ that leaves a model consumes it: the raw folder and the engine kits of `wlm.expo
     smoke     first, second, motion, depth
 
 `valid` is R8_UNORM and 255 inside charts. The textures of smoke are R8G8B8A8_UNORM. A texture or buffer that a model
-has no use for is left out.
+has no use for is left out. Of the documents they read these keys, among others:
+
+    lightmap  width, height, times, period, interpolation, time_axis, tau, slices, record, hour_fours, tile_columns,
+              tile_size, hidden, gamma, tiles; images: by texture name the size [width, height] of one tile's image and
+              the number of images across; values (of a part that is not light): what 0 and 1 stand for
+    atlas     uv_set, states, sheets, objects (label, node, sheet, scale_offset)
+    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, motion_scale
 """
 
 from collections.abc import Mapping
@@ -20,6 +26,12 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
+
+INDEX_FILE = "bundle.json"
+"""Name of the index of every folder that `wlm.export` writes."""
+
+FORMAT = "wlm-bundle"
+"""`format` of these indexes."""
 
 RESERVED = frozenset(
     ("format", "version", "system", "name", "engine", "shader", "textures", "buffers", "reference", "files", "parts")
@@ -100,6 +112,7 @@ class Bundle:
             Empty for a single item.
         exact: Name of the macro with which the shader fetches texels and mixes them in floats, where it otherwise
             uses the texture filter; empty if it has no such variant.
+        model: The model itself, for kits that sample it at other places than it stores: grids of probes.
     """
 
     system: str
@@ -112,6 +125,7 @@ class Bundle:
     files: Mapping[str, bytes] = field(default_factory=dict)
     parts: Mapping[str, "Bundle"] = field(default_factory=dict)
     exact: str = ""
+    model: Any = None
 
     @property
     def nbytes(self) -> int:
