@@ -21,7 +21,8 @@ from wlm.smoke.data import load_frames, read_shaded, read_six_way
 from wlm.smoke.exporter import read_flipbook
 from wlm.smoke.guiding import guide
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
-from wlm.view.smoke import picture, to_bytes
+from wlm.view.pictures import to_bytes
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 LIGHT = LightSettings(toward=(1, 1, 1)).light()

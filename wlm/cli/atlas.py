@@ -277,8 +277,9 @@ def decode(
         write_exr(output, picture)
     else:
         from wlm.atlas.views import mesh_views
-        from wlm.view.atlas import draw, encode, save_png
+        from wlm.view.atlas import draw
         from wlm.view.display import white_of
+        from wlm.view.pictures import encode, save_png
 
         cameras = mesh_views(mesh, views)
         if view >= len(cameras):

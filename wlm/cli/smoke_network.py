@@ -206,7 +206,7 @@ def dataset(
     from wlm.smoke.learn.dataset import STAGES, make_pool, make_validation
     from wlm.smoke.learn.pool import save_pool
     from wlm.smoke.learn.settings import DatasetSettings
-    from wlm.view.smoke_pool import pool_sheet
+    from wlm.view.smoke import pool_sheet
 
     settings = load_settings(DatasetSettings, settings_file)
     try:
