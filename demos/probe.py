@@ -14,9 +14,6 @@ import sys
 import time
 from pathlib import Path
 
-from wlm.view.opening import open_scene
-from wlm.view.window import Window
-
 import wlm
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
@@ -24,6 +21,8 @@ from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.probe.light import light_of
 from wlm.probe.walk import camera_path, settle, summary, walk
+from wlm.view.opening import open_scene
+from wlm.view.window import Window
 
 HERE = Path(__file__).resolve().parent
 STEPS = 5000
