@@ -84,9 +84,8 @@ def light(
     _check_white(white)
     own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
     quiet_warp()
-    from wlm.smoke.transport.features import orders_march
     from wlm.smoke.transport.lighting import light_smoke
-    from wlm.smoke.transport.orders import load_orders, scatter
+    from wlm.smoke.transport.orders import load_orders, orders_march, scatter
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
     from wlm.view.smoke import picture
     from wlm_kernels.smoke.settings import March

@@ -100,6 +100,6 @@ def _book(book: Any) -> Bundle:
         pixels[..., : page.shape[2]] = page
         codes = np.round(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
         textures[name] = Texture.from_texels(codes, "R8G8B8A8_UNORM")
-    from wlm.smoke.billboard import billboard_shader
+    from wlm.smoke.flipbook.shader import billboard_shader
 
     return Bundle("smoke", "smoke", billboard_shader(book), document, textures)

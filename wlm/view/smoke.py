@@ -11,10 +11,10 @@ import warp as wp
 from wlm.interop import device_name, stream, to_warp
 from wlm.ops.raster import rasterize
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
-from wlm.smoke.guiding import Guide
-from wlm.smoke.learn.pool import Pool
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import GUIDES, PLANES
+from wlm.smoke.march.coarse import Guide
+from wlm.smoke.network.planes import GUIDES, PLANES
+from wlm.smoke.network.pool import Pool
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
 from wlm.smoke.transport.lighting import LitSmoke
