@@ -25,8 +25,8 @@ from wlm.errors import WlmError
 from wlm.export.bundles import bundle_of
 from wlm.export.engines.kit import ENGINES
 from wlm.export.files import write_buffer, write_reference, write_texture
+from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.folder import compact_json, made_parents, read_index, staged
-from wlm.shading import ENDINGS, check_language, translate
 
 _VERSION = 1
 _KITS = {
