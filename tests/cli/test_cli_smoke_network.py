@@ -172,7 +172,7 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     monkeypatch.setattr(codec, "shipped", lambda: network)
     text = call("smoke", "evaluate", "--resolution", 16, "--json", tmp_path / "a.json")
     assert str(network) in text.replace("\n", "") and json.loads((tmp_path / "a.json").read_text())["cells"] == 16
-    monkeypatch.setattr(onnx_file, "export", lambda model, path, **size: model.settings.width)
+    monkeypatch.setattr(onnx_file, "export_onnx", lambda model, path, **size: model.settings.width)
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 

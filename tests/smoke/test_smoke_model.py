@@ -23,7 +23,7 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse
 from wlm.smoke.march.fine import bake
 from wlm.smoke.model import SmokeModel, parameter_count
-from wlm.smoke.network.onnx_file import export
+from wlm.smoke.network.onnx_file import export_onnx
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
 from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
@@ -289,7 +289,7 @@ def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
 
 def test_onnx_of_no_pixels_is_refused(tmp_path):
     with pytest.raises(ValueError, match="pixel"):
-        export(random_model(), tmp_path / "a.onnx", height=0, width=22)
+        export_onnx(random_model(), tmp_path / "a.onnx", height=0, width=22)
     assert not (tmp_path / "a.onnx").exists()
 
 
@@ -301,7 +301,7 @@ def test_onnx_computes_the_same(tmp_path, kind, stem):
     runtime = pytest.importorskip("onnxruntime")
     model = random_model(guide=kind, stem=stem, levels=2)
     path = tmp_path / "a.onnx"
-    assert export(model, path, height=18, width=22) == path.stat().st_size
+    assert export_onnx(model, path, height=18, width=22) == path.stat().st_size
     guide = torch.rand(1, len(GUIDES[kind]), 18, 22)
     (planes,) = runtime.InferenceSession(path).run(["lightmaps"], {"guide": guide.numpy()})
     assert np.allclose(planes, model.network(guide).detach(), atol=1e-5)

@@ -11,6 +11,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from wlm.errors import WlmError
+from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.exr import write_exr
@@ -21,7 +22,6 @@ from wlm.lightmap.model import TILE, LightmapModel, decode_scale, encode_time
 from wlm.lightmap.page import MapDecoder
 from wlm.lightmap.shader import EXACT, decode_glsl
 from wlm.lightmap.tiles import UNPACKED, TileKind
-from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-lightmap-export"
 _VERSION = 2
@@ -104,7 +104,7 @@ def export(
         device: Where the frame is decoded.
         values: What the levels 0 and 1 of a model without gamma stand for: `frame.exr` and the shader have values, and
             `weights.json` says so. None: the model is of radiance.
-        shader: Its language, one of `wlm.shading.LANGUAGES`.
+        shader: Its language, one of `wlm.export.shading.LANGUAGES`.
         exact: Texels are fetched and mixed in floats where the filter unit would do.
 
     Returns:

@@ -142,7 +142,7 @@ def export(
         model: The model.
         directory: The folder; made if it isn't there.
         device: Where the frames to compare with are decoded.
-        shader: Its language, one of `wlm.shading.LANGUAGES`.
+        shader: Its language, one of `wlm.export.shading.LANGUAGES`.
         exact: The shader fetches texels and mixes them in floats, rather than to have them filtered.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The bundle of a flip book of six-way lightmaps: its textures, and the shader of a billboard that plays it."""
+"""The bundle of a flip book: its textures in 8 bits, and the shader that shows it on a billboard."""
 
 import numpy as np
 
@@ -8,43 +8,44 @@ from wlm.smoke.camera import ALPHA
 from wlm.smoke.flipbook.book import Book
 from wlm.smoke.flipbook.shader import billboard_shader
 
-_ABOUT = (
-    "A flip book of six-way lightmaps of smoke: frames in rows of cells from the top left, each of frame_size pixels"
-    " with padding around it, linear and premultiplied by opacity; light is multiplied by gain. channels: content of"
-    " each texture's channels; a direction is where the light comes from, as seen from the camera. motion: to the right"
-    " and up to the next frame, in shares of a frame, 127/255 + motion / (2 motion_scale). depth: distance of the smoke"
-    " in front of the billboard in heights of a frame, 127/255 + depth / (2 depth_scale). rate: frames per second."
-    " extent: width and height of the view in the world's unit. levels: smallest mip level at which frames do not show"
-    " their neighbours. clipped: texels above the range of 8 bits. The shader reads the textures."
-)
+_MOST = 255  # largest level of 8 bits
+
+_ABOUT = {
+    "textures": "Frames of six-way lightmaps are in rows of cells from the top left, each of frame_size pixels with "
+    "padding around it. They are linear and premultiplied by the opacity; light is multiplied by gain. channels names "
+    "the direction from which the light of each channel comes, as seen from the camera.",
+    "motion": "Motion to the right and up until the next frame, in fractions of a frame: 127/255 + motion / (2 "
+    "motion_scale).",
+    "depth": "Distance of the smoke in front of the billboard, in heights of a frame: 127/255 + depth / (2 depth_scale).",
+    "rate": "Frames per second.",
+    "extent": "Width and height of the region that a frame shows, in world units.",
+    "levels": "Number of mip levels; beyond them frames bleed into their neighbours.",
+    "clipped": "Number of values above the range of 8 bits, which are clipped.",
+}
 
 
-def bundle(book: Book, *, device: str = "cpu", name: str = "smoke") -> Bundle:
+def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
     """Makes the bundle of a flip book.
 
     Args:
-        book: The flip book, from `wlm.smoke.flipbook.book.pack_book`.
-        device: Not used: a flip book is an image already.
-        name: Name of the smoke.
-
-    Returns:
-        Textures `first`, `second` and, if the book has them, `motion` and `depth`, all R8G8B8A8_UNORM, linear; the
-        shader of the billboard; and a document that describes them.
+        book: The flip book, with an opacity.
+        name: Name of the smoke, for an engine's assets.
+        device: Not used: a flip book is already on the CPU.
 
     Raises:
-        WlmError: The flip book has no opacity, or light that is not finite.
+        WlmError: There is no opacity, or light is not finite.
     """
     if not any(ALPHA in names for names in book.channels.values()):
         raise WlmError(f"{name}: has no opacity: expected an alpha channel, or a texture of it")
     textures, clipped = {}, 0
     for key, page in book.pages.items():
         if not np.isfinite(page).all():
-            raise WlmError(f"{name}: {key}: expected finite light, found NaN or infinity")
+            raise WlmError(f"{name}: {key}: cannot export: expected finite light, found NaN or infinity")
         clipped += int((page > 1.0).sum())
         pixels = np.ones((*page.shape[:2], 4), np.float32)
         pixels[..., : page.shape[2]] = page
-        codes = np.round(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
-        textures[key] = Texture(codes, "R8G8B8A8_UNORM", page.shape[1], page.shape[0])
+        levels = np.round(np.clip(pixels, 0.0, 1.0) * _MOST).astype(np.uint8)
+        textures[key] = Texture.from_texels(levels, "R8G8B8A8_UNORM")
     height, width = book.size
     document = {
         "about": _ABOUT,
@@ -57,10 +58,10 @@ def bundle(book: Book, *, device: str = "cpu", name: str = "smoke") -> Bundle:
         "padding": book.padding,
         "levels": book.levels,
         "gain": book.gain,
-        "motion_scale": book.scale,
-        "depth_scale": book.reach,
         "rate": book.rate,
         "extent": [book.extent * width / height, book.extent],
+        "motion_scale": book.scale,
+        "depth_scale": book.reach,
         "clipped": clipped,
     }
     return Bundle("smoke", name, billboard_shader(book), document, textures)
