@@ -25,12 +25,13 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import Score, of_network, score
+from wlm.smoke.model import parameter_count
 from wlm.smoke.network.dataset import make_pool, make_validation
 from wlm.smoke.network.planes import PLANES
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import DatasetSettings, Profile
 from wlm.smoke.network.trainer import Trainer, plan_round
-from wlm.smoke.network.unet import SixWayNetwork, parameter_count
+from wlm.smoke.network.unet import SixWayNetwork
 
 METHOD = "ablation"
 """The table of these rows."""

@@ -274,3 +274,8 @@ def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
         "transparency": to_bytes(guide.transparency),
         "depth": _grey(grey),
     }
+
+
+def _grey(plane: torch.Tensor) -> np.ndarray:
+    levels = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
+    return np.repeat(levels[..., None], 3, axis=2)
