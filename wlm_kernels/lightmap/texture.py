@@ -1,6 +1,6 @@
 """A map as one texture of RGB9E5 texels with mips, from decoded tiles.
 
-Read first: `wlm.lightmap.page.MapDecoder`.
+See `wlm.lightmap.runtime_texture.MapDecoder`.
 """
 
 import warp as wp
@@ -16,13 +16,13 @@ def _place(
     tiles: wp.array3d[wp.uint32],
     corners: wp.array1d[wp.vec2i],
     # out:
-    page: wp.array2d[wp.uint32],
+    texture: wp.array2d[wp.uint32],
 ):
     n, i, j = wp.tid()
     y = corners[n][0] + i
     x = corners[n][1] + j
-    if y < page.shape[0] and x < page.shape[1]:
-        page[y, x] = tiles[n, i, j]
+    if y < texture.shape[0] and x < texture.shape[1]:
+        texture[y, x] = tiles[n, i, j]
 
 
 @wp.kernel
@@ -31,13 +31,13 @@ def _paint(
     colours: wp.array1d[wp.vec3],
     corners: wp.array1d[wp.vec2i],
     # out:
-    page: wp.array2d[wp.uint32],
+    texture: wp.array2d[wp.uint32],
 ):
     n, i, j = wp.tid()
     y = corners[n][0] + i
     x = corners[n][1] + j
-    if y < page.shape[0] and x < page.shape[1]:
-        page[y, x] = pack_rgb9e5(colours[n])
+    if y < texture.shape[0] and x < texture.shape[1]:
+        texture[y, x] = pack_rgb9e5(colours[n])
 
 
 @wp.kernel
@@ -49,7 +49,7 @@ def _halve(
     coarse: wp.array2d[wp.uint32],
 ):
     y, x = wp.tid()
-    # The last texel of an odd side takes three.
+    # The last texel of an odd side covers three texels.
     bottom = wp.where(y == coarse.shape[0] - 1, fine.shape[0], 2 * y + 2)
     right = wp.where(x == coarse.shape[1] - 1, fine.shape[1], 2 * x + 2)
     light = wp.vec3()
@@ -70,53 +70,53 @@ def _fill(
     target: wp.array1d[wp.vec2i],
     source: wp.array1d[wp.vec2i],
     # in and out:
-    page: wp.array2d[wp.uint32],
+    texture: wp.array2d[wp.uint32],
 ):
     g = wp.tid()
-    page[target[g][0], target[g][1]] = page[source[g][0], source[g][1]]
+    texture[target[g][0], target[g][1]] = texture[source[g][0], source[g][1]]
 
 
-def place(tiles, corners, page) -> None:
+def place(tiles, corners, texture) -> None:
     """Puts decoded tiles into the texture.
 
     Args:
         tiles: uint32 [n, 128, 128], RGB9E5.
-        corners: vec2i [n], row and column of each tile's first texel; what lies outside the map is left out.
-        page: uint32 [H, W], changed.
+        corners: vec2i [n], row and column of each tile's first texel; texels outside the map are left out.
+        texture: uint32 [H, W], changed.
     """
-    wp.launch(_place, tiles.shape, inputs=[tiles, corners], outputs=[page], device=page.device)
+    wp.launch(_place, tiles.shape, inputs=[tiles, corners], outputs=[texture], device=texture.device)
 
 
-def paint(colours, corners, side: int, page) -> None:
+def paint(colours, corners, side: int, texture) -> None:
     """Puts tiles of one colour each into the texture.
 
     Args:
         colours: vec3 [n], radiance.
-        corners: vec2i [n], as of `place`.
-        side: Texels along a tile's side.
-        page: uint32 [H, W], changed.
+        corners: vec2i [n], as for `place`.
+        side: Texels along a side of a tile.
+        texture: uint32 [H, W], changed.
     """
     dim = (len(colours), side, side)
-    wp.launch(_paint, dim, inputs=[colours, corners], outputs=[page], device=page.device)
+    wp.launch(_paint, dim, inputs=[colours, corners], outputs=[texture], device=texture.device)
 
 
 def halve(fine, weight, coarse) -> None:
-    """Makes the next smaller mip: means of two by two texels, by weight.
+    """Makes the next smaller mip level: weighted means of two by two texels.
 
     Args:
         fine: uint32 [h, w].
-        weight: float [h, w], of each texel: 0 in gaps.
-        coarse: uint32 [max(h // 2, 1), max(w // 2, 1)], written; 0 where nothing has a weight.
+        weight: float [h, w], weight of each texel; 0 in gaps.
+        coarse: uint32 [max(h // 2, 1), max(w // 2, 1)], written; 0 without any weight.
     """
     wp.launch(_halve, coarse.shape, inputs=[fine, weight], outputs=[coarse], device=coarse.device)
 
 
-def fill(target, source, page) -> None:
-    """Gives texels in gaps the light of others.
+def fill(target, source, texture) -> None:
+    """Gives texels in gaps the light of other texels.
 
     Args:
         target: vec2i [G], row and column of the texels that are filled.
-        source: vec2i [G], of those whose light they take; none is a target.
-        page: uint32 [H, W], changed.
+        source: vec2i [G], row and column of the texels whose light they take; none is a target.
+        texture: uint32 [H, W], changed.
     """
-    wp.launch(_fill, target.shape, inputs=[target, source], outputs=[page], device=page.device)
+    wp.launch(_fill, target.shape, inputs=[target, source], outputs=[texture], device=texture.device)

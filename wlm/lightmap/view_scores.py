@@ -1,77 +1,206 @@
-"""How right a decoded lightmap set is where it is seen: filtered, between the stored hours, while time passes.
+"""Error of a decoded lightmap set where it is shown: filtered, between the stored hours, over time, in views of a mesh.
 
 The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels at the stored times. A renderer reads
 elsewhere: it filters, so that texels of the gaps between charts and of neighbouring tiles count too, at any hour. The
-scores here are over the same tiles and times, relative to the same range, the tile's at that time:
+scores here are over the same tiles and times, relative to the same range, that of the tile at that time:
 
 - `seen`: bilinear reads at 4 random points of each valid texel, uniform over its area and the same in every run, from
   the decoded map and from the original whose gaps hold the nearest valid texel. Both are clamped at the map's ends.
 - `ring`: the texels of the gaps that touch a valid one, corners included, against the same original. A tile with fewer
   than `wlm.metrics.MIN_VALID_TEXELS` of them has none.
 - `between`: the valid texels half-way between neighbouring stored times, against the mean of the two originals, which
-  is the light that eq. 2 of neural-dynamic-gi gives; in a set with a period also between the last time and the first.
-- `border`: of the points of `seen` those that read two tiles or more, against the other points of the same tiles:
+  is the light of eq. 2 of neural-dynamic-gi; in a set with a period also between the last time and the first.
+- `border`: of the points of `seen`, the ones that read two tiles or more against the other points of the same tiles:
 
-      sqrt(sum n b / sum n i)     n the former's count, b and i both mean squares, summed over tiles and times
+      sqrt(sum n b / sum n i)     n count of the former, b and i both mean squares, summed over tiles and times
 
-  of errors relative to the range of the tile that a texel belongs to, before they are filtered. By the range of
-  the reading tile alone a dark tile beside a bright one would be blamed for the other's error: noise of an equal share
-  of every tile's range would score 1.39 and 4.6 on two lightmaps of a game, where no border shows.
+  of errors relative to the range of the tile that a texel belongs to, before they are filtered. Relative to the range
+  of the reading tile, a dark tile beside a bright one would be blamed for the other's error: noise of an equal share of
+  every tile's range would score 1.39 and 4.6 on two lightmaps of a game, where no border is visible.
 
 - `flicker`: two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
   times, spread evenly over the day. With D the decoded and R the original light (eq. 2), the mean over valid texels of
 
       max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
 
-  and over tiles and steps. 0: nothing moves faster than it does in the original. An interval shorter than the two steps
-  has shorter ones.
+  and over tiles and steps. 0: nothing moves faster than in the original. An interval shorter than the two steps has
+  shorter ones.
 
-Views of the set's mesh are in `wlm.lightmap.views`.
+Views: cameras are spread evenly on a sphere around the set's mesh (`wlm.ops.views`), each at one of the set's times in
+turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the lightmap's light at its
+surface point, read bilinearly, without shading; the gaps of the original are filled. Both are displayed alike: with the
+exposure of that time, from the valid texels of the original (`wlm.texels.exposure`), Reinhard's curve and sRGB. Pixels
+without a surface are black in both, and do not count.
 """
+
+from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import torch
 from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 
+from wlm import system
 from wlm.errors import WlmError
-from wlm.lightmap.data import LightmapSet
+from wlm.formats.geometry import Geometry, read_geometry
+from wlm.interop import check_device
+from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.tiles import TILE, TileGrid
-from wlm.lightmap.views import NO_VIEWS, Views, ViewScore
-from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, evaluate_frame, psnr_from_mse
+from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, psnr_from_mse
 from wlm.metrics.tiled import nanmean
-from wlm.texels import nearest_valid
+from wlm.ops import raster
+from wlm.ops.views import sphere_views, visible_points
+from wlm.texels import exposure, filmic, nearest_valid, to_srgb
 
-POINTS = 4
-"""Random points of each valid texel."""
-
-_SEED = 0
-_INTERVALS, _STEPS = 12, 2  # of `flicker`
-_STEPS_OF_PERIOD, _STEP = 480, 0.05  # a step of `flicker`; without a period in hours
+VIEWS, RESOLUTION = 50, 512
+"""Number of cameras, and pixels along a side of a view."""
 
 
 @dataclass(frozen=True)
-class SeenScore(ViewScore):
-    """The error where light is seen, see `wlm.lightmap.seen`. What has nothing to be measured on is NaN or None.
+class ViewScore(system.Report):
+    """The error in views. Without a view that shows the mesh it is NaN or None.
+
+    Attributes:
+        views: Number of views that show the mesh.
+        view_psnr: PSNR of the displayed colours in [0, 1], over the covered pixels of all views, dB.
+        view_flip: FLIP, mean over the covered pixels of all views, in [0, 1].
+        worst_view: The view with the lowest PSNR: `view` (its number), `time`, `psnr`, `flip`.
+    """
+
+    views: int
+    view_psnr: float
+    view_flip: float
+    worst_view: dict[str, float | int] | None
+
+
+NO_VIEWS = ViewScore(0, math.nan, math.nan, None)
+"""The score of a set without a mesh."""
+
+
+class Views:
+    """Accumulates the error in views, time by time."""
+
+    def __init__(
+        self,
+        lightmaps: SheetFrames,
+        geometry: Geometry,
+        count: int,
+        indices: Sequence[int] | np.ndarray | None = None,
+        device: str = "cpu",
+    ) -> None:
+        """Places the cameras.
+
+        Args:
+            lightmaps: The sheet, for its times, its mask and the exposures.
+            geometry: The mesh, with UVs.
+            count: Number of cameras.
+            indices: Indices of the times that will be added; None: all.
+            device: Device that draws: "cpu", "cuda" or "cuda:N".
+
+        Raises:
+            WlmError: There is no such device, or the mesh is a point.
+        """
+        self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
+        low, high = geometry.box
+        if not (high > low).any():
+            raise WlmError("expected a mesh with a size, found all of its corners in one place")
+        times = range(len(lightmaps.times)) if indices is None else [int(index) for index in indices]
+        self._cameras: dict[int, list[int]] = {index: [] for index in times}
+        for number in range(count):
+            self._cameras[times[number % len(times)]].append(number)
+        self._views = sphere_views(count)
+        self._rows: list[dict[str, float | int]] = []
+        self._pictures = Pictures()
+
+    def add(self, index: int, original: np.ndarray, decoded: np.ndarray) -> None:
+        """Draws the views of a time.
+
+        Args:
+            index: Index of the time.
+            original: Linear radiance, float32 [H, W, 3], with gaps filled.
+            decoded: The decoded map.
+        """
+        numbers = self._cameras[index]
+        if not numbers:
+            return
+        gain = np.float32(exposure(self._lightmaps.frames[index][self._lightmaps.mask]))
+        images = [torch.tensor(image, device=self._device) for image in (original, decoded)]
+        mesh, cameras = self._geometry, [self._views[number] for number in numbers]
+        drawn = visible_points(mesh.position, mesh.triangle, mesh.uv, cameras, RESOLUTION, self._device, cull=True)
+        for number, (visible, _, uv) in zip(numbers, drawn, strict=True):
+            hit = (visible >= 0).cpu().numpy()
+            pictures = []
+            for image in images:
+                light = raster.texture(image, uv).cpu().numpy() * gain
+                pictures.append(to_srgb(filmic(np.maximum(light, 0.0))) * hit[..., None])
+            figures = self._pictures.add(*pictures, hit)
+            if figures is not None:
+                self._rows.append({"view": number, "time": float(self._lightmaps.times[index])} | figures)
+
+    def score(self) -> ViewScore:
+        """Returns the score of the added times."""
+        if not self._rows:
+            return NO_VIEWS
+        worst = min(self._rows, key=lambda row: row["psnr"])
+        return ViewScore(len(self._rows), self._pictures.psnr, self._pictures.flip, worst)
+
+
+def views_of(
+    lightmaps: SheetFrames, count: int, indices: Sequence[int] | np.ndarray | None = None, device: str = "cpu"
+) -> tuple[Views | None, list[str]]:
+    """Makes the views of a sheet that names a mesh.
+
+    Args:
+        lightmaps, count, indices, device: As for `Views`.
+
+    Returns:
+        The views, None without a mesh or with a count of 0; and a warning if the mesh can not be read.
+
+    Raises:
+        WlmError: The count is negative, or there is no such device.
+    """
+    if count < 0:
+        raise WlmError(f"views: expected at least 0, got {count}")
+    if lightmaps.mesh is None or count == 0:
+        return None, []
+    device = check_device(device)
+    try:
+        return Views(lightmaps, read_geometry(lightmaps.mesh), count, indices, device), []
+    except WlmError as error:
+        return None, [f"{lightmaps.name}: no views are scored: {error}"]
+
+
+POINTS = 4
+"""Number of random points of each valid texel."""
+
+_SEED = 0
+_INTERVALS, _STEPS = 12, 2  # intervals of `flicker`, and steps in each
+_STEPS_OF_PERIOD, _STEP = 480, 0.05  # a step of `flicker` as a share of the period, or without one in hours
+
+
+@dataclass(frozen=True)
+class ShownScore(ViewScore):
+    """The error where light is shown, see the module. A score without anything to measure is NaN or None.
 
     Attributes:
         seen: PSNR of filtered reads, dB, mean over tiles and times.
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
-        worst_seen: The tile and time with the lowest: `psnr`, `time`, `tile` (its number), `row`, `column`.
+        worst_seen: The tile and time with the lowest one: `psnr`, `time`, `tile` (its number), `row`, `column`.
         worst_seen_time: The time with the lowest mean: `psnr`, `time`.
         worst_seen_tile: The tile with the lowest mean: `psnr`, `tile`, `row`, `column`.
-        ring: PSNR of the gaps' texels that touch a chart, dB, mean over tiles and times.
+        ring: PSNR of the texels of gaps that touch a chart, dB, mean over tiles and times.
         between: PSNR half-way between stored times, dB, mean over tiles and intervals.
-        worst_between: Its lowest, as `worst_seen`; `time` is the middle.
-        border: RMS error of reads across tiles' borders over that within tiles, relative to the range of each texel's
-            tile; 1: borders don't show.
-        flicker: Change in a step of 3 minutes beyond the original's, mean, as a share of the range; 0: none.
+        worst_between: The lowest one, as in `worst_seen`; `time` is the middle.
+        border: RMS error of reads across borders of tiles divided by that within tiles, relative to the range of each
+            texel's tile; 1: borders are invisible.
+        flicker: Mean change in a step of 3 minutes beyond the change of the original, as a share of the range.
     """
 
     seen: float
@@ -88,11 +217,11 @@ class SeenScore(ViewScore):
 
 
 class Tally:
-    """Adds up the scores of a decoder, time by time."""
+    """Accumulates the scores of a decoder, time by time."""
 
     def __init__(
         self,
-        lightmaps: LightmapSet,
+        lightmaps: SheetFrames,
         mask: np.ndarray,
         decode: Callable[[float], np.ndarray] | None = None,
         views: Views | None = None,
@@ -103,19 +232,19 @@ class Tally:
 
         Args:
             lightmaps: The input.
-            mask: bool [H, W], the valid texels that are scored. In tiles that have others alone, such as those that a
-                file doesn't hold, the decoded light counts as right.
-            decode: From any time, also between two stored ones, to linear radiance [H, W, 3]; None: light between
+            mask: bool [H, W], the valid texels that are scored. In tiles that only have others, such as tiles that are
+                not in the file, the decoded light counts as correct.
+            decode: Returns linear radiance [H, W, 3] for any time, also between two stored ones; None: light between
                 stored times is the mix of the two lightmaps that were added (eq. 2).
-            views: Of the set's mesh; None for none.
-            name: What to call the decoder in a message.
+            views: Views of the mesh; None for none.
+            name: Name of the decoder in messages.
             peak: As for `wlm.metrics.evaluate_frame`.
         """
         self._lightmaps, self._mask, self._decode, self._views, self._name = lightmaps, mask, decode, views, name
         self._peak = peak
         self._grid = grid = TileGrid.of(*mask.shape)
         self._count = count = len(lightmaps.times)
-        # Lengths of the intervals between stored times, that from the last to the first among them.
+        # Lengths of the intervals between stored times, including the one from the last to the first.
         again = [] if lightmaps.period is None else [lightmaps.times[0] + lightmaps.period]
         self._gaps = np.diff([*lightmaps.times, *again] if count > 1 else [])
         self._middles = lightmaps.times[: len(self._gaps)] + self._gaps / 2.0
@@ -128,16 +257,16 @@ class Tally:
         self._moving = set(chosen.round().astype(int).tolist())
         self._flicker: list[np.ndarray] = []
         self._border = np.zeros(2)
-        # What was decoded at the first time and at the last that was added; None where `decode` gives it again.
+        # The decoded maps of the first and of the last added time; None if `decode` returns them again.
         self._added: dict[int, np.ndarray | None] = {}
 
     def add(self, index: int, decoded: np.ndarray, metrics: FrameMetrics) -> None:
-        """Adds a stored time; an interval is scored where both of its ends are added.
+        """Adds a stored time; an interval is scored once both of its ends are added.
 
         Args:
-            index: Of the time, above that of the last call.
-            decoded: The map then, linear radiance [H, W, 3].
-            metrics: Of it by `evaluate_frame` with the same mask: the tiles that are scored, and their ranges.
+            index: Index of the time, above that of the last call.
+            decoded: The map at that time, linear radiance [H, W, 3].
+            metrics: Its metrics from `evaluate_frame` with the same mask: the scored tiles and their ranges.
 
         Raises:
             WlmError: A texel that is read is NaN or infinite.
@@ -166,15 +295,15 @@ class Tally:
             self._add_interval(index)
         self._added = {kept: self._added[kept] for kept in (0, index) if kept in self._added}
 
-    def score(self) -> SeenScore:
-        """The scores of what was added."""
+    def score(self) -> ShownScore:
+        """Returns the scores of the added times."""
         lightmaps = self._lightmaps
         by_time, by_tile = nanmean(self._seen, axis=(1, 2)), nanmean(self._seen, axis=0)
         across, inside = self._border
         border = math.sqrt(across / inside) if inside > 0 else (math.inf if across > 0 else math.nan)
         hour = _lowest(by_time)
         worst_time = None if hour is None else {"psnr": float(by_time[hour]), "time": float(lightmaps.times[hour])}
-        return SeenScore(
+        return ShownScore(
             **vars(NO_VIEWS if self._views is None else self._views.score()),
             seen=float(nanmean(self._seen)),
             seen_by_tile=by_tile,
@@ -194,23 +323,23 @@ class Tally:
         return nearest_valid(self._lightmaps.mask)
 
     @functools.cached_property
-    def _ring(self) -> "_Texels":
+    def _ring(self) -> _Texels:
         mask = self._lightmaps.mask
         return _Texels(binary_dilation(mask, np.ones((3, 3))) & ~mask, self._grid)
 
     @functools.cached_property
-    def _valid(self) -> "_Texels":
+    def _valid(self) -> _Texels:
         return _Texels(self._mask, self._grid)
 
     @functools.cached_property
     def _left_out(self) -> np.ndarray | None:
-        """bool [H, W], the tiles whose valid texels aren't scored; None: there is none."""
+        """bool [H, W], the tiles whose valid texels are not scored; None if there are none."""
         grid = self._grid
         tiles = _tiles_with(self._lightmaps.mask, grid) & ~_tiles_with(self._mask, grid)
         return tiles.repeat(TILE, 0).repeat(TILE, 1)[: grid.height, : grid.width] if tiles.any() else None
 
     def _add_points(self, index: int, error: np.ndarray, metrics: FrameMetrics) -> None:
-        """Scores the reads at points; of a difference they are the difference of the reads."""
+        """Scores the reads at points: a read of the difference is the difference of the reads."""
         grid, (read, sides) = self._grid, _points()
         ends = ((1, grid.rows * TILE + 1 - grid.height), (1, grid.cols * TILE + 1 - grid.width))
         padded = np.pad(error, (*ends, (0, 0)), mode="edge")
@@ -232,7 +361,7 @@ class Tally:
             two = sides[neighbours].any(0)
             crossing, inner = np.flatnonzero(two & own), squared[~two[own]]
             if len(crossing) and len(inner):
-                # A neighbour without a score has no range.
+                # A neighbour without a score has no range of its own.
                 relative = padded[box] / np.where(np.isnan(spans[box]), span, spans[box])[..., None]
                 across = np.square(read[crossing] @ relative.reshape(-1, 3), dtype=np.float64).mean()
                 self._border += len(crossing) * np.array([across, inner.mean() / span**2])
@@ -256,7 +385,7 @@ class Tally:
         share, at = np.float32(step / gap), self._valid.at
         allowed = share * np.abs(second[at] - first[at])
         if self._decode is None:
-            changes = [share * np.abs(self._added[after][at] - self._added[index][at])]  # the same in every step
+            changes = [share * np.abs(self._added[after][at] - self._added[index][at])]  # equal in every step
         else:
             start = np.random.default_rng((_SEED, index)).random() * (gap - _STEPS * step)
             times = self._lightmaps.times[index] + start + step * np.arange(_STEPS + 1)
@@ -268,7 +397,7 @@ class Tally:
             self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
     def _place(self, psnr: np.ndarray, times: np.ndarray | None = None) -> dict[str, float | int] | None:
-        """The lowest of PSNRs [n, rows, columns], and where it is."""
+        """Returns the lowest of PSNRs [n, rows, columns] and its place."""
         lowest = _lowest(psnr)
         if lowest is None:
             return None
@@ -283,7 +412,7 @@ class _Texels:
 
     Attributes:
         at: Their rows and columns, int [K] each.
-        count: int [rows, columns] of the grid, how many each tile has.
+        count: int [rows, columns] of the grid, number in each tile.
     """
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
@@ -293,18 +422,18 @@ class _Texels:
         self.count = np.bincount(self._tile, minlength=grid.count).reshape(self._shape)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Sums of values float64 [K, 3] over the texels and channels of each tile, float64 [rows, columns]."""
+        """Returns sums of values, float64 [K, 3], over the texels and channels of each tile, [rows, columns]."""
         rows, columns = self._shape
         return np.bincount(self._tile, values.sum(1), rows * columns).reshape(self._shape)
 
 
 @functools.cache
 def _points() -> tuple[csr_array, np.ndarray]:
-    """The points of a tile, `POINTS` for each texel, row by row; all tiles have the same.
+    """Returns the points of a tile, `POINTS` for each texel, row by row; all tiles have the same.
 
     Returns:
-        What reads them, [16384 POINTS, 130 x 130], from the tile with a texel more on each side; and bool [4, 16384
-        POINTS], whether a read takes texels above, below, left or right of the tile.
+        The matrix that reads them, [16384 POINTS, 130 x 130], from the tile with one more texel on each side; and bool
+        [4, 16384 POINTS], whether a read includes texels above, below, left or right of the tile.
     """
     side = TILE + 2
     place = np.random.default_rng(_SEED).random((2, TILE, TILE, POINTS)) - 0.5
@@ -320,18 +449,18 @@ def _points() -> tuple[csr_array, np.ndarray]:
 
 
 def _tiles_with(mask: np.ndarray, grid: TileGrid) -> np.ndarray:
-    """bool [rows, columns]: tiles with a texel in the mask."""
+    """Returns the tiles with a texel in the mask, bool [rows, columns]."""
     whole = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
     whole[: grid.height, : grid.width] = mask
     return whole.reshape(grid.rows, TILE, grid.cols, TILE).any(axis=(1, 3))
 
 
 def _psnr(mse: np.ndarray, span: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """`psnr_from_mse` of tiles [rows, columns]; NaN where it isn't counted."""
+    """Returns `psnr_from_mse` of tiles [rows, columns]; NaN if a tile is not counted."""
     pairs = zip(mse.flat, span.flat, counted.flat, strict=True)
     return np.array([psnr_from_mse(m, s) if c else math.nan for m, s, c in pairs]).reshape(mse.shape)
 
 
 def _lowest(psnr: np.ndarray) -> int | None:
-    """The place of the lowest in the flat array; None where all are NaN."""
+    """Returns the position of the lowest value in the flat array; None if all are NaN."""
     return None if np.isnan(psnr).all() else int(np.nanargmin(psnr))
