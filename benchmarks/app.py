@@ -79,10 +79,6 @@ def lightmap(
         Path | None, typer.Option("--set", metavar="SET", help="A lightmap set; default the demo's.")
     ] = None,
     profiles: _Profiles = None,
-    qualities: Annotated[
-        list[int] | None,
-        typer.Option("--quality", metavar="0..105", help="Profile video at this quality. Several times."),
-    ] = None,
     rivals: _Rivals = True,
     rivals_only: Annotated[bool, typer.Option("--rivals-only", help="The rivals alone.")] = False,
     rival_names: Annotated[
@@ -98,15 +94,15 @@ def lightmap(
 
     common = {"quick": quick, "device": device, "set_path": set_path, "progress": note}
     if rivals_only or rival_names:
-        if not rivals or profiles or qualities:
-            raise WlmError("--rivals-only: expected without --no-rivals, --profile and --quality")
+        if not rivals or profiles:
+            raise WlmError("--rivals-only: expected without --no-rivals and --profile")
         rows = run_rivals(names=rival_names, **common)
         options = {"rivals_only": rivals_only, "rival": rival_names, "device": device}
     else:
-        rows = run(names=profiles, qualities=qualities or (), rivals=rivals, **common)
-        options = {"profile": profiles, "quality": qualities, "no_rivals": not rivals, "device": device}
+        rows = run(names=profiles, rivals=rivals, **common)
+        options = {"profile": profiles, "no_rivals": not rivals, "device": device}
     command = _command("lightmap", quick=quick, **options, set=set_path and rows[0].scene)
-    partial = bool(profiles or qualities or rival_names)
+    partial = bool(profiles or rival_names)
     _finish(rows, command, device, json_path, plot_path, PANELS, baseline=baseline, partial=partial)
 
 

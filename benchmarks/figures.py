@@ -110,6 +110,7 @@ TABLES: dict[str, dict[str, Figure]] = {
     },
     "Time": {
         "encode_seconds": Figure("encode", "s", ".3g"),
+        "load_ms": Figure("load a tile", "ms", ".2g"),
         "decode_ms": Figure("decode time", "ms", ".3g"),
         "decode_ms_spread": Figure("p90−p10", "ms", ".2g"),
         "time_ms": Figure("time", "ms", ".3g"),

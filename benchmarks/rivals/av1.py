@@ -29,7 +29,7 @@ _SEQUENCE_HEADER, _DELIMITER = 1, 2
 _KNOWN = {_SEQUENCE_HEADER, _DELIMITER, 3, 4, 5, 6, 7, 15}
 
 
-def encode_av1(pictures: np.ndarray, quality: int, speed: int, extra: str) -> bytes:
+def encode_av1_stream(pictures: np.ndarray, quality: int, speed: int, extra: str) -> bytes:
     """Encodes pictures as one stream, the same on any machine with the same version of the encoder.
 
     Args:
@@ -63,7 +63,7 @@ def decode_av1(stream: bytes, count: int, height: int, width: int, extra: str) -
     """Decodes a stream, once it is known how large it becomes.
 
     Args:
-        stream: From `encode_av1`, or from a file.
+        stream: From `encode_av1_stream`, or from a file.
         count, height, width: Of its pictures.
         extra: The extra that a message names.
 
