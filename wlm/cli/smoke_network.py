@@ -205,7 +205,7 @@ def dataset(
     from wlm.smoke.network.dataset import STAGES, make_pool, make_validation
     from wlm.smoke.network.pool import save_pool
     from wlm.smoke.network.settings import DatasetSettings
-    from wlm.view.smoke_pool import pool_sheet
+    from wlm.view.smoke import pool_sheet
 
     settings = load_settings(DatasetSettings, settings_file)
     try:

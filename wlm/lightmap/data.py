@@ -125,6 +125,17 @@ class LightmapSet:
         """The first sheet of radiance, or the first sheet: all of an ordinary set."""
         return self.sheets[first_light(self.sheets)]
 
+    def find(self, sheet: Sheet) -> SheetFrames:
+        """Returns the lightmaps of a sheet, or the only lightmaps of a set with one sheet.
+
+        Raises:
+            WlmError: The set has several sheets, but not this one.
+        """
+        if sheet not in self.sheets and len(self.sheets) > 1:
+            found = ", ".join(one.label for one in self.sheets)
+            raise WlmError(f"{self.name}: expected a set with {sheet.label}, found {found}")
+        return self.sheets.get(sheet, self.light)
+
     @property
     def times(self) -> np.ndarray:
         """float64 [T], increasing."""

@@ -1,10 +1,10 @@
 """The GLSL that decodes a lightmap from the textures and buffers of its bundle (`wlm.lightmap.bundle`)."""
 
+from wlm.bundle import sampler
 from wlm.lightmap.encodings.base import columns
 from wlm.lightmap.encodings.maps import fours
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.tiles import TILE
-from wlm.shading import sampler
 from wlm.texels import REACH
 
 EXACT = "WLM_LIGHTMAP_EXACT"

@@ -2,7 +2,8 @@
 
 import math
 
-from wlm.shading import LANGUAGES, sampler, translate
+from wlm.bundle import sampler
+from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.flipbook.book import Book
 from wlm.smoke.flipbook.motion import ZERO, mip_levels
