@@ -3,8 +3,8 @@
 Five kinds of rows:
 
 - method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, the
-  decode time of the whole map to 8 bits on the fast path, and the time to unpack one tile of the file. The largest error
-  is in radiance, against the float64 path.
+  decode time of the whole map to 8 bits on the fast path, and the time to unpack one tile of the file. The largest
+  error is in radiance, against the float64 path.
 - methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, and on CUDA
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
@@ -15,8 +15,8 @@ Five kinds of rows:
   and a video codec; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
 
-Profiles and rivals have the scores of `wlm.lightmap.view_scores` too: those between stored times where both are scored, those
-of views in a full run.
+Profiles and rivals have the scores of `wlm.lightmap.view_scores` too: those between stored times where both are scored,
+those of views in a full run.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
 alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in

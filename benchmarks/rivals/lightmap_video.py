@@ -1,10 +1,11 @@
 """A video codec over the hours: AV1 in 10 bits with full chroma, the smallest on disk, without random access.
 
-The frames are the levels of `benchmarks.rivals.lightmap_levels` as one stream of libaom (`benchmarks.rivals.av1`). A texel
-can not be read without decoding its whole frame and the frames that it depends on, and a GPU holds the decoded frame. Gaps
+The frames are the levels of `benchmarks.rivals.lightmap_levels` as one stream of libaom (`benchmarks.rivals.av1`). A
+texel can not be read without decoding its whole frame and the frames that it depends on, and a GPU holds the decoded
+frame. Gaps
 are filled smoothly: detail there would cost as much as on a chart. The coded planes are luma, a green and an orange
-difference, computed by us: libavif's conversion, in floats, loses 0.1 to 0.4 dB and is not part of the AV1 standard, which
-is exact to the bit.
+difference, computed by us: libavif's conversion, in floats, loses 0.1 to 0.4 dB and is not part of the AV1 standard,
+which is exact to the bit.
 
 Compared with HEVC by x265 ("slower", 4:4:4, PSNR tuning) AV1 takes a fifth less for the same PSNR on `city`.
 """
@@ -34,8 +35,8 @@ def encode_av1(
         frames: [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
         quality: 0 to 100.
-        ranges: The range that the levels of a tile are relative to: over the `day`, or at each `hour`. The first is better
-            if hours are alike, the second if they differ much.
+        ranges: The range that the levels of a tile are relative to: over the `day`, or at each `hour`. The first is
+            better if hours are alike, the second if they differ much.
         speed: Speed of libaom, 0 (slowest, best) to 10.
 
     Returns:

@@ -5,7 +5,7 @@ import pytest
 from builders.checks import error_of
 
 from wlm.errors import WlmError
-from wlm.lightmap.data import LightmapSet, from_arrays
+from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.tiles import (
     TILE,
     TileData,
@@ -27,7 +27,7 @@ def _half(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def lightmaps() -> LightmapSet:
+def lightmaps() -> SheetFrames:
     random = np.random.default_rng(1)
     frames = random.uniform(0.0, 4.0, (3, HEIGHT, WIDTH, 3)).astype(np.float32)
     mask = random.random((HEIGHT, WIDTH)) < 0.4

@@ -99,9 +99,7 @@ def _seen_rows(report: SheetReport) -> list[tuple[str, str, str]]:
     return [row for row in rows if not row[1].startswith("–")]
 
 
-def _worst_tiles(
-    page: Document, model: SheetModel, lightmaps: SheetFrames, report: SheetReport, device: str
-) -> None:
+def _worst_tiles(page: Document, model: SheetModel, lightmaps: SheetFrames, report: SheetReport, device: str) -> None:
     decoder = SheetDecoder(model, device)
     scores = report.psnr_by_tile.ravel()
     for number in np.argsort(np.where(np.isfinite(scores), scores, np.inf))[:_WORST_TILES].tolist():
