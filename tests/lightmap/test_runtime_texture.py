@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from builders.synthetic import random_model
 from typer.testing import CliRunner
+from wlm.lightmap.page import MapDecoder
 
 from wlm import interop
 from wlm.cli.app import app
@@ -12,7 +13,6 @@ from wlm.errors import WlmError
 from wlm.formats.dds import read_dds, write_dds
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder
-from wlm.lightmap.page import MapDecoder
 from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack
 from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from builders.small_sets import moving_light, tiny_profile
 from builders.synthetic import random_model
+from wlm.lightmap.held import held_tiles
 
 from wlm.lightmap.evaluation import part_bytes
 from wlm.lightmap.fit import compress
-from wlm.lightmap.held import held_tiles
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.small_sets import sheet_from_arrays as from_arrays
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import SheetFrames

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 from builders.small_sets import moving_light, tiny_profile
+from wlm.lightmap.seen import SeenScore, Tally
 
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import evaluate
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import TimeAxis
-from wlm.lightmap.seen import SeenScore, Tally
 from wlm.metrics import PSNR_CAP_DB, evaluate_frame
 from wlm.texels import fill_gaps
 
