@@ -3,12 +3,12 @@
 from collections.abc import Iterable
 
 from wlm.errors import WlmError
-from wlm.shading.heads import decided
-from wlm.shading.hlsl import HlslWriter
-from wlm.shading.metal import MetalWriter
-from wlm.shading.source import read_words
-from wlm.shading.tree import read_shader
-from wlm.shading.wgsl import WgslWriter
+from wlm.export.shading.heads import decided
+from wlm.export.shading.hlsl import HlslWriter
+from wlm.export.shading.metal import MetalWriter
+from wlm.export.shading.source import read_words
+from wlm.export.shading.tree import read_shader
+from wlm.export.shading.wgsl import WgslWriter
 
 LANGUAGES = ("glsl", "glsl-es", "hlsl", "msl", "wgsl")
 """Languages in which shaders are exported."""
@@ -41,7 +41,7 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
     names, and one sampler, linear and clamped to the edge.
 
     Args:
-        text: GLSL of this package, in the subset of the language that `wlm.shading.tree` parses.
+        text: GLSL of this package, in the subset of the language that `wlm.export.shading.tree` parses.
         language: One of `LANGUAGES`.
         defined: Macros to define, for example `WLM_ATLAS_EXACT`.
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from wlm.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
+from wlm.export.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
 
 _STRENGTH = {
     mark: strength

@@ -28,6 +28,7 @@ from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_til
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
+from wlm.export.shading import LANGUAGES, translate
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.exporter import export as export_lightmap
@@ -36,7 +37,6 @@ from wlm.probe.shader import probe_glsl
 from wlm.probe.volume import Volume
 from wlm.probe.volume_export import export_volume
 from wlm.probe.volume_shader import volume_glsl
-from wlm.shading import LANGUAGES, translate
 
 
 def lightmap(kinds, folder, **settings) -> Subject:

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Mapping
 
-from wlm.shading.hlsl import HlslWriter
-from wlm.shading.source import read_words
-from wlm.shading.tree import Function, Node, Statement, Variable, read_shader
+from wlm.export.shading.hlsl import HlslWriter
+from wlm.export.shading.source import read_words
+from wlm.export.shading.tree import Function, Node, Statement, Variable, read_shader
 
 _FILTERS = {"textureLod", "textureGrad"}
 _SIZE = """\

@@ -1,7 +1,7 @@
 """HLSL of shader model 5 and later."""
 
-from wlm.shading.tree import VECTORS, Node, Variable
-from wlm.shading.writer import Writer
+from wlm.export.shading.tree import VECTORS, Node, Variable
+from wlm.export.shading.writer import Writer
 
 _TEXTURES = {
     "sampler2D": "Texture2D<float4>",

@@ -1,4 +1,4 @@
-"""Lexer and preprocessor of our GLSL; `wlm.shading.tree` parses its words."""
+"""Lexer and preprocessor of our GLSL; `wlm.export.shading.tree` parses its words."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from wlm.shading.source import Word
+from wlm.export.shading.source import Word
 
 VECTORS = {
     f"{kind}vec{n}": ({"": "float", "i": "int", "u": "uint"}[kind], n) for kind in ("", "i", "u") for n in (2, 3, 4)

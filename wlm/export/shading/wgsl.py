@@ -1,7 +1,7 @@
 """WGSL: functions, and declarations of textures and buffers in bind group 0."""
 
-from wlm.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
-from wlm.shading.writer import Writer
+from wlm.export.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
+from wlm.export.shading.writer import Writer
 
 _TEXTURES = {"sampler2D": "texture_2d<f32>", "usampler2D": "texture_2d<u32>", "sampler2DArray": "texture_2d_array<f32>"}
 _SCALARS = {"float": "f32", "int": "i32", "uint": "u32", "bool": "bool"}

@@ -1,7 +1,7 @@
 """Metal shading language: a structure with textures and buffers as members and the functions as methods."""
 
-from wlm.shading.tree import VECTORS, Function, Node, Variable
-from wlm.shading.writer import Writer
+from wlm.export.shading.tree import VECTORS, Function, Node, Variable
+from wlm.export.shading.writer import Writer
 
 _TEXTURES = {
     "sampler2D": "texture2d<float>",
