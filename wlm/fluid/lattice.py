@@ -59,11 +59,6 @@ class Domain:
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name}: expected a positive number, got {value}")
 
-    @classmethod
-    def of_speed(cls, cell: float, speed: float, lattice_speed: float = 0.1) -> "Domain":
-        """The domain in which `speed` (m/s) is `lattice_speed` (cells a step)."""
-        return cls(cell, lattice_speed * cell / speed)
-
     def speed(self, value: float) -> float:
         """A speed in m/s as cells a step."""
         return value * self.step / self.cell

@@ -146,8 +146,6 @@ class Solver:
         substeps: Steps of the lattice in one of the solver. At a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells with smoke in them, and those beside them, are computed.
         threshold: With bricks: the largest value of a brick that counts as empty.
-        checkpoint: The file of the last good state; None: no file.
-        checkpoint_every: Steps of the solver between two checkpoints.
 
     Attributes:
         period: Steps after which a CUDA graph of them can be replayed, see `step`.
@@ -175,13 +173,11 @@ class Solver:
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
-        checkpoint: str | os.PathLike[str] | None = None,
-        checkpoint_every: int = 50,
     ) -> None:
         for name, value, allowed in (("scheme", scheme, SCHEMES), ("storage", storage, tuple(advection.STORAGES))):
             if value not in allowed:
                 raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
-        for name, count in (("refinement", refinement), ("substeps", substeps), ("checkpoint_every", checkpoint_every)):
+        for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
         for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
@@ -200,7 +196,7 @@ class Solver:
         stored, cells = advection.STORAGES[storage], math.prod(self.shape)
         require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
-        self._checkpoint, self._checkpoint_every, self._kept = checkpoint, checkpoint_every, ""
+        self._kept = ""
         self._fields = [
             advection.Fields(self._zeros((cells,), stored), self._zeros((cells if temperature else 0,), stored))
             for _ in range(_buffers(scheme))
@@ -262,8 +258,6 @@ class Solver:
                 self._place_obstacles()
             self._step()
             self._done += 1
-            if self._checkpoint is not None and not capturing and self._done % self._checkpoint_every == 0:
-                self.save(self._checkpoint)
 
     def check(self) -> None:
         """Checks that the air hasn't blown up; syncs with the device.

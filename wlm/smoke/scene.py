@@ -144,7 +144,7 @@ class Air(_Settings):
     viscosity: _Positive = 1.5e-5
     speed: _Positive | None = None
     lattice_speed: float = Field(0.1, gt=0.0, le=0.3)
-    operator: Literal["bgk", "regularised", "recursive"] = "regularised"
+    operator: Literal["bgk", "regularised"] = "regularised"
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
 
