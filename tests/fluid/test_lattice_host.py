@@ -113,11 +113,11 @@ def test_too_fast(device: str):
     """Walls, inlets, and bodies by their translation or their spin."""
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     for wrong in (lambda: box.set_wall("-y", (0.5, 0.0, 0.0)), lambda: box.set_inlet("-x", (0.31, 0.0, 0.0))):
-        with pytest.raises(WlmError, match=f"at most {MAX_SPEED}: use a shorter time step"):
+        with pytest.raises(WlmError, match=f"at most {MAX_SPEED}: use a shorter step"):
             wrong()
     mask = np.zeros(SHAPE, bool)
     mask[4:8, 2:6, 3] = True
-    with pytest.raises(WlmError, match="a solid's surface moves at 0.4 cells a step"):
+    with pytest.raises(WlmError, match="a solid's surface moves at 0.4 cells per step"):
         box.set_solid(mask, (0.0, 0.4, 0.0))
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     box.set_solid(mask, spin=(0.0, 0.0, 0.05), centre=(6.0, 4.0, 3.5))

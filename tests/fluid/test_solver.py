@@ -144,7 +144,7 @@ def test_an_obstacle_too_fast(device: str):
     fast = Sphere(Trajectory.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
     solver = _jet(device, obstacles=[fast])
     solver.step(5)
-    with pytest.raises(WlmError, match="moves at 1 cells a step: expected at most 0.3"):
+    with pytest.raises(WlmError, match="moves at 1 cells per step: expected at most 0.3"):
         solver.step(1)
 
 

@@ -88,6 +88,7 @@ class Spec:
     wide: bool = False
 
     def __post_init__(self) -> None:
+        lattice(self.lattice)
         for name, value, allowed in (
             ("operator", self.operator, OPERATORS),
             ("storage", self.storage, tuple(STORAGES)),
