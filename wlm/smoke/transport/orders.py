@@ -146,7 +146,7 @@ def make_inputs(
 
 
 def aim(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, float]:
-    """Returns the direction to a light from the smoke's centre, and the factor that scales its irradiance there to 4 pi."""
+    """Returns the direction to a light from the smoke's centre, and the factor that makes its irradiance there 4 pi."""
     if isinstance(light, Light):
         return unit(light.toward), 1.0
     way = np.asarray(light.position, np.float64) - volume.centre
