@@ -46,7 +46,7 @@ from wlm.probe.exact import decode64
 from wlm.probe.fields import pack_dead
 from wlm.probe.fit import compress
 from wlm.probe.model import Profile
-from wlm.probe.seen import VIEWS
+from wlm.probe.views import VIEWS
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the first is the one that the other rows are about."""

@@ -6,7 +6,7 @@
   decoded, and of what is read farther away. The walk starts with an empty volume: what its first frame takes, and the
   frames until nothing waits. The light's RMS is that of the probes that the volume was made from, its RMSE is against
   these.
-- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
+- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.views`.
 """
 
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench
 from wlm.errors import WlmError
 from wlm.probe.data import ProbeSet
-from wlm.probe.light import Light, StoredLight, light_of
+from wlm.probe.volume.light import Light, StoredLight, light_of
 from wlm.probe.model import ProbeModel
-from wlm.probe.seen import score_views
+from wlm.probe.views import score_views
 from wlm.probe.transform import TransformModel
-from wlm.probe.walk import score_volume
+from wlm.probe.volume.walk import score_volume
 
 
 def volume_rows(

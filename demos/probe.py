@@ -19,8 +19,8 @@ from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.probe.light import light_of
-from wlm.probe.walk import camera_path, settle, summary, walk
+from wlm.probe.volume.light import light_of
+from wlm.probe.volume.walk import camera_path, settle, summary, walk
 from wlm.view.spheres import render_probes
 
 HERE = Path(__file__).resolve().parent

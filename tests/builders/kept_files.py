@@ -163,7 +163,7 @@ def _probe_running() -> Kept:
 
     from wlm.probe import Profile
     from wlm.probe.fit import _frame
-    from wlm.probe.trainer import Trainer
+    from wlm.probe.gaussian.trainer import Trainer
 
     probes = synthetic(60)
     origin, extent, _ = _frame(probes.position)

@@ -231,7 +231,7 @@ def test_walk_with_another_axis_up(carrying, monkeypatch):
         asked.append((len(position), frames, eye_height, up))
         return position[:2]
 
-    monkeypatch.setattr("wlm.probe.walk.camera_path", path)
+    monkeypatch.setattr("wlm.probe.volume.walk.camera_path", path)
     call("probe", "walk", carrying, "--up", "z", "--eye", 0.8, "--frames", 7)
     call("probe", "walk", carrying, "--block", 0.7)
     # Live probes alone, and as many frames as it takes to go round.

@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.probe.data import load
 from wlm.probe.decode import Decoder
 from wlm.probe.exporter import export
-from wlm.probe.shader import probe_glsl
+from wlm.probe.gaussian.shader import probe_glsl
 
 SHAPES = [
     {},

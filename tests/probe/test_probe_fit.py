@@ -12,8 +12,8 @@ from wlm.probe.data import from_arrays, save_probes
 from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import _frame, compress, open_checkpoint
 from wlm.probe.model import Profile
-from wlm.probe.start import first_gaussians, local_spread, morton_order
-from wlm.probe.trainer import Trainer
+from wlm.probe.gaussian.start import first_gaussians, local_spread, morton_order
+from wlm.probe.gaussian.trainer import Trainer
 
 SMALL = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
 RANDOM = np.random.default_rng(7)

@@ -13,9 +13,9 @@ from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
 from wlm.probe.codec import decode, encode
 from wlm.probe.exact import decode64
-from wlm.probe.index import morton_keys
+from wlm.probe.volume.index import morton_keys
 from wlm.probe.packed import LATENT, MOST, SIZE, TURN, Packed, least_turned
-from wlm.probe.packing import DROP, pack_model
+from wlm.probe.gaussian.packing import DROP, pack_model
 
 
 def packed_model(count=40, seed=0, **settings):

@@ -10,7 +10,7 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.ops.views import clip_from
 from wlm.probe.data import from_arrays
-from wlm.probe.seen import KINDS, score_views
+from wlm.probe.views import KINDS, score_views
 
 SETTINGS = {"views": 3, "resolution": 32}
 

@@ -13,9 +13,9 @@ import wlm
 from wlm.errors import WlmError
 from wlm.probe import export_unreal
 from wlm.probe.conventions import from_canonical
-from wlm.probe.lattice import grid_places
+from wlm.probe.engines.lattice import grid_places
 from wlm.probe.sphere import fibonacci_sphere, irradiance
-from wlm.probe.unreal import SH_FILES, pack_unreal, unpack_unreal
+from wlm.probe.engines.unreal import SH_FILES, pack_unreal, unpack_unreal
 
 FILES = ("ambient.dds", *SH_FILES)
 _HEADER = 148

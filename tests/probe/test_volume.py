@@ -9,9 +9,9 @@ from reference import volume as reference
 from reference import volume_blocks
 
 from wlm.errors import WlmError
-from wlm.probe.light import DecodedLight, StoredLight, at_probes, light_of
-from wlm.probe.volume import FrameStats, Volume
-from wlm.probe.walk import settle
+from wlm.probe.volume.light import DecodedLight, StoredLight, at_probes, light_of
+from wlm.probe.volume.cascade import FrameStats, Volume
+from wlm.probe.volume.walk import settle
 
 # A multiple of every block's side, so that all of a scene can move by it.
 FAR = np.array([1_000_000.0, -1_000_000.0, 3_200_000.0])

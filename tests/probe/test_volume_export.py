@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.probe.light import StoredLight
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.sphere import irradiance
-from wlm.probe.volume import Volume
-from wlm.probe.volume_export import export_volume
-from wlm.probe.volume_shader import volume_glsl, volume_hlsl
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.exporter import export_volume
+from wlm.probe.volume.shader import volume_glsl, volume_hlsl
 
 
 @pytest.fixture(scope="module")

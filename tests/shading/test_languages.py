@@ -31,11 +31,11 @@ from wlm.errors import WlmError
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder as LightmapDecoder
 from wlm.lightmap.exporter import export as export_lightmap
-from wlm.probe.light import StoredLight
-from wlm.probe.shader import probe_glsl
-from wlm.probe.volume import Volume
-from wlm.probe.volume_export import export_volume
-from wlm.probe.volume_shader import volume_glsl
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.gaussian.shader import probe_glsl
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.exporter import export_volume
+from wlm.probe.volume.shader import volume_glsl
 from wlm.shading import LANGUAGES, translate
 
 

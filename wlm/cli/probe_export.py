@@ -61,7 +61,7 @@ def export(
     language = shader_of(engine, shader)
     quiet_warp()
     from wlm import probe
-    from wlm.probe.three_grid import CELLS
+    from wlm.probe.engines.three import CELLS
     from wlm.system import load
 
     model = at_time(load(file, "probe"), time)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from wlm.probe import Decoder, ProbeModel, ProbeSet, Volume
-    from wlm.probe.seen import SeenScore
+    from wlm.probe.views import SeenScore
 
 _Block = Annotated[float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
@@ -60,7 +60,7 @@ def walk(
         raise WlmError(f"--up: expected x, y or z, got {up}")
     quiet_warp()
     from wlm.probe import load_positions
-    from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
+    from wlm.probe.volume.walk import STEP, camera_path, loop_frames, settle, summary, walk
     from wlm.system import load
 
     model = at_time(load(file, "probe"), time)
@@ -101,8 +101,8 @@ def volume(
 ) -> None:
     """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
     quiet_warp()
-    from wlm.probe.volume_export import export_volume
-    from wlm.probe.walk import settle
+    from wlm.probe.exporter import export_volume
+    from wlm.probe.volume.walk import settle
     from wlm.system import load
 
     model = at_time(load(file, "probe"), time)
@@ -137,9 +137,9 @@ def _volume(
     budget: int | None,
 ) -> "tuple[Volume, np.ndarray | None]":
     """A volume of a model's probes, and the light that was compressed, where it is given."""
-    from wlm.probe.light import light_of
+    from wlm.probe.volume.light import light_of
     from wlm.probe.places import probes_of
-    from wlm.probe.volume import BUDGET, Volume
+    from wlm.probe.volume.cascade import BUDGET, Volume
 
     if probes_path is None:
         live = ~model.dead if len(model.dead) else None
@@ -155,8 +155,8 @@ def _volume(
 
 def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
     """What is read along a walk, from the probes as they were and from the model's."""
-    from wlm.probe.light import StoredLight, light_of
-    from wlm.probe.walk import score_volume
+    from wlm.probe.volume.light import StoredLight, light_of
+    from wlm.probe.volume.walk import score_volume
 
     decoder = model.decoder(device)
     lights = {
@@ -184,7 +184,7 @@ def score_seen(
 ) -> "list[SeenScore]":
     """Scores pictures under the decoded light, 50 of them where no number is given."""
     from wlm.formats.geometry import read_geometry
-    from wlm.probe.seen import VIEWS, score_views
+    from wlm.probe.views import VIEWS, score_views
 
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
     decoded = model.decoder(device).decode_probes(probes.position)

@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
-from wlm.probe.light import Light, StoredLight
+from wlm.probe.volume.light import Light, StoredLight
 from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
 from wlm.probe.transform import Transform
-from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, settle
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State, frame_slider

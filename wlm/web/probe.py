@@ -17,7 +17,7 @@ from wlm.probe.evaluation import evaluate
 from wlm.probe.exporter import gaussian_bytes, network_bytes
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
-from wlm.probe.shader import probe_glsl
+from wlm.probe.gaussian.shader import probe_glsl
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import Transform
 from wlm.probe.transform_export import light_bytes, transform_glsl
