@@ -18,7 +18,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -39,18 +39,18 @@ _METHODS = {"gaussians": gaussian_codec, "pca": pca_codec}
 
 _LENGTH = struct.Struct("<H")
 _FARTHEST = 1e150
+_SOURCE = 8  # hexadecimal digits of the source
 # Most bytes of unpacked parts: a frame of zeros has next to no bytes of its own.
 _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file; `count` is the number of Gaussians or of components."""
+    """The header of a file: `count` is the number of Gaussians or of components, and `profile` names the method."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
-    source: str = Field(pattern="^[0-9a-f]{16}$")
+    source: str = Field(pattern="^[0-9a-f]{8}$")
     profile: Profile
-    method: Literal["gaussians", "pca"]
     count: int = Field(ge=1, le=PROBES)
     dropped: int = Field(0, ge=0, le=PROBES)
     live: int | None = Field(None, ge=1, le=PROBES)
@@ -72,7 +72,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     header: dict[str, Any] = {"probes": model.probes}
     if model.outputs != _Header.model_fields["outputs"].default:
         header["outputs"] = model.outputs
-    header |= {"source": model.source, "profile": model.profile.changes(), "method": model.method}
+    header |= {"source": model.source[:_SOURCE], "profile": model.profile.changes()}
     header |= method.settings(model.content)
     header |= {"live": live} if live < model.probes else {}
     header |= {"positions": True} if model.has_positions else {}
@@ -89,7 +89,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> ProbeModel:
-    """Builds the model of a file; everything that `encode` stored comes back bit for bit.
+    """Builds the model of a file; everything that `encode` stored comes back bit for bit, except the end of the source.
 
     Raises:
         WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
@@ -104,6 +104,8 @@ def decode(artifact: Artifact) -> ProbeModel:
     except (ValueError, RecursionError) as error:
         raise ValueError("expected a header in JSON") from error
     header = check_settings(_Header, settings, "setting ")
+    if header.profile.method not in _METHODS:
+        raise ValueError(f"setting method: expected {' or '.join(_METHODS)}, found {header.profile.method}")
     if header.live is not None and header.live >= header.probes:
         raise ValueError(f"setting live: expected fewer than {header.probes}, found {header.live}")
     table = _table(header)
@@ -131,7 +133,7 @@ def decode(artifact: Artifact) -> ProbeModel:
         size=size,
         dead=dead,
         positions=positions,
-        content=_METHODS[header.method].content(header.profile, header.outputs, stored, header.dropped),
+        content=_METHODS[header.profile.method].content(header.profile, header.outputs, stored, header.dropped),
     )
 
 
@@ -143,7 +145,7 @@ def _table(header: _Header) -> dict[str, Part]:
         table["dead"] = Part(np.uint8, (-(-header.probes // 8),))
     if header.positions:
         table["positions"] = Part(np.uint16, (3, header.probes))
-    if header.method == "pca":
+    if header.profile.method == "pca":
         return table | pca_codec.table(live, header.outputs, header.count)
     return table | gaussian_codec.table(header.profile, header.outputs, header.count)
 

@@ -104,7 +104,6 @@ def compress(
         ProbeModel,
         name=probes.name,
         source=probes.source,
-        profile=profile,
         probes=probes.probes,
         outputs=probes.outputs,
         dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
@@ -112,8 +111,9 @@ def compress(
         **box,
     )
     values = probes.values[probes.live]
+    pca = Profile(name=profile.name, method="pca")
     if profile.method == "pca":
-        return make(content=fit_components(values)[0], choice="PCA, as the profile asks")
+        return make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
     if profile.method == "auto":
         budget = predicted_bytes(profile, *values.shape)
         components, error = fit_components(values, budget)
@@ -121,12 +121,12 @@ def compress(
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
             )
-            return make(content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
+            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
     check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, device)
     gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
     if profile.method == "gaussians":
         return gaussians
-    return _better(gaussians, make, probes, device)
+    return _better(gaussians, partial(make, profile=pca), probes, device)
 
 
 def _fit_gaussians(
@@ -153,7 +153,7 @@ def _fit_gaussians(
         trainer.close()
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
         raise WlmError(f"{probes.name}: the fit diverged; expected smaller rates than those of {profile.name}")
-    fitted = make(content=content, choice="Gaussians, as the profile asks")
+    fitted = make(profile=profile.model_copy(update={"method": "gaussians"}), content=content, choice="Gaussians, as the profile asks")
     return pack_model(fitted, probes.position[probes.live], probes.values[probes.live], device)
 
 

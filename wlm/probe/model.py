@@ -93,8 +93,8 @@ class ProbeModel(Model):
 
     Attributes:
         name: Name of the set.
-        source: Hash of the input, 16 hexadecimal digits.
-        profile: Settings of the fit.
+        source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
+        profile: Settings of the fit, with the method that was taken; of PCA the name alone.
         probes: N.
         outputs: D, 27 for L2 spherical harmonics in RGB.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.

@@ -31,7 +31,7 @@ _TEMPLATE = """\
 //
 // Buffer probes, 32-bit words, little-endian:
 //   0    number of live probes, an integer
-//   1    {columns} floats, the lowest value of each column of codes, then {columns} floats, the step of each column
+//   1    {columns} words, one for each column of codes: its lowest value and its step, half floats
 //   {first}   {count_basis} basis vectors of {words} words: half floats, two in a word, the low half first
 //   {codes}   codes, {columns} bytes per probe, four in a word, the lowest byte first: magnitude, then coefficients
 //
@@ -61,8 +61,8 @@ float wlm_probe_number(int probe, int column)
 {{
     int place = probe * WLM_PROBE_COLUMNS + column;
     uint code = (WLM_PROBE_DATA({codes} + place / 4) >> uint(8 * (place % 4))) & 255u;
-    float low = uintBitsToFloat(WLM_PROBE_DATA(1 + column));
-    return low + uintBitsToFloat(WLM_PROBE_DATA(1 + WLM_PROBE_COLUMNS + column)) * float(code);
+    vec2 bounds = unpackHalf2x16(WLM_PROBE_DATA(1 + column));
+    return bounds.x + bounds.y * float(code);
 }}
 
 // The numbers of a live probe.
@@ -120,7 +120,7 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     halves[:, : model.outputs] = content.basis
     codes = np.zeros(-(-content.code.size // 4) * 4, np.uint8)
     codes[: content.code.size] = content.code.reshape(-1)
-    words = [np.array([len(content.code)], "<u4"), content.bounds.astype("<f4").reshape(-1).view("<u4")]
+    words = [np.array([len(content.code)], "<u4"), np.ascontiguousarray(content.bounds.T, "<f2").reshape(-1).view("<u4")]
     words += [halves.reshape(-1).view("<u4"), codes.view("<u4")]
     document = {
         "about": _ABOUT,
@@ -164,7 +164,7 @@ def component_glsl(count: int, outputs: int, basis: bool) -> str:
         GLSL 4.30, which Vulkan's dialect takes too.
     """
     columns, words = 1 + count, -(-outputs // 2)
-    first = 1 + 2 * columns
+    first = 1 + columns
     layout = {"first": first, "words": words, "codes": first + (count * words if basis else 0)}
     text = _TEMPLATE.format(
         outputs=outputs,

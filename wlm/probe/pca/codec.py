@@ -27,7 +27,7 @@ def table(live: int, outputs: int, count: int) -> dict[str, Part]:
         raise ValueError(f"setting count: expected at most {outputs} components, found {count}")
     return {
         "code": Part(np.uint8, (1 + count, live)),
-        "bounds": Part(np.float32, (2, 1 + count)),
+        "bounds": Part(np.float16, (2, 1 + count)),
         "basis": Part(np.float16, (0 if count == outputs else count, outputs)),
     }
 

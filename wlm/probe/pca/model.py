@@ -30,7 +30,7 @@ class Components(Content):
     Attributes:
         outputs: D.
         code: uint8 [V, 1 + K], codes of the logarithm of the magnitude and of the coefficients.
-        bounds: float32 [2, 1 + K], lowest value and step of each column of `code`.
+        bounds: float16 [2, 1 + K], lowest value and step of each column of `code`.
         basis: float16 [K, D]; empty where the directions are the unit vectors, K = D.
     """
 
@@ -67,7 +67,7 @@ class Components(Content):
 def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:
     """Returns the bytes of the GPU buffer of V = `live` probes in `count` components; see `wlm.probe.pca.bundle`."""
     basis = 0 if identity else count * -(-outputs // 2)
-    return 4 * (1 + 2 * (1 + count) + basis + -(-live * (1 + count) // 4))
+    return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
 
 
 def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[Components, float]:
@@ -120,12 +120,18 @@ def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Com
 
 
 def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quantises columns [V, C] over their ranges: float64 numbers, uint8 codes, float32 [2, C] lowest and step."""
-    low = numbers.min(0).astype(np.float32)
-    step = (np.ptp(numbers, axis=0) / _LEVELS).astype(np.float32)
+    """Quantises columns [V, C] over their ranges: float64 numbers, uint8 codes, float16 [2, C] lowest and step."""
+    low = -_half_above(-numbers.min(0))
+    step = _half_above((numbers.max(0) - low) / _LEVELS)
     code = np.divide(numbers - low, step, out=np.zeros_like(numbers), where=step > 0)
     code = np.clip(np.rint(code), 0, _LEVELS).astype(np.uint8)
-    return low.astype(np.float64) + code * step.astype(np.float64), code, np.stack([low, step])
+    return low + code * step, code, np.stack([low, step]).astype(np.float16)
+
+
+def _half_above(numbers: np.ndarray) -> np.ndarray:
+    """Rounds numbers up to half floats, as float64."""
+    near = numbers.astype(np.float16)
+    return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
 
 
 def _norm(values: np.ndarray) -> np.ndarray:
