@@ -149,7 +149,7 @@ def probe(
     rivals: _Rivals = True,
     rivals_at: _RivalsAt = None,
     volume_only: Annotated[
-        bool, typer.Option("--volume-only", help="The volume alone: probes as they were, a transform of 5%.")
+        bool, typer.Option("--volume-only", help="Measure the volume only: original probes and principal components.")
     ] = False,
     json_path: _RowsFile = None,
     plot_path: _PlotFile = None,
@@ -170,7 +170,7 @@ def probe(
     elif rivals_at is not None:
         if quick or not rivals or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
-        rows = run_rivals(rivals_at, **common)
+        rows = run_rivals(**common)
         beside = _measured(rivals_at, rows)
         command = _command("probe", rivals_at=rivals_at, **files)
     else:

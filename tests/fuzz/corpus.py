@@ -23,12 +23,12 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.engines.three import export_grid
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES, export_unreal
-from wlm.smoke.baking import bake as bake_smoke
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.learn.pool import Pool, save_pool
-from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.fine import bake as bake_smoke
+from wlm.smoke.network.pool import Pool, save_pool
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
-from wlm.smoke.shots import with_surface
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
 
@@ -77,10 +77,9 @@ def _textures(folder: Path) -> None:
     size = _WIDTH, _HEIGHT
     flat = np.where(_pixels(3) > 0.5, 1.0, 0.25).astype(np.float32)
     (folder / "runs.hdr").write_bytes(imagecodecs.rgbe_encode(flat, header=True))
-    # Rows of a texel, a repeat of 4, another texel and a repeat of 4.
-    row = bytes([200, 100, 50, 128, 1, 1, 1, 4, 50, 150, 250, 129, 1, 1, 1, 4])
+    row = bytes([200, 100, 50, 128, 50, 150, 250, 129]) * 5
     head = b"#?RADIANCE\nEXPOSURE=2\nCOLORCORR=1 2 1\nFORMAT=32-bit_rle_rgbe\n\n"
-    (folder / "repeats.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
+    (folder / "plain.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
     words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
     blocks = words.tobytes()[: 9 * 16]
     half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]

@@ -35,8 +35,8 @@ from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
-from wlm.smoke.exporter import read_flipbook
-from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.flipbook.textures import read_flipbook
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
 from . import models
@@ -377,7 +377,7 @@ _ALL = (
         lambda: {"light.bin_0": np.arange(18, dtype="<f4").tobytes(), "mask.bin_0": b"\x7f\xff" * 3},
     ),
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
-    Reader("radiance", "a.hdr", corpus("runs.hdr", "repeats.hdr"), vary_radiance, _light_file),
+    Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
     Reader(
         "ktx2",
         "a.ktx2",

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.probe.volume.light import StoredLight
+from wlm.probe.exporter import export_volume
 from wlm.probe.sphere import irradiance
 from wlm.probe.volume.cascade import Volume
-from wlm.probe.exporter import export_volume
-from wlm.probe.volume.shader import volume_glsl, volume_hlsl
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.shader import volume_glsl
+from wlm.shading import translate
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_shaders_read_what_the_volume_has(volume, tmp_path):
 def test_the_shaders_compile(language, outputs, tmp_path):
     if language == "hlsl":
         call = "RWStructuredBuffer<float> o : register(u0);\n[numthreads(1, 1, 1)] void main()\n"
-        text, options = volume_hlsl(outputs) + call, ["-D", "-V", "-e", "main"]
+        text, options = translate(volume_glsl(outputs), "hlsl") + call, ["-D", "-V", "-e", "main"]
         body = f"{{ float v[{outputs}]; float3 p = float3(1.0, 2.0, 3.0); o[0] = wlm_volume_read(p, p, v) + v[0]; }}\n"
     else:
         body = "layout(std430, binding = 7) buffer O { float o[]; };\n"

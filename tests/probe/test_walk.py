@@ -8,8 +8,8 @@ import pytest
 
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
-from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, settle, summary, walk
 
 

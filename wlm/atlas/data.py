@@ -54,7 +54,7 @@ import numpy as np
 from wlm.atlas.belonging import chart_map, choose_mesh, fits_flipped, named, replace_strays
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.errors import WlmError
-from wlm.formats.encoded import read_encoded
+from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
 from wlm.formats.gltf_writer import Replacement, write_glb
 from wlm.formats.light import read_light
@@ -150,7 +150,7 @@ def load(
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
             primitive has it, else 0. An `.obj` has only 0.
         node: The node that the lightmap belongs to, by its name, its mesh's name or its number; None: see above.
-        encoding: What the bytes of a PNG stand for, one of `wlm.formats.encoded.ENCODINGS`; None: it is no PNG.
+        encoding: What the bytes of a PNG stand for, one of `wlm.formats.channels.ENCODINGS`; None: it is no PNG.
         flip: Whether the lightmap is upside down, its top row v = 1 of glTF.
         trust: Whether a glTF file may name files outside its folder, and draw more than its bytes account for
             (`wlm.formats.limits`).

@@ -103,10 +103,10 @@ def export(
 def _network(output: Path, network: Path | None, resolution: int) -> None:
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke import onnx_file
     from wlm.smoke.codec import shipped
     from wlm.smoke.model import SmokeModel
-    from wlm.smoke.planes import GUIDES, PLANES
+    from wlm.smoke.network import onnx_file
+    from wlm.smoke.network.planes import GUIDES, PLANES
     from wlm.system import load
 
     network = network or shipped()

@@ -84,9 +84,8 @@ def light(
     _check_white(white)
     own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
     quiet_warp()
-    from wlm.smoke.transport.features import orders_march
     from wlm.smoke.transport.lighting import light_smoke
-    from wlm.smoke.transport.orders import load_orders, scatter
+    from wlm.smoke.transport.orders import load_orders, orders_march, scatter
     from wlm.view.atlas import save_png
     from wlm.view.smoke import contact_sheet, light_picture, to_bytes
     from wlm_kernels.smoke.settings import March
@@ -210,7 +209,7 @@ def _each(frames: "Frames") -> "Iterator[tuple[int, DensityVolume]]":
 
 
 def _write_exr(path: Path, made: "Transport") -> None:
-    from wlm.formats.exr_planes import write_planes
+    from wlm.formats.exr import write_planes
 
     orders = made.planes.sum(0).cpu().numpy()
     noise = made.total_noise.cpu().numpy()

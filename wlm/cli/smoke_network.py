@@ -67,7 +67,7 @@ def train(
     quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
     from wlm.smoke.fit import train as fit
-    from wlm.smoke.model import Profile
+    from wlm.smoke.network.settings import Profile
 
     settings = Profile.load(profile)
     checkpoint = Path(f"{output}{SUFFIX}")
@@ -151,7 +151,7 @@ def evaluate(
     html_path: PageFile = None,
     device: Device = "cpu",
 ) -> None:
-    """Measure a network on smoke that it hasn't learned from, beside a coarse march and a flip book.
+    """Measure a network on smoke that it was not trained on.
 
     The smoke is of sequences by which no network was chosen either, at half, once and twice its density, and the
     volumes given. PSNR is of the lightmaps in sRGB; flicker is what changes from frame to frame beside the motion, over
@@ -162,7 +162,6 @@ def evaluate(
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from benchmarks.rivals.smoke import RIVALS
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network, shipped
     from wlm.smoke.evaluation import compare
@@ -172,7 +171,7 @@ def evaluate(
     sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
     settings = model.dataset.model_copy(update=sizes)
     with running("evaluate") as progress:
-        comparisons = compare(model, settings, smoke or (), rivals=RIVALS, device=device, progress=progress)
+        comparisons = compare(model, settings, smoke or (), device=device, progress=progress)
     if json_path is not None:
         facts = {"network": _facts(network, model), "device": device, **sizes}
         write_json(json_path, facts | {"sets": [comparison.to_json() for comparison in comparisons]})
@@ -203,9 +202,9 @@ def dataset(
     """
     quiet_warp()
     from wlm.config import load_settings
-    from wlm.smoke.learn.dataset import STAGES, make_pool, make_validation
-    from wlm.smoke.learn.pool import save_pool
-    from wlm.smoke.learn.settings import DatasetSettings
+    from wlm.smoke.network.dataset import STAGES, make_pool, make_validation
+    from wlm.smoke.network.pool import save_pool
+    from wlm.smoke.network.settings import DatasetSettings
     from wlm.view.smoke_pool import pool_sheet
 
     settings = load_settings(DatasetSettings, settings_file)
@@ -244,19 +243,19 @@ def dataset(
 
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.coarse import march
+    from wlm.smoke.march.coarse import bake_coarse
     from wlm_kernels.smoke.settings import March
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         voxels = max(volume.shape) / _MARCH if step is None else step
-        return march(volume, camera, March(voxels, seed=seed))
+        return bake_coarse(volume, camera, March(voxels, seed=seed))
 
     return make
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network; notes once where little of it is taken."""
-    from wlm.smoke.prediction import SmokePredictor
+    from wlm.smoke.network.prediction import SmokePredictor
 
     predictor, first = SmokePredictor(model, device), True
 
@@ -273,7 +272,7 @@ def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[Densit
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     """The network, and what its file says of its training."""
-    from wlm.smoke.model import parameter_count
+    from wlm.smoke.network.unet import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
     training = {name: model.summary[name] for name in names if name in model.summary}
@@ -282,7 +281,7 @@ def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
 
 
 def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
-    from wlm.smoke.planes import PLANES
+    from wlm.smoke.network.planes import PLANES
 
     scores = table(str(path), ["smoke", "method", "PSNR", "lowest", "highest", "flicker"], text=["method"])
     planes = table(f"{path}: PSNR of each plane", ["smoke", "method", *PLANES], text=["method"])

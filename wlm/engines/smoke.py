@@ -10,10 +10,10 @@ from wlm.engines.unreal import asset_name
 from wlm.errors import WlmError
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.shading import ENDINGS, check_language, custom_node, translate
-from wlm.smoke.billboard import billboard_shader
-from wlm.smoke.book import Book
 from wlm.smoke.camera import ALPHA
-from wlm.smoke.exporter import write_page
+from wlm.smoke.flipbook.book import Book
+from wlm.smoke.flipbook.shader import billboard_shader
+from wlm.smoke.flipbook.textures import write_page
 
 FORMAT = "wlm-smoke-engine"
 _VERSION = 1

@@ -1,8 +1,8 @@
 """Compact artifacts: eight bytes before the body, for files that a JSON header would be most of.
 
-A file is "wlm", a byte that is 16 times the system's number (its index in `SYSTEMS`) plus the version, the first 4 bytes
-of the BLAKE2b of everything else, and the body. The system defines the body. The file stores no name: a model is named
-after its file.
+A file is "wlm", a byte that is 16 times the system's number (its index in `SYSTEMS`) plus the version, the first 4
+bytes of the BLAKE2b of everything else, and the body. The system defines the body. The file stores no name: a model is
+named after its file.
 """
 
 import hashlib

@@ -74,10 +74,10 @@ class Decoder(ABC):
         """Returns the light of the model's own probes for a volume, decoded on demand.
 
         Args:
-            position: [N, 3], of all probes, in the order of the fit.
+            position: [N, 3], of all probes, in the order of the fit; Gaussians can be decoded at any other points too.
 
         Raises:
-            WlmError: The number of positions differs, or a position is not finite.
+            WlmError: The positions are not those of the model's probes, or a position is not finite.
         """
 
     def own_positions(self) -> np.ndarray:

@@ -153,7 +153,11 @@ def _fit_gaussians(
         trainer.close()
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
         raise WlmError(f"{probes.name}: the fit diverged; expected smaller rates than those of {profile.name}")
-    fitted = make(profile=profile.model_copy(update={"method": "gaussians"}), content=content, choice="Gaussians, as the profile asks")
+    fitted = make(
+        profile=profile.model_copy(update={"method": "gaussians"}),
+        content=content,
+        choice="Gaussians, as the profile asks",
+    )
     return pack_model(fitted, probes.position[probes.live], probes.values[probes.live], device)
 
 

@@ -51,7 +51,7 @@ _BUDGET = 1024  # blocks decoded per frame; the volume is awaited
 
 
 @dataclass(frozen=True)
-class SeenScore(Report):
+class ViewScore(Report):
     """The error of one kind of surface under one kind of light.
 
     Attributes:
@@ -80,7 +80,7 @@ def score_views(
     up: int = 1,
     device: str = "cpu",
     progress: OnProgress | None = None,
-) -> list[SeenScore]:
+) -> list[ViewScore]:
     """Draws the views and compares them.
 
     Args:
@@ -123,7 +123,7 @@ def score_views(
         if meter.due(number + 1):
             meter.report(number + 1)
     return [
-        SeenScore(thing, kind, error.count, error.mse, error.psnr, error.ssim, error.flip)
+        ViewScore(thing, kind, error.count, error.mse, error.psnr, error.ssim, error.flip)
         for (thing, kind), error in errors.items()
     ]
 

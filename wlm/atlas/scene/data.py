@@ -29,7 +29,7 @@ from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.data import LightmappedMesh, checked_mesh
 from wlm.atlas.scene.description import Description, SheetFiles, material_lightmaps, read_description
 from wlm.errors import WlmError
-from wlm.formats.encoded import read_encoded
+from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf, reported
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask

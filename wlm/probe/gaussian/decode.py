@@ -123,16 +123,14 @@ class GaussianDecoder(Decoder):
         return points.values()
 
     def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
-        position = self.own_positions() if position is None else np.asarray(position, np.float64)
-        self.check_own(position)
-        values = self.decode(position)
+        if position is not None:
+            self.check_own(position)
+        values = self.decode(self.own_positions() if position is None else position)
         values[~self.model.live] = 0.0
         return values
 
     def light(self, position: np.ndarray) -> "GaussianLight":
-        position = check_points(position, "N")
-        self.check_own(position)
-        return GaussianLight(self, position)
+        return GaussianLight(self, check_points(position, "N"))
 
 
 class GaussianLight:

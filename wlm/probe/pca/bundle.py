@@ -35,17 +35,17 @@ _TEMPLATE = """\
 //   {first}   {count_basis} basis vectors of {words} words: half floats, two in a word, the low half first
 //   {codes}   codes, {columns} bytes per probe, four in a word, the lowest byte first: magnitude, then coefficients
 //
-// It is a storage buffer, unless WLM_PROBE_DATA(i) is defined before this file as another way to read word i.
+// It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
 
-#ifndef WLM_PROBE_DATA
-#ifndef WLM_PROBE_DATA_BINDING
-#define WLM_PROBE_DATA_BINDING 0
+#ifndef WLM_PROBE_PROBES
+#ifndef WLM_PROBE_PROBES_BINDING
+#define WLM_PROBE_PROBES_BINDING 0
 #endif
-layout(std430, binding = WLM_PROBE_DATA_BINDING) readonly buffer WlmProbeData
+layout(std430, binding = WLM_PROBE_PROBES_BINDING) readonly buffer WlmProbeProbes
 {{
-    uint wlm_probe_data[];
+    uint wlm_probe_probes[];
 }};
-#define WLM_PROBE_DATA(i) wlm_probe_data[i]
+#define WLM_PROBE_PROBES(i) wlm_probe_probes[i]
 #endif
 
 const int WLM_PROBE_OUTPUTS = {outputs};
@@ -53,15 +53,15 @@ const int WLM_PROBE_COLUMNS = {columns};
 
 int wlm_probe_count()
 {{
-    return int(WLM_PROBE_DATA(0));
+    return int(WLM_PROBE_PROBES(0));
 }}
 
 // Number in a column of codes of a live probe.
 float wlm_probe_number(int probe, int column)
 {{
     int place = probe * WLM_PROBE_COLUMNS + column;
-    uint code = (WLM_PROBE_DATA({codes} + place / 4) >> uint(8 * (place % 4))) & 255u;
-    vec2 bounds = unpackHalf2x16(WLM_PROBE_DATA(1 + column));
+    uint code = (WLM_PROBE_PROBES({codes} + place / 4) >> uint(8 * (place % 4))) & 255u;
+    vec2 bounds = unpackHalf2x16(WLM_PROBE_PROBES(1 + column));
     return bounds.x + bounds.y * float(code);
 }}
 
@@ -78,7 +78,7 @@ _BASIS = """\
     for (int k = 0; k < WLM_PROBE_COLUMNS - 1; ++k) {{
         float coefficient = magnitude * wlm_probe_number(probe, 1 + k);
         for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d) {{
-            vec2 pair = unpackHalf2x16(WLM_PROBE_DATA({first} + k * {words} + d / 2));
+            vec2 pair = unpackHalf2x16(WLM_PROBE_PROBES({first} + k * {words} + d / 2));
             values[d] += coefficient * (d % 2 == 0 ? pair.x : pair.y);
         }}
     }}
@@ -120,7 +120,10 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     halves[:, : model.outputs] = content.basis
     codes = np.zeros(-(-content.code.size // 4) * 4, np.uint8)
     codes[: content.code.size] = content.code.reshape(-1)
-    words = [np.array([len(content.code)], "<u4"), np.ascontiguousarray(content.bounds.T, "<f2").reshape(-1).view("<u4")]
+    words = [
+        np.array([len(content.code)], "<u4"),
+        np.ascontiguousarray(content.bounds.T, "<f2").reshape(-1).view("<u4"),
+    ]
     words += [halves.reshape(-1).view("<u4"), codes.view("<u4")]
     document = {
         "about": _ABOUT,
