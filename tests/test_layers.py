@@ -7,13 +7,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 GROUND = (
     "wlm_kernels wlm wlm._facade wlm.bundle wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels "
-    "wlm.system wlm.workers wlm.shading"
+    "wlm.system wlm.workers"
 )
 FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.bake", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
+    ["wlm.bake", "wlm.export", "wlm.inspection", "wlm.view"],
     ["wlm.cli"],
     ["wlm.__main__"],
     ["benchmarks"],

@@ -273,8 +273,9 @@ def decode(
         write_exr(output, picture)
     else:
         from wlm.atlas.views import mesh_views
-        from wlm.view.atlas import draw, encode, save_png
+        from wlm.view.atlas import draw
         from wlm.view.display import white_of
+        from wlm.view.pictures import encode, save_png
 
         cameras = mesh_views(mesh, views)
         if view >= len(cameras):
@@ -313,7 +314,8 @@ def export(
     quiet_warp()
     from wlm.atlas.exporter import read_folder
     from wlm.atlas.scene.exporter import is_scene
-    from wlm.engines import export_atlas, export_scene
+    from wlm.export.engines.atlas import export_atlas
+    from wlm.export.engines.scene import export_scene
 
     if is_scene(folder):
         if exact:

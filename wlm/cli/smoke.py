@@ -254,8 +254,8 @@ def shade(
     behind = None if background is None else vector("--background", background)
     quiet_warp()
     from wlm.smoke.scene import LightSettings, Looks
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, picture, to_bytes
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
 
     book = opened_book(smoke, textures, cells, source_layout, straight)
     source = source_of(smoke, options, step, supersample, 1.0, book)

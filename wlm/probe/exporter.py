@@ -4,11 +4,11 @@ import os
 from pathlib import Path
 
 from wlm.bundle import Bundle
+from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.probe.bundle import bundle, volume_bundle
 from wlm.probe.model import ProbeModel
 from wlm.probe.volume.cascade import Volume
-from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT, VOLUME_FORMAT = "wlm-probe-export", "wlm-probe-volume"
 _VERSION = 2
@@ -24,7 +24,7 @@ def export(
         model: The model.
         directory: The folder; it is created if it does not exist. A new export replaces an earlier one.
         device: Where the reference is decoded.
-        shader: One of `wlm.shading.LANGUAGES`.
+        shader: One of `wlm.export.shading.LANGUAGES`.
 
     Returns:
         The files written, `probe.json` last.

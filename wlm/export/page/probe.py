@@ -1,0 +1,129 @@
+"""The page of light probes."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any, Literal
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.export.page.html import Page, pack_triangles
+from wlm.formats.geometry import read_geometry
+from wlm.probe.bundle import bundle
+from wlm.probe.data import load
+from wlm.probe.evaluation import evaluate
+from wlm.probe.model import ProbeModel
+from wlm.probe.places import ball_exposure, ball_radius, probes_of
+from wlm.probe.sphere import sh_count
+
+_BANDS = 9  # coefficients that diffuse light needs
+_BUFFERS = ("gaussians", "network", "probes")
+
+_BETWEEN = """
+// Light between principal components: of the probes within four times the distance of the nearest one, weighted by
+// 1 / distance^4. WLM_PROBE_OWN(i) reads the positions of the live probes.
+vec3 wlm_probe_own(int probe)
+{
+    return uintBitsToFloat(
+        uvec3(WLM_PROBE_OWN(3 * probe), WLM_PROBE_OWN(3 * probe + 1), WLM_PROBE_OWN(3 * probe + 2)));
+}
+
+void wlm_probe_sh(vec3 position, out vec3 sh[COUNT])
+{
+    float nearest = 1e30;
+    for (int i = 0; i < wlm_probe_count(); ++i) {
+        vec3 away = position - wlm_probe_own(i);
+        nearest = min(nearest, dot(away, away));
+    }
+    float total = 0.0;
+    for (int c = 0; c < COUNT; ++c)
+        sh[c] = vec3(0.0);
+    for (int i = 0; i < wlm_probe_count(); ++i) {
+        vec3 away = position - wlm_probe_own(i);
+        float square = dot(away, away);
+        if (square > 16.0 * nearest)
+            continue;
+        float weight = 1.0 / max(square * square, 1e-30);
+        vec3 here[COUNT];
+        wlm_probe_sh(i, here);
+        for (int c = 0; c < COUNT; ++c)
+            sh[c] += weight * here[c];
+        total += weight;
+    }
+    for (int c = 0; c < COUNT; ++c)
+        sh[c] /= total;
+}
+"""
+
+
+def probe_page(
+    model: ProbeModel,
+    file_bytes: int,
+    *,
+    mesh: str | os.PathLike[str] | None = None,
+    original: str | os.PathLike[str] | None = None,
+    key: str | None = None,
+    up: Literal["y", "z"] = "y",
+) -> Page:
+    """Makes the page of a probe model: spheres at its positions or at those of the original.
+
+    Args:
+        model: The model.
+        file_bytes: Size of its file.
+        mesh, original, key, up: As for `wlm.export.page.pages.make_page`.
+
+    The page holds the buffers of the model's bundle.
+
+    Raises:
+        WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
+            can't be read, or is of other probes.
+    """
+    coefficients = sh_count(model.outputs)
+    if coefficients is None:
+        raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
+    position, values, live, _ = probes_of(model, original, key)
+    places = position[live].astype(np.float32)
+    decoded = model.decoder(position=position).decode_probes()[live]
+    made = bundle(model)
+    shader = made.shader
+    arrays = {name: made.buffers[name] for name in _BUFFERS if name in made.buffers}
+    if "probes" in arrays:
+        arrays["own"] = places.reshape(-1).view("<u4")
+        shader += _BETWEEN.replace("COUNT", str(coefficients))
+    arrays["places"] = places
+    radius = ball_radius(places)
+    light = decoded if values is None else values[live]
+    manifest: dict[str, Any] = {
+        "shader": shader,
+        "exposure": ball_exposure(light.reshape(len(places), coefficients, 3)),
+        "low": (places.min(0) - radius).tolist(),
+        "high": (places.max(0) + radius).tolist(),
+        "up": "xyz".index(up),
+        "probe": {"count": len(places), "radius": radius, "coefficients": coefficients},
+    }
+    if values is not None:
+        stored = np.zeros((len(places), _BANDS, 3), np.float16)
+        shown = values[live].reshape(len(places), coefficients, 3)[:, :_BANDS]
+        stored[:, : shown.shape[1]] = shown.clip(-65504, 65504)
+        arrays["original"] = stored
+        manifest["reference"] = {"times": [0.0]}
+    if mesh is not None:
+        triangles, box = pack_triangles(read_geometry(mesh, with_uv=False), up)
+        arrays |= triangles
+        manifest["low"] = np.minimum(manifest["low"], box["low"]).tolist()
+        manifest["high"] = np.maximum(manifest["high"], box["high"]).tolist()
+        manifest["inward"] = box["inward"]
+    figures = [
+        ("file", f"{file_bytes:,} bytes"),
+        ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
+        ("size", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f}% of float32"),
+        ("live probes", f"{len(places):,} of {model.probes:,}"),
+        *((name, str(value)) for name, value in model.content.facts().items()),
+        ("profile", model.profile.name),
+    ]
+    if original is not None:
+        score = evaluate(model, load(original, key=key), file_bytes=file_bytes).psnr
+        figures.append(("PSNR of coefficients", "–" if math.isnan(score) else f"{score:.2f} dB"))
+    return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)
