@@ -194,7 +194,6 @@ def _model(path: Path) -> Finding:
         return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
     kind = {
         "lightmap": "lightmaps over time",
-        "lightmap-layers": "layered lightmaps over time",
         "atlas": "a mesh's lightmap",
         "atlas-scene": "the lightmaps of a scene",
         "probe": "light probes",

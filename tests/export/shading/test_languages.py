@@ -18,6 +18,7 @@ from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, r
 from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
+from wlm.lightmap.exporter import export as export_lightmap
 
 from wlm import probe
 from wlm.atlas.colour import quantise
@@ -31,7 +32,6 @@ from wlm.errors import WlmError
 from wlm.export.shading import LANGUAGES, translate
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder as LightmapDecoder
-from wlm.lightmap.exporter import export as export_lightmap
 from wlm.probe.light import StoredLight
 from wlm.probe.shader import probe_glsl
 from wlm.probe.volume import Volume

@@ -18,7 +18,7 @@ from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.shared_exponent import unpack_rgb9e5
-from wlm.lightmap.packed import MOST_LAYERS
+from wlm.lightmap.bundle import MOST_LAYERS
 
 FORMAT = "wlm-bundle"
 INFO_FILE = "bundle.json"
