@@ -89,14 +89,6 @@ def _smoke() -> Kept:
     return Kept(_written(random_model(levels=2).save), wlm.load, {}, {})
 
 
-def _pool() -> Kept:
-    from wlm.smoke.network.pool import load_pool, save_pool
-    from wlm.smoke.network.settings import DatasetSettings
-
-    content = _written(lambda path: save_pool(path, _samples(), DatasetSettings(), "seed-0"))
-    return Kept(content, load_pool, {}, {})
-
-
 def _samples() -> Any:
     import torch
 
@@ -218,7 +210,6 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "atlas-cascade": lambda: _atlas("cascade", "half"),
         "atlas-bc6h": lambda: _atlas("plain with uv", "bc6h"),
         "smoke": _smoke,
-        "pool": _pool,
         "lightmap-running": _lightmap_running,
         "lightmap-finished": _lightmap_finished,
         "probe-running": _probe_running,

@@ -114,7 +114,7 @@ def _network(output: Path, network: Path | None, resolution: int) -> None:
 
     network = network or shipped()
     model: SmokeModel = load(network, "smoke-network")
-    size = onnx_file.export(model, output, height=resolution, width=resolution)
+    size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
     rows = table(str(network), ["", "planes"], text=["planes"])
     rows.add_row("guide", " ".join(GUIDES[model.settings.guide]))
     rows.add_row("lightmaps", " ".join(PLANES))
