@@ -183,18 +183,11 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model = load(path)
-    if model.SYSTEM == "probe":
-        from wlm.probe.regions import RegionModel
-
-        if isinstance(model, RegionModel):
-            # It is read piece by piece; here all of it is asked for.
-            model.check_pieces()
     if model.SYSTEM == "smoke-network":
         what = "a network that predicts six-way lightmaps"
         return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
     kind = {
         "lightmap": "lightmaps over time",
-        "lightmap-layers": "layered lightmaps over time",
         "atlas": "a mesh's lightmap",
         "atlas-scene": "the lightmaps of a scene",
         "probe": "light probes",
