@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from wlm.shading import translate
 
 from wlm.errors import WlmError
 from wlm.probe.exporter import export_volume
@@ -13,7 +14,6 @@ from wlm.probe.sphere import irradiance
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.shader import volume_glsl
-from wlm.shading import translate
 
 
 @pytest.fixture(scope="module")
