@@ -149,12 +149,6 @@ class ProbeModel(Model):
         """
         return self.content.decoder(self, device, **options)
 
-    def bundle(self, *, device: str = "cpu") -> Bundle:
-        """Returns what a GPU holds of the model; see `wlm.probe.bundle.bundle`."""
-        from wlm.probe.bundle import bundle
-
-        return bundle(self, device=device)
-
     def normalise(self, position: np.ndarray) -> np.ndarray:
         """Converts positions to the normalised frame and clamps them to the probes' box.
 
