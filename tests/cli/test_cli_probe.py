@@ -61,12 +61,12 @@ def test_compress_prints_one_table(room, profile, tmp_path):
 
 def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     out, other = tmp_path / "a.wlm", tmp_path / "b.wlm"
-    options = ["--profile", profile, "--ratio", 0.2, "--bits", 8, "--latent", 3, "--steps", 12, "--positions"]
+    options = ["--profile", profile, "--ratio", 0.2, "--latent", 3, "--steps", 12, "--positions"]
     call("probe", "compress", room, "-o", out, *options, "--key", "sh", "--convention", "threejs")
     model = wlm.load(out)
     settings = model.profile
-    assert (settings.ratio, settings.bits, settings.latent, settings.steps) == (0.2, 8, 3, 12)
-    assert model.source == data.load(room).source[:4]
+    assert (settings.ratio, settings.latent, settings.steps) == (0.2, 3, 12)
+    assert model.source == data.load(room).source[:8]
     slack = model.extent * model.size.max() / 65535
     np.testing.assert_allclose(model.stored_positions(), data.load(room).position, rtol=0, atol=slack)
     # The seed of the command is the seed of the fit.
@@ -75,7 +75,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
         assert (other.read_bytes() == out.read_bytes()) is same
     # Another convention is other light.
     call("probe", "compress", room, "-o", other, *options, "--convention", "godot")
-    assert wlm.load(other).source == data.load(room, convention="godot").source[:4] != model.source
+    assert wlm.load(other).source == data.load(room, convention="godot").source[:8] != model.source
 
 
 def test_warnings_of_the_set_are_shown(profile, tmp_path):
@@ -160,7 +160,7 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
     model = wlm.load(fitted)
     assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
     assert (facts["probes"], facts["dead"], facts["outputs"], facts["positions"]) == (PROBES, DEAD, 27, False)
-    assert facts["gaussians"] == model.count and facts["packed"] and facts["gaussian_bits"] is None
+    assert facts["gaussians"] == model.content.count and facts["gpu_bytes"] == model.content.nbytes
     assert facts["bits_per_probe"] == facts["bytes"] * 8 / PROBES
     np.testing.assert_allclose(facts["size"], np.ptp(synthetic(PROBES).position, axis=0))
     assert facts["profile"]["name"] == "tiny"
