@@ -114,9 +114,9 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS)
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
+def test_the_command(given_rows, tmp_path, monkeypatch):
     words = ["probe", "--no-rivals", "--probes", tmp_path / "room.npz", "--key", "sh", "--key", "sh_noon"]
-    command, _, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    command, _, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
     assert command == "python -m benchmarks probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon"
     assert options["keys"] == ["sh", "sh_noon"] and not options["rivals"] and not options["quick"]
 
