@@ -24,7 +24,7 @@ from playwright.sync_api import sync_playwright
 
 import wlm
 from benchmarks import describe_environment
-from wlm.engines import ENGINES, export_lightmap
+from wlm.export.engines import ENGINES, export_lightmap
 from wlm.formats.atomic import atomic_write
 from wlm.lightmap.data import from_arrays
 

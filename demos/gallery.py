@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from wlm.errors import WlmError
-from wlm.web import write_page
+from wlm.export import write_page
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE / "data"

@@ -322,7 +322,7 @@ def test_a_signal_keeps_the_fit(number, code, folder, profile, tmp_path):
                 break
         text, errors = process.communicate()
     assert process.returncode == code and text == ""
-    assert re.search(r"^stopped at step \d+: .* --resume goes on from .+a\.wlm\.partial$", errors, re.MULTILINE)
+    assert re.search(r"^stopped at step \d+: .* --resume to continue from .+a\.wlm\.partial$", errors, re.MULTILINE)
     assert "Traceback" not in errors
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm.partial"]
 

@@ -81,7 +81,7 @@ def test_frames_that_were_made_are_not_made_again(words, place, stem, other, fra
 
     monkeypatch.setattr(place, interrupted)
     call(*words, "-o", out, code=130)
-    assert f"stopped at frame 2: the same command with --resume goes on from {out / stem}.partial" in call.stderr
+    assert f"stopped at frame 2: repeat the command with --resume to continue from {out / stem}.partial" in call.stderr
     names = [f"{stem}_0001.exr", f"{stem}_0002.exr", f"{stem}.partial"]
     assert sorted(os.listdir(out)) == sorted(names)
     before = [(out / name).stat().st_mtime_ns for name in names[:2]]

@@ -100,7 +100,7 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "run", interrupted)
     call(*words, code=130)
     monkeypatch.setattr(Trainer, "run", run)
-    assert f"stopped at step 2: the same command with --resume goes on from {tmp_path}" in call.stderr
+    assert f"stopped at step 2: repeat the command with --resume to continue from {tmp_path}" in call.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.safetensors", "a.safetensors.partial"]
     text = call(*words, "--resume", "--minutes", 0)
     assert "out of time at step 4" in call.stderr and "4 of 8" in text

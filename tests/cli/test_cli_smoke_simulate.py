@@ -106,7 +106,7 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     call("smoke", "simulate", scene, "-o", out, code=130)
     monkeypatch.undo()
     whole = ["frame_0001.npz", *["frame_0002.npz"] * (not within)]
-    assert f"stopped at frame {len(whole)}: the same command with --resume goes on from {out}" in call.stderr
+    assert f"stopped at frame {len(whole)}: repeat the command with --resume to continue from {out}" in call.stderr
     assert sorted(os.listdir(out)) == [*whole, "scene.json", CHECKPOINT]
     # With another scene it isn't resumed, and nothing is lost by the attempt.
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))

@@ -21,7 +21,7 @@ from wlm.lightmap.layers import codec
 from wlm.lightmap.layers.data import LayerArrays, from_layers
 from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.tiles import TileKind
-from wlm.web.pages import make_page
+from wlm.export.page.pages import make_page
 
 
 @pytest.fixture(scope="module")

@@ -180,7 +180,7 @@ def test_a_stopped_command_leaves_no_process_behind(number, lightmaps, tmp_path)
         errors = run.stderr.read()
     assert len(workers) == 2
     if number != signal.SIGKILL:
-        assert run.returncode == 128 + number and "--resume goes on from" in errors and "Traceback" not in errors
+        assert run.returncode == 128 + number and "--resume to continue from" in errors and "Traceback" not in errors
     # An orphan ends once it has answered.
     for pid in workers:
         for _ in range(100):

@@ -1,7 +1,7 @@
 """The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
 
 from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES, AtlasModel
-from wlm.shading import sampler
+from wlm.bundle import sampler
 
 EXACT = "WLM_ATLAS_EXACT"
 """Macro that has texels fetched and mixed in floats."""

@@ -313,7 +313,7 @@ def export(
     quiet_warp()
     from wlm.atlas.exporter import read_folder
     from wlm.atlas.scene.exporter import is_scene
-    from wlm.engines import export_atlas, export_scene
+    from wlm.export.engines import export_atlas, export_scene
 
     if is_scene(folder):
         if exact:

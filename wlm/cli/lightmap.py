@@ -369,7 +369,7 @@ def export(
     if engine != "raw" and device != "cpu":
         raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
     quiet_warp()
-    from wlm.engines import export_lightmap
+    from wlm.export.engines import export_lightmap
     from wlm.lightmap.front import export
 
     model = _model(file)

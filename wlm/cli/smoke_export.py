@@ -92,7 +92,7 @@ def export(
     if padding is None:
         padding = 0 if mips is not None else _PADDING
     quiet_warp()
-    from wlm.engines import export_smoke
+    from wlm.export.engines import export_smoke
 
     opened = opened_book(source, textures, cells, source_layout, straight)
     packed = packed_book(source, options, opened, **packing, layout=layout or "unity", padding=padding)

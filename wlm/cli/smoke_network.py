@@ -78,7 +78,7 @@ def train(
     with running("train", checkpoint) as progress:
         training = fit(settings, output, progress=progress, **options)
     if not training.finished:
-        note(f"out of time at step {training.steps}: the same command with --resume goes on from {checkpoint}")
+        note(f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}")
     rows = table(f"{output}: {settings.name}", ["", "value"])
     rows.add_row("steps", f"{training.steps:,} of {settings.training.total:,}")
     rows.add_row("steps skipped", f"{training.skipped:,}")

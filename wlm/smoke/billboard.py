@@ -5,7 +5,8 @@ It ends with the functions that engines' materials call; those of `wlm.smoke.sha
 
 import math
 
-from wlm.shading import LANGUAGES, sampler, translate
+from wlm.bundle import sampler
+from wlm.shading import LANGUAGES, translate
 from wlm.smoke.book import Book
 from wlm.smoke.shading import Ramp
 

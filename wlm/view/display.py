@@ -1,6 +1,6 @@
 """From linear light to the screen: exposure, tone mapping, sRGB, and the colours of an error.
 
-The same as the pages for a browser have (`wlm/web/assets/light.js`), so that a picture of either is that of the other.
+The same as the pages for a browser have (`wlm/export/page/assets/light.js`), so that a picture of either is that of the other.
 """
 
 from dataclasses import dataclass

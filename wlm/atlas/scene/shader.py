@@ -2,7 +2,7 @@
 
 from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES
 from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, MOST_COARSE, SHORT_ENTRY, SceneModel
-from wlm.shading import sampler
+from wlm.bundle import sampler
 
 _TEXT = """\
 // Light from the compressed lightmaps of a scene: each tile of each lightmap is a few rectangles of a texture array,
