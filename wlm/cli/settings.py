@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import typer
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from typer.core import TyperCommand
+from typer.main import get_command
 
 _PANEL = "Settings; default: as the profile says"
 _SENTENCE_END = re.compile(r"(?<=[.;:])\s+(?=[A-Z\"`0-9])")
@@ -37,35 +39,50 @@ def with_settings(place: str, into: str = "settings") -> Callable[[Callable[...,
     """Marks a command as having an option for each field of a settings model.
 
     Args:
-        place: The model, as `module:name`. It is imported when the command is built, which `expanded` does.
+        place: The model, as `module:name`. It is imported when the command is built, by `command_of`.
         into: The parameter of the command that receives the given options, nested as the model is.
     """
 
     def mark(command: Callable[..., None]) -> Callable[..., None]:
-        command.settings_model = (place, into)  # type: ignore[attr-defined]
+        signature = inspect.signature(command)
+        own = [parameter for name, parameter in signature.parameters.items() if name != into]
+        command.__signature__ = signature.replace(parameters=own)  # type: ignore[attr-defined]
+        command.settings_model = (place, into, command)  # type: ignore[attr-defined]
         return command
 
     return mark
 
 
-def expanded(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command that `with_settings` has marked its options, for typer to read; leaves any other as it is."""
-    place, into = getattr(command, "settings_model", (None, None))
-    if place is None:
-        return command
-    module, _, name = place.partition(":")
-    settings = list(_fields(getattr(import_module(module), name)))
-    signature = inspect.signature(command)
+def command_of(name: str, function: Callable[..., None]) -> Any:
+    """Builds the command of a function, with the options of its settings if `with_settings` has marked it."""
+    if hasattr(function, "settings_model"):
+        place, into, function = function.settings_model
+        module, _, model = place.partition(":")
+        function = _expanded(function, list(_fields(getattr(import_module(module), model))), into)
+    app = typer.Typer(add_completion=False)
+    app.command(name)(function)
+    return get_command(app)
+
+
+class Generated(TyperCommand):
+    """A command that is built with its generated options when it is called, because that imports the settings."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        return command_of(str(self.name), self.callback).make_context(info_name, args, parent, **extra)
+
+
+def _expanded(command: Callable[..., None], settings: "list[_Field]", into: str) -> Callable[..., None]:
+    """Gives a command an option for each field, for typer to read."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
         given = {field.path: values.pop(field.parameter) for field in settings}
         command(**values, **{into: _nested({path: value for path, value in given.items() if value is not None})})
 
-    own = [parameter for name, parameter in signature.parameters.items() if name != into]
+    own = list(inspect.signature(command).parameters.values())
     generated = [_parameter(field) for field in settings]
     # typer reads both.
-    run.__signature__ = signature.replace(parameters=[*own, *generated])  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*own, *generated])  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *generated)}
     return run
 

@@ -13,7 +13,6 @@ from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand
-from typer.main import get_command
 from typer.models import OptionInfo
 
 from wlm.errors import WlmError
@@ -88,15 +87,13 @@ def variant(verb: str, system: str) -> Any:
     Raises:
         WlmError: The system does not have the verb; the line names the alternative.
     """
-    from wlm.cli.settings import expanded
+    from wlm.cli.settings import command_of
 
     function = functions(verb).get(system)
     if function is None:
         instead = getattr(import_module(f"wlm.cli.{system}"), "INSTEAD", {}).get(verb, "")
         raise WlmError(f"wlm {verb}: does not apply to files of {system}" + (f"; use {instead}" if instead else ""))
-    app = typer.Typer(add_completion=False)
-    app.command(verb)(expanded(function))
-    return get_command(app)
+    return command_of(verb, function)
 
 
 def first_argument(words: Sequence[str], value_options: set[str]) -> str | None:
