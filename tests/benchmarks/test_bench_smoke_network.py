@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from builders.bench_rows import by_option, check_command, check_outputs
+from wlm.smoke.network.unet import SixWayNetwork
 
 import benchmarks.path_tracer as path_tracer
 import benchmarks.smoke_network as bench
@@ -15,12 +16,12 @@ from benchmarks.smoke_network import PANELS, plotted, run, run_rows
 from benchmarks.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.smoke.baking import bake
 from wlm.smoke.codec import shipped
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.learn.synthetic import make_plume
-from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
+from wlm.smoke.march.fine import bake
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm.smoke.synthetic import make_plume
 
 TINY = replace(
     QUICK,

@@ -10,9 +10,9 @@ from builders.smoke_plumes import plume
 from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.smoke.baking import bake
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 from wlm.smoke.transport.lighting import light_smoke

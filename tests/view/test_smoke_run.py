@@ -6,7 +6,7 @@ import pytest
 import torch
 from builders.smoke_plumes import SPHERE, plume
 
-from wlm.smoke.replay import VolumeGraph
+from wlm.smoke.march.launch import VolumeGraph
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
 from wlm.smoke.shading import Ramp
 from wlm.smoke.transport.orders import scatter

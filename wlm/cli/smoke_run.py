@@ -78,7 +78,7 @@ def run(
     from wlm.formats.film import film
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles
-    from wlm.smoke.prediction import SmokePredictor
+    from wlm.smoke.network.prediction import SmokePredictor
     from wlm.smoke.scene import load_scene
     from wlm.smoke.transport.orders import load_orders
     from wlm.view.atlas import save_png

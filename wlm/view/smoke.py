@@ -12,8 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 from wlm.errors import WlmError
 from wlm.interop import device_name
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import Guide
 from wlm.smoke.scene import ObstacleSettings
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lighting import LitSmoke

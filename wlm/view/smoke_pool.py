@@ -5,8 +5,8 @@ import os
 import numpy as np
 import torch
 
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.planes import GUIDES, PLANES
+from wlm.smoke.network.planes import GUIDES, PLANES
+from wlm.smoke.network.pool import Pool
 from wlm.view.smoke import MOST_COLUMNS, contact_sheet
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.learn.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
+from wlm.smoke.network.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
 from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
 # Of the air, m^2/s: at the low end the eddies come from the turbulence model, at the high end the smoke is smooth.

@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from wlm.smoke.camera import LAYOUTS
 from wlm.smoke.data import Frames
-from wlm.smoke.exporter import brightest_gain, cells, lay_out, pack
-from wlm.smoke.flipbook_depth import encoded_depth, frames_depth
-from wlm.smoke.flipbook_motion import ZERO, encoded, frames_motion, mip_levels, scale_of
-from wlm.smoke.shader import smoke_shader
+from wlm.smoke.flipbook.depth import encoded_depth, frames_depth
+from wlm.smoke.flipbook.motion import ZERO, encoded, frames_motion, mip_levels, scale_of
+from wlm.smoke.flipbook.shots import Shot
+from wlm.smoke.flipbook.textures import brightest_gain, cells, lay_out, pack
 from wlm.smoke.shading import Ramp
-from wlm.smoke.shots import Shot
 from wlm.system import OnProgress
 
 RATE = 25.0
@@ -25,9 +23,10 @@ class Book:
     """A flip book in its textures.
 
     Attributes:
-        first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4], see `wlm.smoke.exporter`.
-        motion: float32 [..., 3] of the same size, see `wlm.smoke.flipbook_motion`; or None.
-        depth: Likewise, see `wlm.smoke.flipbook_depth`; or None.
+        first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4], see
+            `wlm.smoke.flipbook.textures`.
+        motion: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; or None.
+        depth: Likewise, see `wlm.smoke.flipbook.depth`; or None.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
         rows, columns, count: Of cells, and of frames in them.
         size: Height and width of a frame in pixels, without padding.
@@ -77,12 +76,6 @@ class Book:
         """The smallest level of a texture's mips whose frames show no neighbour."""
         return mip_levels(*self.size, self.padding)
 
-    def shader(self, language: str) -> str:
-        """The functions of `wlm.smoke.shader`, in one of `wlm.shading.LANGUAGES`."""
-        names = ("rows", "columns", "count", "size", "padding", "gain", "hot")
-        values: dict[str, Any] = {name: getattr(self, name) for name in names}
-        return smoke_shader(language, self.layout, **values, motion=self.scale, depth=self.reach)
-
 
 def pack_book(
     shots: Sequence[Shot],
@@ -104,7 +97,7 @@ def pack_book(
         columns: Of cells, at most; None: as near to a square as can be.
         gain: Factor on the light; None: the greatest that 8 bits hold.
         padding: Pixels around each frame that repeat its border.
-        air: Of `wlm.smoke.flipbook_motion.open_motion`, for a texture of motion; None: none.
+        air: Of `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: none.
         volumes: The frames' smoke, for a texture of depth; None: none.
         rate: Frames a second; None: as the scene's frames are apart, or `RATE`.
         progress: Of the motion and the depth, called after each frame.

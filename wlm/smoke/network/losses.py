@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from wlm.smoke.learn.settings import LossSettings
-from wlm.smoke.planes import OPACITY_PLANE, PLANES, from_srgb
+from wlm.smoke.network.planes import OPACITY_PLANE, PLANES, from_srgb
+from wlm.smoke.network.settings import LossSettings
 
 _BITS = 40  # of the largest number in an integer sum; there are 22 more for the sum itself
 _VISIBLE = 0.01  # opacity above which change counts

@@ -13,7 +13,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.lightmaps import SixWay, StepError
-from wlm.smoke.marching import run
+from wlm.smoke.march.launch import run
 from wlm_kernels.smoke import march_six
 from wlm_kernels.smoke.settings import March
 

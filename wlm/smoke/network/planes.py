@@ -5,9 +5,8 @@ import torch
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import march_planes
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import guide, march_planes
 from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import FOOT, FOOT_CODE
@@ -98,7 +97,7 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
         volume: The smoke.
         camera: Orthographic.
         kind: One of `GUIDES`.
-        march: As for `guide` where the kind is "paper", else as for `wlm.smoke.coarse.march`.
+        march: As for `guide` where the kind is "paper", else as for `wlm.smoke.march.coarse.bake_coarse`.
 
     Returns:
         float32 [C, H, W], the planes of `GUIDES`, all 0 where there is no smoke, but for an emission without any.

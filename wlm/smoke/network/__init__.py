@@ -3,8 +3,8 @@
 A network turns a guiding map, a cheap render of smoke, into six-way lightmaps. It learns that from pairs of the two,
 rendered from simulated smoke while it trains. To read it all, in order:
 
-1.  `wlm/smoke/planes.py`: the planes of a guiding map and of lightmaps, encoded to a common range. All that follows
-    is in these.
+1.  `wlm/smoke/network/planes.py`: the planes of a guiding map and of lightmaps, encoded to a common range. All that
+    follows is in these.
 2.  `wlm/smoke/model.py`: the network, a U-Net with NAFBlocks behind it: `NetworkSettings`, `SixWayNetwork`.
 3.  `settings.py`: how samples are made (`DatasetSettings`), weights of the losses (`LossSettings`), the
     optimiser's settings (`TrainSettings`). `Profile` in `model.py` holds the network's, the training's and the

@@ -10,8 +10,8 @@ import torch
 
 from wlm.formats.artifact import Artifact, read_artifact, write_artifact
 from wlm.formats.parts import Part, check_parts
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import decode
 
 _SYSTEM = "smoke-pool"

@@ -11,11 +11,11 @@ import torch.nn.functional as F
 
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import StepGraph
-from wlm.smoke.learn.losses import Losses
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.settings import TrainSettings
-from wlm.smoke.model import NetworkSettings, SixWayNetwork
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
+from wlm.smoke.network.losses import Losses
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import NetworkSettings, TrainSettings
+from wlm.smoke.network.unet import SixWayNetwork
 
 _BLOCK = 16  # edge in pixels of the blocks in which crops look for smoke
 

@@ -1,12 +1,14 @@
 """Settings of the network's training: samples, losses, optimiser; and the units in which scenes are drawn."""
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from wlm.smoke.network.planes import GUIDES
+from wlm.system import Settings
 from wlm_kernels.smoke.settings import March
 
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
@@ -21,6 +23,43 @@ GuideKind = Literal["paper", "front", "sides", "six"]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Positive = Annotated[float, Field(gt=0.0)]
 _Range = tuple[_Positive, _Positive]
+
+
+class NetworkSettings(BaseModel):
+    """The network's shape.
+
+    Attributes:
+        width: Channels of the first level; each level has twice those of the one before, at half the resolution.
+        levels: Levels of the U-Net, the lowest included.
+        adapters: Whether each of the four groups of planes has a NAFBlock; otherwise all share one.
+        emission: Whether emission is predicted; otherwise it is 0.
+        guide: Kind of the guiding map.
+        depth: Whether the guide's depth, its last plane, is read.
+        stem: Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the
+            network at half the resolution, for a quarter of the work.
+        residual: Whether the filtered guide is added to the output.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int = Field(16, ge=8, le=64, multiple_of=8)
+    levels: int = Field(5, ge=2, le=6)
+    adapters: bool = True
+    emission: bool = True
+    guide: GuideKind = "paper"
+    depth: bool = True
+    stem: Literal[1, 2] = 1
+    residual: bool = True
+
+    @property
+    def channels(self) -> int:
+        """Planes of the guide that are read."""
+        return len(GUIDES[self.guide]) - (not self.depth)
+
+    @property
+    def multiple(self) -> int:
+        """Pixels: images are padded with zeros to multiples of this."""
+        return self.stem * 2 ** (self.levels - 1)
 
 
 class DatasetSettings(BaseModel):
@@ -214,3 +253,48 @@ class TrainSettings(BaseModel):
         """The learning rate of a step, from 0."""
         rise = min(1.0, (step + 1) / (self.warmup + 1))
         return rise * self.rate * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * step / self.total)))
+
+
+class Profile(Settings):
+    """What `configs/smoke-network-*.yaml` hold.
+
+    Attributes:
+        name: Shown in reports.
+        network, training, dataset: Settings of the parts.
+    """
+
+    FILES: ClassVar[str] = "smoke-network"
+
+    network: NetworkSettings = NetworkSettings()
+    training: TrainSettings = TrainSettings()
+    dataset: DatasetSettings = DatasetSettings()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.network.guide != self.dataset.guide:
+            kinds = {"network": self.network.guide, "dataset": self.dataset.guide}
+            message = "dataset.guide: expected {network}, which network.guide is, found {dataset}"
+            raise PydanticCustomError("guide", message, kinds)
+        if (self.training.crop or 0) > self.dataset.resolution:
+            sizes = {"most": self.dataset.resolution, "crop": self.training.crop}
+            message = "training.crop: expected at most {most}, which dataset.resolution is, found {crop}"
+            raise PydanticCustomError("crop", message, sizes)
+        return self
+
+    def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
+        """As `Settings.override`, inside the parts too: `{"training": {"steps": 500}}` leaves their other settings.
+
+        Raises:
+            WlmError: Unknown or out of range.
+        """
+        return super().override(_merged(self.model_dump(), values), prefix) if values else self
+
+
+def _merged(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with some values replaced, in nested mappings too."""
+
+    def value_of(name: str) -> Any:
+        old, new = settings.get(name), values[name]
+        return _merged(old, new) if isinstance(old, Mapping) and isinstance(new, Mapping) else new
+
+    return {**settings, **{name: value_of(name) for name in values}}

@@ -1,7 +1,7 @@
 """How far before its billboard a flip book's smoke lies, for lights at a point: their direction and distance are others
 at each pixel and each depth.
 
-Read first: `from_point`, which `wlm.smoke.shader` writes for engines.
+Read first: `from_point`, which `wlm.smoke.flipbook.shader` writes for engines.
 """
 
 import math
@@ -15,7 +15,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.data import Frames
-from wlm.smoke.flipbook_motion import ZERO, spread_out
+from wlm.smoke.flipbook.motion import ZERO, spread_out
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight

@@ -32,13 +32,13 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.motion import motion
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.scenes import draw_scene, generator
-from wlm.smoke.learn.settings import EDGE, PERIOD, DatasetSettings
-from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps, render_guide
+from wlm.smoke.march.fine import bake
+from wlm.smoke.march.motion import motion
+from wlm.smoke.network.planes import GUIDES, PLANES, encode_lightmaps, render_guide
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.scenes import draw_scene, generator
+from wlm.smoke.network.settings import EDGE, PERIOD, DatasetSettings
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.system import Meter, OnProgress

@@ -20,7 +20,7 @@ from wlm.smoke.codec import open_network
 from wlm.smoke.decode import Decoder
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import GUIDES, PLANES, decode_lightmaps, render_guide
+from wlm.smoke.network.planes import GUIDES, PLANES, decode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
 _GROUPS = ((0, 6), (6, 7), (7, 8))  # of planes that share a gate: lightmaps, opacity, emission

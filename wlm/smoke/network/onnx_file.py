@@ -10,8 +10,9 @@ import torch
 
 from wlm.formats.atomic import atomic_path
 from wlm.formats.hdr_blocks import need
-from wlm.smoke.model import SixWayNetwork, SmokeModel
-from wlm.smoke.planes import GUIDES
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import GUIDES
+from wlm.smoke.network.unet import SixWayNetwork
 
 _OPSET = 20
 
@@ -19,7 +20,7 @@ _OPSET = 20
 def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
     """Writes a network as ONNX for one image size: `guide` [1, C, H, W] to `lightmaps` [1, 8, H, W], float32.
 
-    Both are encoded planes, as `wlm.smoke.planes` defines them; the lightmaps aren't clamped.
+    Both are encoded planes, as `wlm.smoke.network.planes` defines them; the lightmaps aren't clamped.
 
     Args:
         model: The network.

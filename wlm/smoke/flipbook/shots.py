@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import SCENE_FILE, Frames, numbered, read_shaded, spread
-from wlm.smoke.exporter import is_straight, read_flipbook
-from wlm.smoke.guiding import guide
+from wlm.smoke.flipbook.textures import is_straight, read_flipbook
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, Looks
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
@@ -116,7 +116,7 @@ class FlipBook:
 
     Attributes:
         files: The two textures, and maybe one of opacity.
-        layout, rows, columns, straight: As for `wlm.smoke.exporter.read_flipbook`.
+        layout, rows, columns, straight: As for `wlm.smoke.flipbook.textures.read_flipbook`.
         device: Where the lightmaps go.
     """
 

@@ -3,7 +3,8 @@
 A frame's cell has its motion to the next frame, in shares of the frame's width and height: in the first channel to the
 right, in the second up, each as 127/255 + motion / (2 scale), so that 8 bits hold 0 exactly. A picture between two
 frames reads the earlier one back along the motion and the later one ahead of it, and mixes both: what moves stays
-sharp, where a cross-fade would show it twice. Read first: `between`, which `wlm.smoke.shader` writes for engines.
+sharp, where a cross-fade would show it twice. Read first: `between`, which
+`wlm.smoke.flipbook.shader` writes for engines.
 """
 
 import os
@@ -16,9 +17,8 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.smoke.data import Frames, load_frames
-from wlm.smoke.learn.motion import motion
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.velocity import read_velocity, velocity_file
+from wlm.smoke.march.motion import motion, read_velocity, velocity_file
 from wlm.system import Meter, OnProgress
 
 ZERO = 127.0 / 255.0
