@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from wlm.smoke.network.unet import SixWayNetwork, parameter_count
 
 from benchmarks.rivals.smoke import COARSE, coarse
 from benchmarks.rows import Row
@@ -34,6 +33,7 @@ from wlm.smoke.network.planes import PLANES
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import DatasetSettings, Profile
 from wlm.smoke.network.trainer import Trainer, plan_round
+from wlm.smoke.network.unet import SixWayNetwork, parameter_count
 
 METHOD = "ablation"
 """The table of these rows."""

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
-from wlm.smoke.network.unet import SixWayNetwork, parameter_count
 
 from benchmarks.rivals.smoke import coarse
 from benchmarks.rows import Row
@@ -15,6 +14,7 @@ from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import GUIDES, decode_lightmaps, render_guide
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import DatasetSettings, Profile
+from wlm.smoke.network.unet import SixWayNetwork, parameter_count
 from wlm.smoke.scene import LightSettings
 
 _LIGHTS = (

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from wlm.smoke.network.unet import SixWayNetwork
 
 from benchmarks.runner import Bench, Note
 from benchmarks.timing import Timing
@@ -23,6 +22,7 @@ from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import decode_lightmaps, encode_lightmaps, render_guide
 from wlm.smoke.network.scenes import draw_scene
 from wlm.smoke.network.settings import DatasetSettings, Profile
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from builders.bench_rows import by_option, check_command, check_outputs
-from wlm.smoke.network.unet import SixWayNetwork
 
 import benchmarks.path_tracer as path_tracer
 import benchmarks.smoke_network as bench
@@ -20,6 +19,7 @@ from wlm.smoke.codec import shipped
 from wlm.smoke.march.fine import bake
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera
 from wlm.smoke.synthetic import make_plume
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from builders.smoke_plumes import plume
-from wlm.smoke.network.unet import SixWayNetwork
 
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact
@@ -18,6 +17,7 @@ from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import encode_lightmaps, render_guide
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera
 from wlm_kernels.smoke.settings import March
 

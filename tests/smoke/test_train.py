@@ -8,7 +8,6 @@ import pytest
 import torch
 from builders.checks import error_of
 from builders.smoke_samples import file_content, small_pool
-from wlm.smoke.network.unet import SixWayNetwork
 
 import wlm
 from wlm.config import profile_names
@@ -19,6 +18,7 @@ from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import LossSettings, NetworkSettings, Profile, TrainSettings
 from wlm.smoke.network.trainer import Plan, Trainer, plan_round
+from wlm.smoke.network.unet import SixWayNetwork
 
 TINY = NetworkSettings(width=8, levels=2)
 TEMPORAL = LossSettings(temporal=1.0)

@@ -199,7 +199,7 @@ def export(
     ] = None,
     cells: Annotated[
         int | None,
-        typer.Option(help="Cells of the grid of three, godot and unreal along the longest side; default 24."),
+        typer.Option(help="Cells of the grid of three, godot or unreal along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
         Literal["x", "y", "z"] | None, typer.Option(help="Axis that becomes left-handed for unity; default none.")

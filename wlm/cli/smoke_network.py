@@ -171,7 +171,7 @@ def info(file: ModelFile, as_json: AsJson = False) -> None:
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     """Returns the shape of a network and the facts about its training that its file states."""
-    from wlm.smoke.model import parameter_count
+    from wlm.smoke.network.unet import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
     training = {name: model.summary[name] for name in names if name in model.summary}

@@ -35,10 +35,10 @@ def view(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or the walk; turn=DEGREES and "
-            "height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
-            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; extinction of smoke per length at density 1; block=SIDE "
-            "of the finest blocks of the volume of probes.",
+            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or the walk; turn=DEGREES "
+            "and height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
+            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; extinction=PER_LENGTH of smoke at density 1; "
+            "block=SIDE of the finest blocks of the volume of probes.",
         ),
     ] = None,
     tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",

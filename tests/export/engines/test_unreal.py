@@ -11,11 +11,11 @@ from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
 from builders.engine_scripts import Script, node_gives, pixels_of
 from builders.synthetic import random_model as random_lightmap
+from wlm.export.engines.unreal import asset_name
 
 from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
 from wlm.export.engines import export_atlas, export_lightmap, kit
-from wlm.export.engines.unreal import asset_name
 from wlm.lightmap.decode import Decoder
 
 ALL = (4, 3, 2, 1, 5, 0)

@@ -14,6 +14,7 @@ from PIL import Image
 
 import wlm
 from wlm.atlas.model import unpack_entries
+from wlm.export import write_page
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.data import from_arrays
@@ -22,7 +23,6 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
-from wlm.export import write_page
 
 TIMES = (0.0, 6.25, 12.0, 18.5, 23.9)
 

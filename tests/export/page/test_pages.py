@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
+from wlm.export.page.html import Page
+from wlm.export.page.pages import make_page, write_page
 from wlm.formats.exr import write_exr
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
-from wlm.export.page.html import Page
-from wlm.export.page.pages import make_page, write_page
 
 
 def parts(path) -> tuple[dict, bytes]:
