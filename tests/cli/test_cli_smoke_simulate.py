@@ -218,14 +218,14 @@ def test_hard_scenes(case, tmp_path):
 def test_earlier_results_outlast_a_command_that_cannot_be(jet, tmp_path, monkeypatch):
     """Frames, and lightmaps, guides and pictures made of them, when the next run ends before its first result."""
     frames = write_frames(tmp_path / "frames", frames=2).path
-    made = {"bake": "bake", "guide": "guide", "shade": "shade"}
+    made = {"bake": "bake", "guide": "guide"}
     for command, folder in made.items():
         call("smoke", command, frames, "-o", tmp_path / folder, "--resolution", 8)
     call("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for command, folder in made.items():
-        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--toward", "0,0,0")
-        assert "--toward: expected a direction" in line
+        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--camera", "toward=0,0,0")
+        assert "--camera toward: expected a direction" in line
     for path in (frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"):
         path.write_bytes(b"x")
     fails("smoke", "guide", frames, "-o", tmp_path / "guide")

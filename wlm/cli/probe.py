@@ -193,8 +193,8 @@ def export(
         Path | None,
         typer.Option(
             metavar="PROBES",
-            help="File with the positions of the probes, for a FILE.wlm that stores none; for Godot also the bake whose "
-            "other content is kept.",
+            help="File with the positions of the probes, for a FILE.wlm that stores none; for Godot also the bake of "
+            "which all other content is kept.",
         ),
     ] = None,
     cells: Annotated[

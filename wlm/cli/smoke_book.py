@@ -118,6 +118,7 @@ def flipbook(
         float | None,
         typer.Option(help="Factor on the light; default 1 in an .exr, else the greatest without clipping."),
     ] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second; default the scene's, or 25.")] = None,
     textures: _With = None,
     cells: _Cells = None,
     source_layout: _From = None,
@@ -152,7 +153,7 @@ def flipbook(
     for option, given in (("motion", motion), ("depth", depth)):
         if given is not None and textures:
             raise WlmError(f"--{option}: expected lightmaps of bake or predict: the camera of a flip book is unknown")
-    packing = {"count": count, "gain": gain, "mips": mips, "motion": motion, "depth": depth}
+    packing = {"count": count, "gain": gain, "rate": rate, "mips": mips, "motion": motion, "depth": depth}
     packed = _packed(lightmaps, source, layout, device, **packing, padding=0 if in_files else _PADDING)
     if in_files:
         contents, clipped = _write_textures(packed, output)
@@ -224,6 +225,7 @@ def _packed(
     *,
     count: int | None,
     gain: float | None,
+    rate: float | None,
     mips: int | None,
     motion: Path | None,
     depth: Path | None,
@@ -240,8 +242,9 @@ def _packed(
     from wlm.smoke.flipbook.motion import mip_padding, open_motion
 
     check_choice("--layout", layout, tuple(LAYOUTS))
-    if gain is not None and not 0 < gain < float("inf"):
-        raise WlmError(f"--gain: expected a number above 0, got {gain}")
+    for option, number in (("gain", gain), ("rate", rate)):
+        if number is not None and not 0 < number < float("inf"):
+            raise WlmError(f"--{option}: expected a number above 0, got {number}")
     if depth is not None and not depth.exists():
         raise WlmError(f"{depth}: expected the smoke of the flip book, found none")
     # These inputs are opened before the long work.
@@ -251,7 +254,7 @@ def _packed(
         shots = list(_shots(source, progress, count))
     if mips is not None:
         padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
-    options: dict[str, Any] = {"gain": gain, "padding": padding, "air": air, "volumes": volumes}
+    options: dict[str, Any] = {"gain": gain, "rate": rate, "padding": padding, "air": air, "volumes": volumes}
     try:
         with running("motion and depth") as progress:
             options["progress"] = None if air is None and volumes is None else progress
