@@ -24,7 +24,7 @@ from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import AllOrders, SixWays
 from wlm_kernels.smoke.settings import March
 

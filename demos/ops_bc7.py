@@ -29,9 +29,8 @@ from wlm.formats.bc7 import decode_image
 from wlm.interop import check_device
 from wlm.ops.views import View
 from wlm.texels import fill_gaps
-from wlm.view.atlas import encode
 from wlm.view.display import white_of
-from wlm.view.smoke import contact_sheet
+from wlm.view.pictures import contact_sheet, encode
 
 HERE = Path(__file__).resolve().parent
 FITTED = [(1, 0.7, 1), (0.4, 1.2, 1), (1, 1.2, 0.3), (0.7, 0.3, 1), (1, 0.3, 0.6), (0.8, 1.5, 0.8)]  # into the room

@@ -35,7 +35,8 @@ from wlm.smoke.shading import Light
 from wlm.smoke.simulation import simulate
 from wlm.smoke.synthetic import make_plume
 from wlm.system import Progress
-from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.smoke import guide_pictures, picture, six_pictures
 from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent

@@ -41,7 +41,8 @@ from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.network.settings import Profile
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.simulation import simulate
-from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent

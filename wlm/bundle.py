@@ -18,7 +18,8 @@ has no use for is left out. Of the documents they read these keys, among others:
               tile_size, hidden, gamma, tiles; images: by texture name the size [width, height] of one tile's image and
               the number of images across; values (of a part that is not light): what 0 and 1 stand for
     atlas     uv_set, states, sheets, objects (label, node, sheet, scale_offset)
-    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, motion_scale
+    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, motion_scale,
+              clipped (numbers above the range of 8 bits)
 """
 
 from collections.abc import Mapping

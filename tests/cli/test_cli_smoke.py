@@ -22,7 +22,8 @@ from wlm.smoke.flipbook.textures import read_flipbook
 from wlm.smoke.march.coarse import guide
 from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
-from wlm.view.smoke import picture, to_bytes
+from wlm.view.pictures import to_bytes
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 LIGHT = LightSettings(toward=(1, 1, 1)).light()

@@ -28,7 +28,7 @@ from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Air
 from wlm.smoke.simulation import make_solver, volume_of
-from wlm.view.smoke_pool import pool_sheet
+from wlm.view.smoke import pool_sheet
 from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(

@@ -1,6 +1,7 @@
 """`wlm smoke shade` and `flipbook`: six-way lightmaps as pictures, as textures, and as folders for engines."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,8 +79,8 @@ def shade(
     behind = None if background is None else vector("--background", background)
     quiet_warp()
     from wlm.smoke.scene import LightSettings, Looks
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, picture, to_bytes
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
 
     source = _source(lightmaps, textures, cells, source_layout, straight, device)
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
@@ -159,10 +160,11 @@ def flipbook(
         contents, clipped = _write_textures(packed, output)
     else:
         from wlm.export import export
+        from wlm.export.bundles import bundle_of
 
-        bundle = packed.bundle(name=lightmaps.resolve().stem)
+        bundle = replace(bundle_of(packed, device), name=lightmaps.resolve().stem)
         paths = export(bundle, output, engine, shader=shader or "glsl")
-        contents, clipped = {path: packed.channels.get(path.stem, ()) for path in paths}, 0
+        contents, clipped = {path: packed.channels.get(path.stem, ()) for path in paths}, bundle.document["clipped"]
     _show(str(output), packed, contents, clipped)
 
 

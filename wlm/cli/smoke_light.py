@@ -88,8 +88,8 @@ def light(
     quiet_warp()
     from wlm.smoke.transport.lighting import light_smoke
     from wlm.smoke.transport.orders import load_orders, orders_march, scatter
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, light_picture, to_bytes
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
     from wlm_kernels.smoke.settings import March
 
     frames = options.open(smoke)
@@ -113,7 +113,7 @@ def light(
                 extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
                 background = looks.background
             background = background if behind is None else behind
-            shaded = light_picture(made, albedo=colour, background=background, **extra)
+            shaded = picture(made, albedo=colour, background=background, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(frame)
             save_png(path, pictures[-1])
@@ -157,8 +157,7 @@ def trace(
     quiet_warp()
     from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.transport.tracing import trace
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import to_bytes
+    from wlm.view.pictures import save_png, to_bytes
 
     environment = None if around is None else _even(around)
     frames = options.open(smoke)

@@ -81,7 +81,7 @@ def run(
     from wlm.smoke.network.prediction import SmokePredictor
     from wlm.smoke.scene import load_scene
     from wlm.smoke.transport.orders import load_orders
-    from wlm.view.atlas import save_png
+    from wlm.view.pictures import save_png
     from wlm.view.smoke_run import AllOrders, SixWays, write_all
     from wlm.view.smoke_run import run as frames_of
 

@@ -22,6 +22,7 @@ from typing import Any
 
 from wlm.bundle import FORMAT, INDEX_FILE, RESERVED, Bundle
 from wlm.errors import WlmError
+from wlm.export.bundles import bundle_of
 from wlm.export.engines.kit import ENGINES
 from wlm.export.files import write_buffer, write_reference, write_texture
 from wlm.formats.folder import compact_json, made_parents, read_index, staged
@@ -76,7 +77,7 @@ def export(
         raise WlmError(f"engine {engine}: shader and exact have no meaning for a kit, whose language is the engine's")
     folder = Path(folder)
     with made_parents(folder), staged(folder, INDEX_FILE, FORMAT) as staging:
-        bundle = model if isinstance(model, Bundle) else model.bundle(device=device)
+        bundle = bundle_of(model, device)
         if engine is None:
             _check_options(options, (), "a raw folder")
             _write_raw(bundle, staging, shader, exact)

@@ -24,8 +24,8 @@ from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lights import AnyLight
 from wlm.smoke.transport.orders import OrdersModel, ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
-from wlm.view.smoke import to_bytes
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.pictures import to_bytes
+from wlm.view.smoke import Drawing
 from wlm_kernels.smoke.settings import March
 
 SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"

@@ -21,12 +21,12 @@ from builders.synthetic import random_model as random_lightmap
 from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
 from wlm.atlas.mips import make_tail
-from wlm.export.engines import ENGINES, export_atlas, export_lightmap
+from wlm.export import ENGINES, export
+from wlm.export.engines.atlas import export_atlas
 from wlm.formats.light import read_light
 from wlm.inspection import inspect
-from wlm.lightmap.shader import texture_names
 
-ALL = (4, 3, 2, 1, 5, 0)
+ALL = (4, 3, 2, 1, 4, 0)
 
 
 def atlas_folder(folder, kind, stored="half", mesh=None):
@@ -39,9 +39,9 @@ def atlas_folder(folder, kind, stored="half", mesh=None):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_large_lightmap_has_few_files(engine, tmp_path):
     model = random_lightmap((3, 4) * 32, columns=8, times=(0.0, 12.0))
-    paths = export_lightmap(model, tmp_path / "out", engine)
+    paths = export(model, tmp_path / "out", engine)
     assert {path.name for path in paths} == set(os.listdir(tmp_path / "out")) and len(paths) <= 12
-    assert paths[-1].name == "weights.json"
+    assert paths[-1].name == "bundle.json"
     assert 5 <= len((tmp_path / "out" / "README.md").read_text().splitlines()) <= 20
     assert not re.search(r"@[A-Z]+@", "".join(path.read_text() for path in paths if path.suffix in TEXTS))
 
@@ -52,17 +52,18 @@ TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", "
 def test_one_engines_files_take_the_place_of_anothers(tmp_path):
     folder = tmp_path / "out"
     (folder).mkdir()
-    export_lightmap(random_lightmap(ALL), folder, "three")
+    export(random_lightmap(ALL), folder, "three")
     (folder / "mine.txt").write_text("x")
     for engine in (*ENGINES[1:], ENGINES[0]):
-        paths = export_lightmap(random_lightmap((2, 1, 2, 0)), folder, engine)
+        paths = export(random_lightmap((2, 1, 2, 0)), folder, engine)
         assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
     _, output = atlas_folder(tmp_path / "made", "tiles")
     for engine in (*ENGINES, "raw"):
         paths = export_atlas(output, tmp_path / "atlas", engine)
         assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
         info = json.loads(paths[-1].read_text())
-        assert set(info["textures"].values()) < set(os.listdir(tmp_path / "atlas")) and info["uv_set"] == 0
+        assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "atlas"))
+        assert info["uv_set"] == 0
 
 
 def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
@@ -77,37 +78,39 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
         info = json.loads(paths[-1].read_text())
         text = "".join(path.read_text() for path in paths if path.suffix in TEXTS - {".md", ".cs"})
         assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks|tail)\b", text)) == set(info["textures"])
-    assert info["textures"]["tail"] == "tail.dds"
+    assert info["textures"]["tail"]["file"] == "tail.dds"
     assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
 
 
-def test_layers_have_a_folder_for_each_sheet_of_light(tmp_path):
-    """What a project can have but once is written once, and what engines name after the model has the sheet's name."""
+def test_sheets_of_light_have_a_folder_each(tmp_path):
+    """What a project can have only once is written once, and assets named after the model have the sheet's name."""
     model, out = random_layers(), tmp_path / "out"
     places = set()
     for engine in ("unity", "three", "unreal", "godot"):
-        paths = export_lightmap(model, out, engine)
-        assert {path for path in out.rglob("*") if path.is_file()} == set(paths) and paths[-1] == out / "sheets.json"
+        paths = export(model, out, engine)
+        assert {path for path in out.rglob("*") if path.is_file()} == set(paths) and paths[-1] == out / "bundle.json"
         index = json.loads(paths[-1].read_text())
-        assert [(each["folder"], each["atlas"]) for each in index["sheets"]] == [("sheet_00", "a"), ("sheet_03", "b")]
+        assert index["parts"] == ["sheet_00", "sheet_03"]
+        atlases = {each["part"]: each["atlas"] for each in index["sheets"]}
+        assert [atlases[part] for part in index["parts"]] == ["a", "b"]
         shared = [path.relative_to(out).as_posix() for path in paths if path.suffix == ".cs"]
         assert shared == (["WlmLightmap.cs"] if engine == "unity" else [])
-        for each in index["sheets"]:
+        for part in index["parts"]:
             light = next(
-                own for sheet, own in model.sheets.items() if sheet.atlas == each["atlas"] and not sheet.linear
+                own for sheet, own in model.sheets.items() if sheet.atlas == atlases[part] and not sheet.linear
             )
-            alone = {path.name: path for path in export_lightmap(light, tmp_path / f"alone-{engine}", engine)}
+            alone = {path.name: path for path in export(light, tmp_path / f"alone-{engine}", engine)}
             same = [name for name in alone if Path(name).suffix in (".bytes", ".dds", ".bin", ".tga", ".exr")]
             for name in same:
-                assert (out / each["folder"] / name).read_bytes() == alone[name].read_bytes(), name
+                assert (out / part / name).read_bytes() == alone[name].read_bytes(), name
             assert same
             for name in ("WlmLightmap.shader", "wlm_lightmap.py"):
                 if name in alone:
-                    text = (out / each["folder"] / name).read_text()
+                    text = (out / part / name).read_text()
                     places.add(re.search(r'^(Shader|PLACE =) "(.*)"', text, re.MULTILINE)[0])
     assert len(places) == 4
     (finding,) = inspect(out)
-    assert "for one engine" in finding.what
+    assert "wlm export wrote" in finding.what
 
 
 KEY = """
@@ -120,7 +123,7 @@ globalThis.fetch = async (url) => {
   return { ok: true, arrayBuffer, text: () => bytes.toString(), json: () => JSON.parse(bytes) };
 };
 const { loadAtlas } = await import("./atlas.mjs"), material = {};
-(await loadAtlas("atlas.json", { DataTexture: class {} })).apply(material);
+(await loadAtlas("bundle.json", { DataTexture: class {} })).apply(material);
 console.log(material.customProgramCacheKey());
 """
 
@@ -152,10 +155,10 @@ def test_a_file_that_three_cannot_load_is_named(tmp_path):
 
 
 def test_what_cannot_be_exported_for_an_engine(tmp_path):
-    assert "engine: expected one of three" in error_of(export_lightmap, random_lightmap(), tmp_path / "a", "cry")
+    assert "engine: expected one of three" in error_of(export, random_lightmap(), tmp_path / "a", "cry")
     layers = random_layers()
     layers.sheets = {sheet: model for sheet, model in layers.sheets.items() if sheet.linear}
-    assert "expected a layer of light, found dir" in error_of(export_lightmap, layers, tmp_path / "a", "three")
+    assert "expected a layer of light" in error_of(export, layers, tmp_path / "a", "three")
     _, output = atlas_folder(tmp_path / "made", "plain", "astc")
     assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
     assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
@@ -188,14 +191,16 @@ def compiled(text, folder, *words):
 @pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
 def test_godots_passes_compile(kinds, tmp_path):
     model = random_lightmap(kinds)
-    export_lightmap(model, tmp_path / "out", "godot")
+    export(model, tmp_path / "out", "godot")
     text = (tmp_path / "out" / "lightmap.glsl").read_text()
     versions, _, text = text.partition("#[compute]\n")
     assert re.findall(r'(\w+) = "(.*)";', versions) == [("decode", "#define WLM_DECODE"), ("fill", "#define WLM_FILL")]
     for name in ("WLM_DECODE", "WLM_FILL"):
         compiled(text.strip().replace("#VERSION_DEFINES", f"#define {name}"), tmp_path)
     script = (tmp_path / "out" / "wlm_lightmap.gd").read_text()
-    assert f"NAMES: Array[String] = {json.dumps(texture_names(model))}" in script
+    names = json.loads(re.search(r"NAMES: Array\[String\] = (.*)", script)[1])
+    bound = re.findall(r"^#define WLM_LIGHTMAP_(\w+)_BINDING (\d+)$", text, re.MULTILINE)
+    assert [name.lower() for name, _ in bound] == names and [int(i) for _, i in bound] == list(range(len(names)))
     pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
     from gdtoolkit.parser import parser
 
@@ -230,7 +235,7 @@ def test_godots_atlas_shows_its_light(kind, tmp_path):
 
 
 def test_godots_lit_surface_mixes_two_hours(tmp_path):
-    export_lightmap(random_lightmap(), tmp_path, "godot")
+    export(random_lightmap(), tmp_path, "godot")
     text = as_glsl((tmp_path / "lit.gdshader").read_text())
     maps = {"wlm_early": np.full((1, 1, 4), 1.0, np.float32), "wlm_late": np.full((1, 1, 4), 3.0, np.float32)}
     maps["albedo"] = np.full((1, 1, 4), 51, np.uint8)
@@ -242,7 +247,7 @@ def test_godots_lit_surface_mixes_two_hours(tmp_path):
 @pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
 def test_unitys_passes_compile(kinds, tmp_path):
     model = random_lightmap(kinds)
-    export_lightmap(model, tmp_path / "unity", "unity")
+    export(model, tmp_path / "unity", "unity")
     shader = (tmp_path / "unity" / "WlmLightmap.shader").read_text()
     shared = re.search(r"HLSLINCLUDE(.*?)ENDHLSL", shader, re.DOTALL)[1]
     included = (tmp_path / "unity" / "WlmLightmap.hlsl").read_text()
@@ -267,7 +272,7 @@ float4 UnityObjectToClipPos(float4 p) { return p; }
 @pytest.mark.parametrize("down", [0, 1])
 def test_unitys_light_has_its_top_where_unity_has_it(down, tmp_path):
     """The picture's top row at v = 1, the last row of a texture of Unity; or at v = 0."""
-    export_lightmap(random_lightmap(), tmp_path, "unity")
+    export(random_lightmap(), tmp_path, "unity")
     text = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmLightmap.shader").read_text(), re.DOTALL)[2]
     named = "Texture2D<float4> _WlmEarly;\nTexture2D<float4> _WlmLate;\n"
     text = f"#define WLM_DOWN {down}\n{named}{RUN}{text}"
@@ -324,7 +329,7 @@ def test_unitys_components_parse(tmp_path):
     sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
     from tree_sitter import Language, Parser
 
-    export_lightmap(random_lightmap(), tmp_path / "lightmap", "unity")
+    export(random_lightmap(), tmp_path / "lightmap", "unity")
     _, output = atlas_folder(tmp_path / "made", "tiles")
     export_atlas(output, tmp_path / "atlas", "unity")
     for path in (tmp_path / "lightmap" / "WlmLightmap.cs", tmp_path / "atlas" / "WlmAtlas.cs"):

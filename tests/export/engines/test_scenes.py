@@ -13,7 +13,8 @@ from builders.shader_runs import run_glsl
 from test_folders import TEXTS, UNITY, as_glsl, compiled
 
 from wlm.atlas.scene.model import SHORT_ENTRY
-from wlm.export.engines import ENGINES, export_scene
+from wlm.export import ENGINES
+from wlm.export.engines.scene import export_scene
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.inspection import inspect
 
@@ -49,7 +50,7 @@ def squares(info):
 
 def textures_of(folder, info):
     """A folder's EXRs as an editor has them, in halves where they are filtered, by the shader's names."""
-    found = {name: pixels_of(str(folder / file)) for name, file in info["textures"].items()}
+    found = {name: pixels_of(str(folder / each["file"])) for name, each in info["textures"].items()}
     filtered = info["layer_heights"]
     return {f"wlm_scene_{n}": np.float16(v) if n in filtered else np.float32(v) for n, v in found.items()}
 
@@ -69,9 +70,9 @@ def test_each_engines_files_take_the_place_of_anothers(made, tmp_path):
         info = json.loads(paths[-1].read_text())
         assert info["uv_set"] == 1 and info["states"] == list(model.states) and len(info["objects"]) == 3
         assert set(info["textures"]) == {"sheets", "lut", "factors", "colour", "blocks"}
-        assert set(info["textures"].values()) < set(os.listdir(tmp_path / "out"))
+        assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "out"))
     paths = export_scene(source, tmp_path / "out", "raw", shader="wgsl")
-    assert "fn wlm_object" in (tmp_path / "out" / "scene.wgsl").read_text() and paths[-1].name == "scene.json"
+    assert "fn wlm_object" in (tmp_path / "out" / "scene.wgsl").read_text() and paths[-1].name == "bundle.json"
 
 
 def test_inspect_names_a_scenes_folders(made, tmp_path):
@@ -83,7 +84,7 @@ def test_inspect_names_a_scenes_folders(made, tmp_path):
     for engine in (*ENGINES, "raw"):
         export_scene(source, tmp_path / engine, engine)
         (found,) = inspect(tmp_path / engine)
-        assert "of a scene for one engine" in found.what and not found.command
+        assert "wlm export wrote" in found.what and not found.command
 
 
 def test_what_cannot_be_exported(made, tmp_path):
@@ -104,11 +105,11 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     """With the textures as they lie in their files; of the blocks the bytes are compared, and their texels bound."""
     source, model = each_form
     export_scene(source, tmp_path, "raw")
-    info = json.loads((tmp_path / "scene.json").read_text())
+    info = json.loads((tmp_path / "bundle.json").read_text())
     assert ("blocks" in info["textures"]) == (model.colour == "mixed")
 
     def texels(name, kind):
-        data = (tmp_path / info["textures"][name]).read_bytes()
+        data = (tmp_path / info["textures"][name]["file"]).read_bytes()
         height, width, layers = (int.from_bytes(data[at : at + 4], "little") for at in (12, 16, 140))
         return np.frombuffer(data, kind, offset=148).reshape(layers, height, width, -1)
 
@@ -117,7 +118,7 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     colour = unpack_rgb9e5(texels("colour", "<u4")[..., 0])
     bound["wlm_scene_colour"] = np.pad(colour, [(0, 0)] * 3 + [(0, 1)]).astype(np.float16)
     if model.colour == "mixed":
-        data = (tmp_path / info["textures"]["blocks"]).read_bytes()
+        data = (tmp_path / info["textures"]["blocks"]["file"]).read_bytes()
         assert data[148:] == model.blocks.tobytes()
         bound["wlm_scene_blocks"] = np.pad(model.block_texels, [(0, 0)] * 3 + [(0, 1)])
     text = (tmp_path / "scene.glsl").read_text()
@@ -140,7 +141,7 @@ def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkey
     # One of the level's actors has no light, one object no actor.
     assert script.slots == [("left", 0), ("above", 0)] and "below" in script.unreal.log_warning.call_args.args[0]
     ((code, inputs),) = script.customs()
-    info = json.loads((tmp_path / "scene.json").read_text())
+    info = json.loads((tmp_path / "bundle.json").read_text())
     bound = textures_of(tmp_path, info)
     picture = np.zeros((SIZE, SIZE, 3))
     for (x, y, width, height), place, sheet in squares(info):
@@ -158,7 +159,7 @@ def test_godots_shader_reads_each_objects_part(each_form, tmp_path):
     source, model = each_form
     export_scene(source, tmp_path, "godot")
     text = as_glsl((tmp_path / "scene.gdshader").read_text())
-    info = json.loads((tmp_path / "scene.json").read_text())
+    info = json.loads((tmp_path / "bundle.json").read_text())
     bound = textures_of(tmp_path, info)
     for name, height in info["layer_heights"].items():
         pages = bound[f"wlm_scene_{name}"]

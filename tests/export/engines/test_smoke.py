@@ -15,12 +15,18 @@ from builders.shader_runs import run_glsl, run_hlsl
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
 from PIL import Image
 
-from wlm.export.engines import ENGINES, export_smoke, kit
+from wlm.export import ENGINES, export
+from wlm.export.bundles import bundle_of
+from wlm.export.engines import kit
 from wlm.inspection import inspect
 
 TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".py", ".import"}
 STEP = 1.6 / 255
 """Half a step of 8 bits in each of a light's parts, and filters' places of 8 bits between texels."""
+
+
+def export_smoke(book, folder, engine, name="smoke"):
+    return export(dataclasses.replace(bundle_of(book, "cpu"), name=name), folder, engine)
 
 
 @pytest.fixture(scope="module")
@@ -37,46 +43,45 @@ def pages_of(folder):
     return found
 
 
-@pytest.mark.parametrize("engine", [*ENGINES, "raw"])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_folder_has_what_its_index_names(engine, moving, frames, tmp_path):
     book = random_book(frames, moving=moving)
-    paths, clipped = export_smoke(book, tmp_path / "out", engine, name="the jet")
+    paths = export_smoke(book, tmp_path / "out", engine, name="the jet")
     assert {path.name for path in paths} == set(os.listdir(tmp_path / "out")) and len(paths) <= 12
-    assert paths[-1].name == "smoke.json" and clipped == 0
+    assert paths[-1].name == "bundle.json"
     info = json.loads(paths[-1].read_text())
     assert set(info["textures"]) == set(book.pages) and info["shader"] in {path.name for path in paths}
-    assert (info["frames"], info["rate"], info["levels"]) == (5, 10.0, 2)
+    assert (info["frames"], info["rate"], info["levels"], info["clipped"]) == (5, 10.0, 2, 0)
     assert info["frame_size"] == [16, 12] and info["extent"] == pytest.approx([2.0 * 16 / 12, 2.0])
     assert info["motion_scale"] == book.scale and info["channels"]["second"][-1] == "emission"
     texts = {path.name: path.read_text() for path in paths if path.suffix in TEXTS}
     assert not re.search(r"@[A-Z]+@", "".join(texts.values()))
-    if engine != "raw":
-        assert 5 <= len(texts["README.md"].splitlines()) <= 20
-        assert ("motion of at most" in texts["README.md"]) == moving and "5 frames at 10" in texts["README.md"]
+    assert 5 <= len(texts["README.md"].splitlines()) <= 20
+    assert ("motion of at most" in texts["README.md"]) == moving and "5 frames at 10" in texts["README.md"]
     for name, page in pages_of(tmp_path / "out").items():
         np.testing.assert_allclose(page[..., :3] / 255.0, book.pages[name[10:-4]][..., :3], atol=0.51 / 255)
     (finding,) = inspect(tmp_path / "out")
-    assert "for one engine" in finding.what
+    assert "wlm export wrote" in finding.what
 
 
 def test_one_engines_files_take_the_place_of_anothers(frames, tmp_path):
     export_smoke(random_book(frames, moving=True), tmp_path / "out", "godot")
     (tmp_path / "out" / "mine.txt").write_text("x")
-    for engine in (*ENGINES, "raw"):
-        paths, _ = export_smoke(random_book(frames), tmp_path / "out", engine)
+    for engine in (*ENGINES, None):
+        paths = export_smoke(random_book(frames), tmp_path / "out", engine)
         assert set(os.listdir(tmp_path / "out")) == {path.name for path in paths} | {"mine.txt"}
 
 
 def test_what_cannot_be_exported(frames, tmp_path, monkeypatch):
     book, out = random_book(frames), tmp_path / "deep" / "out"
-    assert "engine: expected one of raw, three" in error_of(export_smoke, book, out, "cry")
+    assert "engine: expected one of three" in error_of(export_smoke, book, out, "cry")
     bare = [dataclasses.replace(frame, transparency=None, emission=None) for frame in frames]
-    assert "jet: has no opacity" in error_of(export_smoke, random_book(bare), out, "three", name="jet")
-    with pytest.raises(ValueError, match="layout: expected unity for unreal"):
-        export_smoke(dataclasses.replace(book, layout="o3de"), out, "unreal")
+    assert "the smoke has no opacity" in error_of(export_smoke, random_book(bare), out, "three")
+    o3de = dataclasses.replace(book, layout="o3de")
+    assert "layout: expected unity for unreal" in error_of(export_smoke, o3de, out, "unreal")
     broken = dataclasses.replace(book, second=book.second * np.float32("nan"))
-    assert "second.png: cannot write: expected finite light" in error_of(export_smoke, broken, out, "three")
+    assert "expected finite light" in error_of(export_smoke, broken, out, "three")
     monkeypatch.setitem(kit._MOST_SIDE, "unreal", 40)
     line = error_of(export_smoke, book, out, "unreal", name="jet")
     assert re.search(r"jet: cannot export for unreal: first.png: expected at most 40 texels along a side", line)
@@ -87,12 +92,20 @@ def test_cold_smoke_of_one_frame(tmp_path):
     """Without emission, which is black; any time shows the one frame."""
     frames = random_frames(1, hot=False)
     book = random_book(frames)
-    export_smoke(book, tmp_path, "raw")
+    export_smoke(book, tmp_path, None)
     text = (tmp_path / "smoke.glsl").read_text()
     given = f"0.7, 1.0, vec3{TOWARD}, vec3{IRRADIANCE}, vec3{SKY}"
     main = f"light = wlm_smoke_pixel((vec2(pixel) + 0.5) / vec2(16.0, 12.0), {given});"
-    found = run_glsl(text, main, (12, 16), pages_of(tmp_path))
+    stored = {f"wlm_smoke_{path.stem}_map": read_texels(path) for path in tmp_path.glob("*.dds")}
+    found = run_glsl(text, main, (12, 16), stored)
     np.testing.assert_allclose(found, shown(frames, book, 0.0), atol=STEP)
+
+
+def read_texels(path):
+    """The texels of an uncompressed DDS of 4 bytes a texel."""
+    data = path.read_bytes()
+    height, width = (int.from_bytes(data[at : at + 4], "little") for at in (12, 16))
+    return np.frombuffer(data, np.uint8, offset=148).reshape(height, width, 4)
 
 
 TIMES = (0.0, 1.5, 3.25, 4.9)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from builders.scene_folders import expected_picture, scene_folder
 
-from wlm.export.engines import export_scene
+from wlm.export.engines.scene import export_scene
 
 _SIZE = 96
 _PAGE = """<!doctype html>
@@ -15,7 +15,7 @@ import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 import { loadScene } from './scene.js';
 const renderer = new THREE.WebGLRenderer(), size = SIZE;
-const light = await loadScene(new URL('scene.json', import.meta.url), THREE);
+const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
 window.draw = async (name, state) => {
   const { scene } = await new GLTFLoader().loadAsync('scene.glb');
   const shared = new THREE[`Mesh${name}Material`]({color: 0xffffff});

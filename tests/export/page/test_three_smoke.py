@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
 
-from wlm.export.engines import export_smoke
+from wlm.export import export
+from wlm.export.bundles import bundle_of
 
 _PAGE = """<!doctype html>
 <script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
@@ -12,7 +13,7 @@ _PAGE = """<!doctype html>
 import * as THREE from 'three';
 import { loadSmoke } from './smoke.js';
 const renderer = new THREE.WebGLRenderer();
-const smoke = await loadSmoke(new URL('smoke.json', import.meta.url), THREE);
+const smoke = await loadSmoke(new URL('bundle.json', import.meta.url), THREE);
 const scene = new THREE.Scene(), sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
 scene.add(smoke.mesh, sun, sun.target, sky);
 smoke.mesh.position.set(3, 2, 1);
@@ -52,7 +53,7 @@ def opened(tmp_path, browser, serve):
     pages, errors = [], []
 
     def open_book(book):
-        export_smoke(book, tmp_path, "three")
+        export(bundle_of(book, "cpu"), tmp_path, "three")
         (tmp_path / "index.html").write_text(_PAGE)
         page = browser.new_page()
         pages.append(page)

@@ -17,9 +17,9 @@ from wlm.formats.dds import write_dds
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.shading import ENDINGS, check_language, custom_node, translate
 
-FORMAT = "wlm-atlas-engine"
+FORMAT = "wlm-bundle"
 _VERSION = 1
-INFO_FILE = "atlas.json"
+INFO_FILE = "bundle.json"
 
 
 def export_atlas(
@@ -77,8 +77,12 @@ def export_atlas(
             "source": model.source,
             "method": model.method,
             "colour": model.colour,
-            "textures": files,
-            "sizes": {name: list(sizes[name]) for name in names},
+            "system": "atlas",
+            "engine": engine,
+            "textures": {
+                name: {"file": file, "width": sizes[name][0], "height": sizes[name][1], "layers": 0}
+                for name, file in files.items()
+            },
             "shader": next(iter(texts)),
             "uv_set": output.report.get("new_uv_set") if len(model.uv) else output.report.get("uv_set"),
         }

@@ -20,8 +20,8 @@ from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.packed import MOST_LAYERS
 from wlm.shading import ENDINGS, check_language, custom_node, translate
 
-FORMAT = "wlm-scene-engine"
-INFO_FILE = "scene.json"
+FORMAT = "wlm-bundle"
+INFO_FILE = "bundle.json"
 _VERSION = 1
 # An object's part: its rectangle, the number of its sheet, and the state.
 _OBJECT = """
@@ -68,6 +68,8 @@ def export_scene(
         model = model.without_levels()
     info: dict[str, Any] = {
         "format": FORMAT,
+        "system": "atlas",
+        "engine": engine,
         "version": _VERSION,
         "name": model.name,
         "source": model.source,
@@ -82,7 +84,11 @@ def export_scene(
             pictures = _write_pictures(model, staging, engine)
         else:
             pictures = _write_textures(model, staging, ".bytes" if engine == "unity" else ".dds")
-        info["textures"] = {name: file for name, (file, _, _) in pictures.items()}
+        layers = {name: len(pages) for name, pages in _layered(model).items()}
+        info["textures"] = {
+            name: {"file": file, "width": size[0], "height": size[1], "layers": layers.get(name, 0)}
+            for name, (file, _, size) in pictures.items()
+        }
         texts = _raw(model, shader) if engine == "raw" else _TEXTS[engine](model, uv_set, pictures)
         try:
             shutil.copyfile(source / SCENE_FILE, staging / SCENE_FILE)

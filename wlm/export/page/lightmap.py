@@ -9,23 +9,22 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.export.bundles import bundle_of
+from wlm.export.engines.kit import filled
 from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5
-from wlm.lightmap import packed
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
-from wlm.lightmap.exporter import document
 from wlm.lightmap.front import load_light
 from wlm.lightmap.layers.sheet import Sheet
 from wlm.lightmap.model import LightmapModel
-from wlm.lightmap.shader import decode_glsl
 from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
 
 _DESCRIBED = (
-    *("times", "period", "interpolation", "time_axis", "tau", "tiles", "textures", "slices", "record", "tile_columns"),
+    *("times", "period", "interpolation", "time_axis", "tau", "tiles", "images", "slices", "record", "tile_columns"),
     *("tile_size", "hidden", "gamma", "height"),
 )
 
@@ -54,11 +53,14 @@ def lightmap_page(
     Raises:
         WlmError: The mesh or the set can't be read, or the set is of another size.
     """
-    nets, starts = packed.networks(model)
-    # The gaps' light is that of charts: what lies there packs better as nothing.
-    textures = packed.textures(model, bare=True)
-    described = document(model, textures, starts)
-    arrays: dict[str, np.ndarray] = {"networks": nets, "valid": np.packbits(model.mask)}
+    bundle = bundle_of(model, "cpu")
+    textures = {name: texture for name, texture in bundle.textures.items() if name != "valid"}
+    described = {name: bundle.document[name] for name in _DESCRIBED}
+    described["textures"] = {
+        name: {"size": [each.width, each.height], "layers": each.layers} for name, each in textures.items()
+    }
+    networks = bundle.buffers.get("networks", np.zeros((0, 4), np.float32))
+    arrays: dict[str, np.ndarray] = {"networks": networks, "valid": np.packbits(bundle.textures["valid"].data > 0)}
     arrays |= {f"tiles_{name}": texture.data for name, texture in textures.items()}
     times = model.times
     time = float(times[len(times) // 2])
@@ -71,10 +73,10 @@ def lightmap_page(
     manifest: dict[str, Any] = {
         "width": model.width,
         "height": model.height,
-        "shader": decode_glsl(model),
+        "shader": bundle.shader,
         "exposure": exposure(Decoder(model).frame(time)),
         "time": time,
-        "lightmap": {name: described[name] for name in _DESCRIBED},
+        "lightmap": described,
     }
     if mesh is not None:
         triangles, box = pack_triangles(read_geometry(mesh), up)
@@ -94,7 +96,7 @@ def lightmap_page(
     if sheet is not None:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
         note += f" Shown is {sheet.label}{rest}."
-    return Page("lightmap", model.name, note, figures, manifest, arrays, [packed.table_script()])
+    return Page("lightmap", model.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
 
 
 def _originals(

@@ -2,7 +2,7 @@
 //
 //     import * as THREE from 'three';
 //     import { loadAtlas } from './atlas.js';
-//     const atlas = await loadAtlas(new URL('atlas.json', import.meta.url), THREE);
+//     const atlas = await loadAtlas(new URL('bundle.json', import.meta.url), THREE);
 //     model.traverse((mesh) => mesh.material && atlas.apply(mesh.material));
 //
 // `model` is mesh.glb, or any with its UVs. three.js divides what a lightMap gives by pi.
@@ -14,7 +14,7 @@ export async function loadAtlas(url, THREE) {
   const info = await (await fetched(base)).json();
   const shader = await (await fetched(beside(info.shader))).text();
   const textures = {};
-  for (const [name, file] of Object.entries(info.textures)) textures[`wlm_atlas_${name}`] = await readDds(beside(file), THREE);
+  for (const [name, entry] of Object.entries(info.textures)) textures[`wlm_atlas_${name}`] = await readDds(entry, base, THREE);
   const {wlm_atlas_colour: colour} = textures;
   return {
     info,

@@ -2,7 +2,7 @@
 //
 //     import * as THREE from 'three';
 //     import { loadScene } from './scene.js';
-//     const light = await loadScene(new URL('scene.json', import.meta.url), THREE);
+//     const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
 //     light.apply(gltf.scene);  // of scene.glb, by GLTFLoader
 //     light.setState(1.5);      // half-way from the second of `light.info.states` to the third
 //
@@ -15,9 +15,8 @@ export async function loadScene(url, THREE) {
   const info = await (await fetched(base)).json();
   const shader = await (await fetched(beside('scene.glsl'))).text();
   const state = {value: 0}, shared = {wlm_state: state};
-  await Promise.all(Object.entries(info.textures).map(async ([name, file]) => {
-    const layered = name === 'colour' || name === 'blocks';
-    shared[`wlm_scene_${name}`] = {value: await readDds(beside(file), THREE, layered)};
+  await Promise.all(Object.entries(info.textures).map(async ([name, entry]) => {
+    shared[`wlm_scene_${name}`] = {value: await readDds(entry, base, THREE)};
   }));
   // What switches the materials' lightmap on; the shader reads the others in its place.
   const shown = new THREE.DataTexture(new Uint8Array(4), 1, 1);

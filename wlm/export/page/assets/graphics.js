@@ -94,19 +94,18 @@ class Graphics {
     return {...result, width, height};
   }
 
-  // An array of textures to be filled layer by layer: of words of 10 bits, or blocks of BC7.
-  layers(width, height, count, words) {
+  // Allocates a texture array of BC7 blocks, to be filled layer by layer.
+  layers(width, height, count) {
     const {gl} = this, target = gl.TEXTURE_2D_ARRAY, result = this.#texture(target, gl.NEAREST);
-    const form = words ? gl.RGB10_A2 : this.bptc?.COMPRESSED_RGBA_BPTC_UNORM_EXT ?? gl.RGBA8;
+    const form = this.bptc?.COMPRESSED_RGBA_BPTC_UNORM_EXT ?? gl.RGBA8;
     gl.texStorage3D(target, 1, form, width, height, count);
-    return {...result, width, height, words};
+    return {...result, width, height};
   }
 
-  putLayer({target, texture, width, height, words}, layer, data) {
+  putLayer({target, texture, width, height}, layer, data) {
     const {gl} = this, place = [target, 0, 0, 0, layer, width, height, 1];
     gl.bindTexture(target, texture);
-    if (words) gl.texSubImage3D(...place, gl.RGBA, gl.UNSIGNED_INT_2_10_10_10_REV, data);
-    else if (this.bptc) gl.compressedTexSubImage3D(...place, this.bptc.COMPRESSED_RGBA_BPTC_UNORM_EXT, data);
+    if (this.bptc) gl.compressedTexSubImage3D(...place, this.bptc.COMPRESSED_RGBA_BPTC_UNORM_EXT, data);
     else gl.texSubImage3D(...place, gl.RGBA, gl.UNSIGNED_BYTE, unpackBlocks(data, width, height));
   }
 

@@ -1,4 +1,4 @@
-// Lightmaps over the day: the exported shader decodes stored hours into textures, which are mixed between two hours.
+// Lightmaps over time: the exported shader decodes stored hours into textures, which are mixed between two hours.
 
 const MAIN_TILE = `
 out vec4 radiance;
@@ -85,25 +85,23 @@ class LightmapPage {
       const bytes = () => page.array(`tiles_${name}`, Uint8Array), key = `wlm_lightmap_${name}`;
       if (name === 'uv' || name === 'uvt') made[key] = graphics.blocks(...size, bytes(), gl.LINEAR);
       else if (name === 'planes') made[key] = graphics.plain(...size, [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], bytes(), gl.LINEAR);
-      else made[key] = graphics.layers(...size, layers, name === 'video');
+      else made[key] = graphics.layers(...size, layers);
     }
     return made;
   }
 
-  // Images of an hour, uploaded when they are first seen.
+  // Uploads the images of an hour when they are first needed.
   #show(hour) {
     const {graphics, page, layers} = this;
     if (layers.has(hour)) return;
     layers.add(hour);
-    for (const name of ['frames', 'video']) {
-      const texture = this.textures[`wlm_lightmap_${name}`];
-      if (!texture) continue;
-      const kind = name === 'video' ? Uint32Array : Uint8Array, size = texture.width * texture.height;
-      graphics.putLayer(texture, hour, page.array(`tiles_${name}`, kind).subarray(size * hour, size * (hour + 1)));
-    }
+    const texture = this.textures.wlm_lightmap_frames;
+    if (!texture) return;
+    const size = texture.width * texture.height;
+    graphics.putLayer(texture, hour, page.array('tiles_frames', Uint8Array).subarray(size * hour, size * (hour + 1)));
   }
 
-  // Valid texels from one bit each, the first the highest of its byte.
+  // The mask of valid texels, from one bit each, the first in the highest bit of its byte.
   #mask(bits) {
     const {graphics, manifest: {width, height}} = this, {gl} = graphics, texels = new Uint8Array(width * height);
     for (let i = 0; i < texels.length; ++i) texels[i] = bits[i >> 3] >> (7 - (i & 7)) & 1 ? 255 : 0;
@@ -119,7 +117,7 @@ class LightmapPage {
     graphics.draw(3);
   }
 
-  // What is asked for: its table, and the images that it reads.
+  // Prepares a time of `wlmReads`: its table, and the images that it reads.
   #ask(read) {
     const {graphics, lightmap} = this, old = this.table;
     this.asked = read;
