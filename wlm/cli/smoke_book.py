@@ -142,7 +142,7 @@ def flipbook(
 
     A folder has the textures, a shader that plays and lights them, and with --engine what puts them together.
     """
-    in_files = output.suffix.lower() in _TEXTURES
+    in_files = bool(output.suffix) and not output.is_dir()
     if in_files:
         check_output(output, *_TEXTURES)
         for option, given in (("engine", engine), ("shader", shader)):

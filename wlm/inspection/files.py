@@ -21,7 +21,7 @@ from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
 from wlm.formats.unity_asset import read_lighting_data
-from wlm.inspection.finding import Finding, command, compress_command
+from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
 from wlm.system import load, system_of
@@ -87,9 +87,9 @@ def inspect_file(path: Path) -> Finding:
         if kind := kind_of(path):
             return _KINDS[kind].inspect(path)
     except WlmError as error:
-        return Finding(path, "cannot be read", problems=(said(error, path),))
+        return Finding(path, UNREADABLE, problems=(said(error, path),))
     if path.suffix.lower() in (*SUFFIXES, ".png"):
-        return Finding(path, "cannot be read", problems=(f"its content does not match the suffix {path.suffix}",))
+        return Finding(path, UNREADABLE, problems=(f"its content does not match the suffix {path.suffix}",))
     return Finding(path, "unknown kind of file")
 
 
@@ -220,6 +220,8 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model, system = load(path), system_of(path)
+    if hasattr(model, "check_pieces"):
+        model.check_pieces()
     what = f"{_MODELS[system]}: {model.name}"
     if system == "smoke":
         return Finding(path, _MODELS[system], command("info", path))

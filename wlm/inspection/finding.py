@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+UNREADABLE = "cannot be read"
+"""Description of unreadable files and folders."""
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -13,9 +13,9 @@ from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import BAKED, FRAMES, document_of, file_system, inspect_file, kind_of
-from wlm.inspection.finding import Finding, command, compress_command
+from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, picture_of, said
-from wlm.inspection.sets import UNREADABLE, inspect_set, named, together
+from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
 from wlm.lightmap.layers.listing import list_layers, state_folders
 from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
 
@@ -116,7 +116,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
                 findings.append(finding)
                 taken |= its
     except WlmError as error:
-        return [Finding(folder, "cannot be read", problems=(said(error, folder),))], []
+        return [Finding(folder, UNREADABLE, problems=(said(error, folder),))], []
     rest = (file for file in files if file not in taken and not _is_ignored(file))
     findings += map(inspect_file, islice(rest, max(most - len(findings), 0)))
     inside = [entry for entry in entries if entry not in taken and entry.is_dir() and not entry.is_symlink()]
@@ -144,7 +144,7 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
     for file in sorted(documents, key=lambda file: file.name != SET_FILE)[:_DOCUMENTS]:
         if file.name == SET_FILE:
             finding = inspect_set(file)
-            listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
+            listed = set() if finding.what == UNREADABLE_SET else {file, *named(file, files)}
             if any(document_of(each) == BAKED for each in documents):
                 listed = set(files)
             return [(finding, listed | {file})]
@@ -285,9 +285,12 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(pictures) == len(meshes) == 1:
-        what, mesh = f"a mesh with the lightmap {pictures[0].name}", meshes[0]
-        light = inspect_file(pictures[0])
-        return [(Finding(mesh, what, compress_command(mesh, pictures[0]), light.problems), {mesh, pictures[0]})]
+        mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
+        if UNREADABLE not in (mesh.what, light.what):
+            what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
+            return [
+                (Finding(mesh.path, what, compress_command(mesh.path, light.path), problems), {mesh.path, light.path})
+            ]
     if len(pictures) < 2:
         return []
     problems, alike = together(pictures, [heads[file] for file in pictures])

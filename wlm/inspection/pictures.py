@@ -88,13 +88,15 @@ def picture_of(path: Path) -> Picture | None:
     return None
 
 
-def inspect_picture(path: Path, picture: Picture) -> Finding:
+def inspect_picture(path: Path) -> Finding:
     """Describes a single picture.
 
     Raises:
         WlmError: The file cannot be read.
     """
-    name = path.name.lower()
+    picture, name = picture_of(path), path.name.lower()
+    if picture is None:
+        raise WlmError(f"{path}: expected a picture")
     if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
         return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))

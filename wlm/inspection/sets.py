@@ -11,7 +11,7 @@ from wlm.lightmap.layers.listing import is_layered, list_layers
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
 from wlm.lightmap.listing import Listing, count_of, parse_set
 
-UNREADABLE = "a lightmap set that cannot be read"
+UNREADABLE_SET = "a lightmap set that cannot be read"
 
 
 def inspect_set(path: Path) -> Finding:
@@ -27,7 +27,7 @@ def inspect_set(path: Path) -> Finding:
             return Finding(path.parent, what, compress_command(path.parent), tuple(problems[:4]))
         return _checked(path.parent, parse_set(path, None))
     except WlmError as error:
-        return Finding(path.parent, UNREADABLE, problems=(said(error, path),))
+        return Finding(path.parent, UNREADABLE_SET, problems=(said(error, path),))
 
 
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
