@@ -1,4 +1,4 @@
-"""Shader text: what the systems' GLSL has in common, and the same text in other languages."""
+"""Translation of the systems' GLSL into other shading languages."""
 
 from wlm.shading.node import custom_node
 from wlm.shading.translation import ENDINGS, LANGUAGES, check_language, translate

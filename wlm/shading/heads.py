@@ -1,14 +1,14 @@
-"""What the heads of our GLSL say of GLSL alone, and of macros: decided in other languages."""
+"""Adapts the comment at the head of a GLSL shader to the language that it is translated into."""
 
 import re
 from collections.abc import Collection
 
 _GAP = r"\s*(?://\s*)?"
-_REST = r"(?:[^.]|\.(?!\s))*\."  # of a sentence, to its full stop
+_REST = r"(?:[^.]|\.(?!\s))*\."  # the rest of a sentence, to its full stop
 _FOR_GLSL = re.compile(rf"For GLSL [^;]*;{_GAP}include it below #version[^.:]*\.")
 _CHOICE = re.compile(rf"Where (WLM_\w+) is defined ([^;]*);{_GAP}else ([^.]*)\.")
 _IF = re.compile(rf"\s(?://\s*)?If (WLM_\w+)\(\w\) is defined,{_REST}")
-# Clauses, and last whole sentences.
+# Clauses; the last pattern is a whole sentence.
 _MACROS = (
     re.compile(rf",{_GAP}unless (?:[^.]|\.(?!\s))*? before this file(?:[^.]|\.(?!\s))*(?=\.)"),
     re.compile(rf",{_GAP}or{_GAP}define WLM_[^.]*? before{_GAP}this{_GAP}file(?=\.)"),
@@ -17,12 +17,12 @@ _MACROS = (
 
 
 def decided(text: str, dialect: str, defined: Collection[str]) -> str:
-    """A shader of ours whose head speaks of one dialect, and of what its text holds once macros are expanded.
+    """Rewrites the head comment for one language, with sentences about macros decided.
 
     Args:
-        text: GLSL.
-        dialect: The language's name for people.
-        defined: Macros that are.
+        text: A GLSL shader of this package.
+        dialect: The language's name in prose.
+        defined: Names of the macros that are defined.
     """
     text = _FOR_GLSL.sub(f"For {dialect}.", text)
     text = _CHOICE.sub(lambda match: _sentence(match[2] if match[1] in defined else match[3]), text)

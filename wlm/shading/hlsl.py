@@ -25,7 +25,7 @@ int2 wlm_size_of_{name}()
 
 
 class HlslWriter(Writer):
-    """Functions to be included. One sampler reads all textures; Unity makes it of its name."""
+    """Writes HLSL functions to be included. One sampler reads all textures; Unity creates it from its name."""
 
     names = {
         **{name: f"{kind}{n}" for name, (kind, n) in VECTORS.items()},
@@ -43,7 +43,7 @@ class HlslWriter(Writer):
         if variable.way == "buffer":
             return [f"StructuredBuffer<{self.kind(variable.type)}> {variable.name};"]
         if variable.way == "uniform":
-            # A float3 of an array in a constant buffer has the room of a float4.
+            # A float3 in an array of a constant buffer takes the space of a float4.
             return [f"cbuffer {variable.name}_values", "{", f"    {self.local(variable)};", "};"]
         return [f"static const {self.local(variable)};"]
 
@@ -52,7 +52,7 @@ class HlslWriter(Writer):
         return way + self.local(variable)
 
     def make(self, name: str, values: list[str]) -> str:
-        # A constructor of one argument is none in HLSL, but for a number.
+        # HLSL has no vector constructor with one argument; a cast does the same.
         if len(values) == 1 and name in VECTORS:
             return f"(({self.kind(name)})({values[0]}))"
         return super().make(name, values)

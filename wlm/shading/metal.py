@@ -1,4 +1,4 @@
-"""The Metal shading language: a structure with the textures and buffers as members and the functions as methods."""
+"""Metal shading language: a structure with textures and buffers as members and the functions as methods."""
 
 from wlm.shading.tree import VECTORS, Function, Node, Variable
 from wlm.shading.writer import Writer
@@ -11,7 +11,7 @@ _TEXTURES = {
 
 
 class MetalWriter(Writer):
-    """A structure, since Metal has neither global textures nor global buffers: fill it in and call its methods."""
+    """Writes a structure, since Metal has no global textures or buffers: the user fills it in and calls its methods."""
 
     names = {
         **{name: f"{kind}{n}" for name, (kind, n) in VECTORS.items()},
@@ -20,7 +20,7 @@ class MetalWriter(Writer):
     indent = "    "
 
     def text(self) -> str:
-        # Constants and the words at the top stay outside.
+        # Constants and the head comment stay outside of the structure.
         items = self.shader.items
         first = next(i for i, (item, _) in enumerate(items) if not isinstance(item, str))
         self._top = [str(item) for item, _ in items[:first]]

@@ -1,4 +1,4 @@
-"""HLSL for a Custom node of Unreal's materials: the code of one function, which gets its textures as parameters."""
+"""HLSL for Custom nodes of Unreal's materials: one function, with its textures as parameters."""
 
 from collections.abc import Iterator, Mapping
 
@@ -20,23 +20,23 @@ _SIZE = """\
 def custom_node(
     text: str, function: str, arguments: str, layers: Mapping[str, tuple[int, int]] | None = None
 ) -> tuple[str, list[str]]:
-    """Writes one of our shaders as the code of a Custom node: a structure of functions, and a call of one.
+    """Writes one of our shaders as the code of a Custom node: a structure of functions, and a call of one of them.
 
-    Functions are known within the node alone, so that a project needs no folder of shaders and no C++. The node's
-    textures are parameters of each function that reads them. Those of whole numbers are of floats, which hold them
-    exactly, and arrays are their layers one below the other: Unreal imports neither.
+    The functions exist only within the node, so a project needs no shader folder and no C++. The node's textures are
+    parameters of each function that reads them. Integer textures become float textures, which hold their numbers
+    exactly, and the layers of arrays are stacked from top to bottom, since Unreal imports neither.
 
     Args:
-        text: GLSL of `wlm`; its uniforms are inputs of the node, too.
-        function: What the node returns.
-        arguments: Of the function, in HLSL of the node's other inputs.
-        layers: Of arrays: rows of a layer, and layers.
+        text: GLSL of this package; its uniforms are inputs of the node, too.
+        function: Name of the function whose value the node returns.
+        arguments: HLSL of the function's arguments, in terms of the node's other inputs.
+        layers: By name of a texture array: rows of a layer, and number of layers.
 
     Returns:
-        The code, and the names of the textures and uniforms that the node has to have as inputs.
+        The code, and the names of the textures and uniforms that must be inputs of the node.
 
     Raises:
-        ValueError: GLSL beyond what our shaders are made of.
+        ValueError: The text uses GLSL outside the subset.
     """
     return _NodeWriter(text, layers or {}).node(function, arguments)
 
@@ -52,7 +52,7 @@ class _NodeWriter(HlslWriter):
     def node(self, function: str, arguments: str) -> tuple[str, list[str]]:
         self._drop_all_but(function)
         inputs = self.used(function)
-        # Any texture that is filtered has the sampler of all of them, linear and clamped.
+        # All filtered textures share the sampler of one of them, linear and clamped.
         filtered = [name for each in self.functions.values() for name in _textures(each.body, _FILTERS)]
         given = [f"{filtered[0]}Sampler" if each == self.linear else each for each in inputs]
         constants = [item.name for item, _ in self.shader.items if _is_constant(item)]
@@ -65,7 +65,7 @@ class _NodeWriter(HlslWriter):
         return "".join(lines), [each for each in inputs if each != self.linear]
 
     def _drop_all_but(self, function: str) -> None:
-        """Leaves out functions that this one doesn't call with their comments, and the head, which is of files."""
+        """Removes the head comment and, with their comments, the functions that this one does not call."""
         needed, found = set(), {function}
         while found - needed:
             needed |= found
@@ -87,7 +87,7 @@ class _NodeWriter(HlslWriter):
         self.functions = self.shader.functions
 
     def used(self, name: str) -> list[str]:
-        """What a function reads, itself or through others, of what is bound; and the sampler where it filters."""
+        """Names of the bound variables that a function reads, directly or through others; the sampler if it filters."""
         if name not in self.uses:
             nodes = list(_nodes(self.functions[name].body))
             names = {each.text for each in nodes if each.kind == "name"}
@@ -106,7 +106,7 @@ class _NodeWriter(HlslWriter):
         return ["};"]
 
     def outer(self, variable: Variable) -> list[str]:
-        # A structure within a function has no constants.
+        # A structure within a function cannot have constants.
         if not _is_constant(variable):
             return []
         assert variable.value is not None
@@ -149,7 +149,7 @@ def _is_constant(item: object) -> bool:
 
 
 def _nodes(body: tuple[Statement, ...]) -> Iterator[Node]:
-    """All parts of all expressions."""
+    """Iterates over all nodes of all expressions."""
 
     def within(node: Node) -> Iterator[Node]:
         yield node
@@ -166,5 +166,5 @@ def _nodes(body: tuple[Statement, ...]) -> Iterator[Node]:
 
 
 def _textures(body: tuple[Statement, ...], calls: set[str]) -> list[str]:
-    """The textures that some calls read."""
+    """Names of the textures that calls of these functions read."""
     return [each.parts[0].text for each in _nodes(body) if each.kind == "call" and each.text in calls]

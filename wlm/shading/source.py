@@ -1,4 +1,4 @@
-"""The words of our GLSL, after its conditions and macros: what `wlm.shading.tree` reads."""
+"""Lexer and preprocessor of our GLSL; `wlm.shading.tree` parses its words."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,13 +12,13 @@ _WORD = re.compile(
 
 @dataclass(frozen=True)
 class Word:
-    """A word of a shader.
+    """A token of a shader.
 
     Attributes:
-        kind: `comment`, `number`, `name` or `mark`.
-        text: As written.
-        alone: Whether it begins its line.
-        blank: Whether a blank line is before it.
+        kind: `comment`, `number`, `name` or `mark` (an operator or bracket).
+        text: Text as written.
+        alone: Whether it is the first token of its line.
+        blank: Whether a blank line precedes it.
     """
 
     kind: str
@@ -34,14 +34,14 @@ class _Macro:
 
 
 def read_words(text: str, defined: Iterable[str] = ()) -> list[Word]:
-    """Takes a shader apart; macros are expanded, and of conditions what holds remains.
+    """Splits a shader into tokens; expands macros and evaluates conditional directives.
 
     Args:
         text: GLSL.
-        defined: Macros that are defined before it, as 1.
+        defined: Macros that are defined before the text, with the value 1.
 
     Raises:
-        ValueError: A directive that our shaders don't have, or a character that GLSL hasn't.
+        ValueError: An unsupported directive, or a character that is not part of GLSL.
     """
     macros = {name: _Macro(None, (Word("number", "1"),)) for name in defined}
     words: list[Word] = []
@@ -94,7 +94,7 @@ def _split(line: str, blank: bool) -> Iterator[Word]:
 
 
 def _expand(words: Sequence[Word], macros: dict[str, _Macro]) -> list[Word]:
-    """Macros of a line, which end in it."""
+    """Expands the macros of one line; a call must end in its line."""
     out: list[Word] = []
     i = 0
     while i < len(words):

@@ -1,4 +1,4 @@
-"""The exported shaders in the languages of engines, from their one GLSL text."""
+"""Translates exported shaders from GLSL into the shading languages of engines."""
 
 from collections.abc import Iterable
 
@@ -11,10 +11,10 @@ from wlm.shading.tree import read_shader
 from wlm.shading.wgsl import WgslWriter
 
 LANGUAGES = ("glsl", "glsl-es", "hlsl", "msl", "wgsl")
-"""Languages that shaders are exported in."""
+"""Languages in which shaders are exported."""
 
 ENDINGS = {"glsl": ".glsl", "glsl-es": ".glsl", "hlsl": ".hlsl", "msl": ".metal", "wgsl": ".wgsl"}
-"""Of their files."""
+"""Endings of shader files by language."""
 
 _WRITERS = {"hlsl": HlslWriter, "msl": MetalWriter, "wgsl": WgslWriter}
 _VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "msl": "Metal 2 and later", "wgsl": "WGSL"}
@@ -24,29 +24,30 @@ _PRECISIONS = "".join(
 
 
 def check_language(language: str) -> None:
-    """Checks a language's name.
+    """Checks the name of a shading language.
 
     Raises:
-        WlmError: It is none of `LANGUAGES`.
+        WlmError: It is not in `LANGUAGES`.
     """
     if language not in LANGUAGES:
         raise WlmError(f"shader: expected one of {', '.join(LANGUAGES)}, got {language!r}")
 
 
 def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
-    """Writes one of our shaders in another language.
+    """Translates one of our shaders.
 
-    GLSL stays as it is: conditions and macros are its includer's. The other languages have what holds with `defined`:
-    functions of the same names, the textures under their names and one sampler, linear and clamped to the edge.
+    GLSL is not changed, except for macros and precisions at its head; conditional directives are left to the including
+    shader. In the other languages macros are expanded. They have functions of the same names, textures of the same
+    names, and one sampler, linear and clamped to the edge.
 
     Args:
-        text: GLSL of `wlm`, with the words and types that our shaders use.
+        text: GLSL of this package, in the subset of the language that `wlm.shading.tree` parses.
         language: One of `LANGUAGES`.
-        defined: Macros that are defined, for example `WLM_ATLAS_EXACT`.
+        defined: Macros to define, for example `WLM_ATLAS_EXACT`.
 
     Raises:
-        WlmError: No such language.
-        ValueError: GLSL beyond what our shaders are made of.
+        WlmError: Unknown language.
+        ValueError: The text uses GLSL outside the subset.
     """
     check_language(language)
     if not language.startswith("glsl"):

@@ -1,4 +1,4 @@
-"""The grammar of our GLSL: functions, constants, textures and buffers. What the shaders don't use isn't read."""
+"""Parser of our GLSL: functions, constants, textures and buffers. It covers the subset that our shaders use."""
 
 from dataclasses import dataclass, field
 
@@ -27,12 +27,12 @@ _ASSIGN = ("=", "+=", "-=", "*=", "/=", "%=", "&=", "|=", "^=")
 
 @dataclass(frozen=True)
 class Node:
-    """A part of an expression.
+    """A node of an expression tree.
 
     Attributes:
         kind: `number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice`, `assign` or `step`.
         text: The number, name, member or operator.
-        parts: What it is made of.
+        parts: Operands.
     """
 
     kind: str
@@ -42,14 +42,14 @@ class Node:
 
 @dataclass(frozen=True)
 class Variable:
-    """A parameter, a constant, a local or what is bound.
+    """A parameter, constant, local variable, texture, uniform or buffer.
 
     Attributes:
-        type: Of GLSL.
-        name: Its own.
-        size: Of an array; None: it is none.
-        way: `in`, `out` or `inout` of a parameter; `const`, `uniform` or `buffer`.
-        value: Its first value.
+        type: GLSL type.
+        name: Name.
+        size: Length of an array; None for other types.
+        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform` or `buffer`.
+        value: Initial value, or None.
     """
 
     type: str
@@ -65,12 +65,12 @@ class Statement:
 
     Attributes:
         kind: `comment`, `declare`, `expression`, `return`, `if`, `for` or `block`.
-        text: A comment's.
+        text: Text of a comment.
         parts: Expressions.
-        variable: Of a declaration, or of a loop.
-        bodies: Blocks: of `if` one or two, of `for` and `block` one.
-        tail: A comment behind it, in its line.
-        blank: Whether a blank line is before it.
+        variable: Variable of a declaration or a loop.
+        bodies: Blocks: one or two of `if`, one of `for` and `block`.
+        tail: Comment at the end of its line.
+        blank: Whether a blank line precedes it.
     """
 
     kind: str
@@ -94,17 +94,17 @@ class Function:
 
 @dataclass
 class Shader:
-    """A shader's parts, and all in their order.
+    """The declarations of a shader.
 
     Attributes:
-        items: Comments (text), variables and functions, each with whether a blank line is before it.
+        items: Comments (text), variables and functions in order, each with whether a blank line precedes it.
     """
 
     items: list[tuple[str | Variable | Function, bool]] = field(default_factory=list)
 
     @property
     def functions(self) -> dict[str, Function]:
-        """By name."""
+        """The functions by name."""
         return {item.name: item for item, _ in self.items if isinstance(item, Function)}
 
     @property
@@ -136,7 +136,7 @@ class _Reader:
         return True
 
     def quiet(self) -> None:
-        """Leaves out comments within an expression."""
+        """Skips comments within an expression."""
         while self.word.kind == "comment":
             self.at += 1
 
@@ -313,9 +313,9 @@ class _Reader:
 
 
 def read_shader(words: list[Word]) -> Shader:
-    """Reads a shader's words.
+    """Parses the tokens of a shader.
 
     Raises:
-        ValueError: It is beyond what our shaders are made of.
+        ValueError: The text uses GLSL outside the subset.
     """
     return _Reader(words).shader()

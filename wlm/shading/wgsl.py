@@ -1,4 +1,4 @@
-"""WGSL: functions, and the declarations of what is bound in group WLM_GROUP, 0 but for the caller's own."""
+"""WGSL: functions, and declarations of textures and buffers in bind group 0."""
 
 from wlm.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
 from wlm.shading.writer import Writer
@@ -8,7 +8,7 @@ _SCALARS = {"float": "f32", "int": "i32", "uint": "u32", "bool": "bool"}
 
 
 class WgslWriter(Writer):
-    """Functions and bindings, in the order of the textures and buffers; the sampler is the last."""
+    """Writes WGSL. Bindings are numbered in the order of the textures and buffers; the sampler is the last."""
 
     names = {
         **{name: f"vec{n}{kind[0]}" for name, (kind, n) in VECTORS.items()},
@@ -24,7 +24,7 @@ class WgslWriter(Writer):
         return ["", f"{self._bind(self.linear)} {self.linear}: sampler;"] if self.filters else []
 
     def type_of(self, variable: Variable) -> str:
-        """Its type, of an array with its size."""
+        """Type of a variable; an array's type includes its size."""
         kind = self.kind(variable.type)
         return kind if variable.size is None else f"array<{kind}, {self.write(variable.size)}>"
 
@@ -49,7 +49,7 @@ class WgslWriter(Writer):
         return f"{variable.name}{'_given' if variable.name in self._changed else ''}: {kind}"
 
     def function(self, function: Function) -> list[str]:
-        # Parameters can't be changed.
+        # WGSL parameters are immutable.
         names = {each.name for each in function.parameters if each.way == "in"}
         self._changed = sorted(names & set(_assigned(function.body)))
         self.scope = {each.name: each for each in function.parameters}
@@ -92,7 +92,7 @@ class WgslWriter(Writer):
                 out.append(self.write(given))
                 continue
             own = self.scope.get(given.text)
-            # What was handed in is a pointer already.
+            # A parameter of the caller is already a pointer.
             out.append(given.text if own is not None and own.way != "in" else f"&{given.text}")
         return out
 
@@ -114,7 +114,7 @@ class WgslWriter(Writer):
 
 
 def _assigned(body: tuple[Statement, ...]) -> list[str]:
-    """Names that are written to."""
+    """Names of variables that are assigned."""
     found = []
 
     def look(node: Node) -> None:

@@ -1,4 +1,4 @@
-"""What the languages that our GLSL is written in have in common."""
+"""Base class of the writers of shading languages."""
 
 from abc import ABC, abstractmethod
 
@@ -11,21 +11,21 @@ _STRENGTH = {
     )
     for mark in marks
 } | dict.fromkeys("*/%", 9)
-# Where all readers, WGSL's too, need no brackets round the weaker operator's side.
+# Pairs of outer and inner operator that need no brackets in any language, WGSL included.
 _PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")}
 _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
 class Writer(ABC):
-    """Writes a shader in a language of C's kind; the languages say what is different.
+    """Writes a parsed shader in a C-like language; subclasses override the differences.
 
     Attributes:
-        shader: What is written.
-        linear: Name of the sampler of all textures that are filtered.
+        shader: The parsed shader.
+        linear: Name of the sampler that reads all filtered textures.
     """
 
     names: dict[str, str] = {}
-    """Types and functions whose names differ."""
+    """Names of types and functions that differ from GLSL."""
 
     indent = ""
     linear = "wlm_linear_clamp_sampler"
@@ -35,7 +35,7 @@ class Writer(ABC):
         self.scope: dict[str, Variable] = {}
 
     def text(self) -> str:
-        """The whole shader."""
+        """Writes the whole shader."""
         lines: list[str] = []
         for item, blank in self.shader.items:
             if blank and lines:
@@ -49,36 +49,36 @@ class Writer(ABC):
         return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
 
     def head(self) -> list[str]:
-        """Lines before all."""
+        """Lines before the first item."""
         return []
 
     def foot(self) -> list[str]:
-        """Lines behind all."""
+        """Lines after the last item."""
         return []
 
     @abstractmethod
     def outer(self, variable: Variable) -> list[str]:
-        """A constant, or what is bound."""
+        """Lines of a global constant, texture, uniform or buffer."""
 
     def signature(self, function: Function) -> str:
-        """Its first line."""
+        """First line of a function."""
         return f"{self.kind(function.type)} {function.name}({', '.join(map(self.parameter, function.parameters))})"
 
     @abstractmethod
     def parameter(self, variable: Variable) -> str:
-        """A parameter's declaration."""
+        """Declaration of a parameter."""
 
     def kind(self, name: str) -> str:
-        """A type's name."""
+        """Name of a type."""
         return self.names.get(name, name)
 
     def function(self, function: Function) -> list[str]:
-        """A function's lines."""
+        """Lines of a function."""
         self.scope = {each.name: each for each in function.parameters}
         return [self.signature(function), "{", *self.block(function.body, "    "), "}"]
 
     def block(self, body: tuple[Statement, ...], indent: str) -> list[str]:
-        """Statements' lines."""
+        """Lines of statements."""
         lines: list[str] = []
         for statement in body:
             if statement.blank and lines:
@@ -87,7 +87,7 @@ class Writer(ABC):
         return lines
 
     def statement(self, statement: Statement) -> list[str]:
-        """A statement's lines."""
+        """Lines of a statement."""
         tail = f" {statement.tail}" if statement.tail else ""
         if statement.kind == "comment":
             return [statement.text]
@@ -111,13 +111,13 @@ class Writer(ABC):
         return [head, *self.block(statement.bodies[0], "    "), "}"]
 
     def local(self, variable: Variable) -> str:
-        """A declaration within a function."""
+        """Declaration of a local variable."""
         size = "" if variable.size is None else f"[{self.write(variable.size)}]"
         value = "" if variable.value is None else f" = {self.write(variable.value)}"
         return f"{self.kind(variable.type)} {variable.name}{size}{value}"
 
     def write(self, node: Node) -> str:
-        """An expression."""
+        """Text of an expression."""
         if node.kind in ("number", "name"):
             return self.plain(node)
         if node.kind == "call":
@@ -140,16 +140,16 @@ class Writer(ABC):
         return f"{self.side(node.text, left)} {node.text} {self.side(node.text, right, right=True)}"
 
     def plain(self, node: Node) -> str:
-        """A name or a number."""
+        """Text of a name or a number."""
         return node.text
 
     def inside(self, node: Node) -> str:
-        """An expression as a part of a stronger one."""
+        """Text of an operand of an operator that binds more strongly, in brackets if needed."""
         text = self.write(node)
         return f"({text})" if node.kind in ("binary", "choice", "assign", "unary", "step") else text
 
     def side(self, mark: str, node: Node, right: bool = False) -> str:
-        """A side of an operator, in brackets where it needs them or is hard to read without."""
+        """Text of an operand of a binary operator, in brackets if it needs them or is hard to read without."""
         if node.kind != "binary":
             return f"({self.write(node)})" if node.kind in ("choice", "assign") else self.write(node)
         inner = node.text
@@ -161,7 +161,7 @@ class Writer(ABC):
         return f"({self.write(node)})"
 
     def call(self, node: Node) -> str:
-        """A call, a texture's read or a constructor."""
+        """Text of a call, a texture read or a constructor."""
         arguments = node.parts
         name = node.text
         if name in ("texelFetch", "textureLod"):
@@ -178,37 +178,37 @@ class Writer(ABC):
         return f"{self.names.get(name, name)}({', '.join(self.arguments(name, arguments))})"
 
     def arguments(self, name: str, arguments: tuple[Node, ...]) -> list[str]:
-        """A call's arguments."""
+        """Texts of the arguments of a call."""
         return [self.write(each) for each in arguments]
 
     def make(self, name: str, values: list[str]) -> str:
-        """A vector, or a number of another type."""
+        """Text of a constructor of a vector or scalar."""
         return f"{self.kind(name)}({', '.join(values)})"
 
     @abstractmethod
     def fetch(self, texture: Variable, place: Node) -> str:
-        """A texel."""
+        """Text that fetches one texel."""
 
     @abstractmethod
     def filtered(self, texture: Variable, place: Node, level: str) -> str:
-        """Several of a level, mixed."""
+        """Text that reads a texture through the filter at a mip level."""
 
     @abstractmethod
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
-        """Several, mixed, of the levels that a pixel of these changes of the place asks for."""
+        """Text that reads a texture through the filter, with derivatives that choose the mip level."""
 
     @abstractmethod
     def size(self, texture: Variable) -> str:
-        """Texels of a texture, two whole numbers."""
+        """Text that gives the size of a texture in texels, two integers."""
 
     @property
     def textures(self) -> list[Variable]:
-        """The textures."""
+        """The textures that the shader declares."""
         return [each for each in self.bound.values() if each.type in SAMPLERS]
 
     @property
     def filters(self) -> bool:
-        """Whether a texture is read through a filter."""
+        """Whether any texture is read through the filter."""
 
         def reads(node: Node) -> bool:
             called = node.kind == "call" and node.text in ("textureLod", "textureGrad")
