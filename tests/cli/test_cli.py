@@ -240,7 +240,7 @@ def test_a_set_that_names_files_elsewhere_needs_trust(folder, fitted, tmp_path):
         (["compress", "{set}", "-o", "{set}/light_0h.exr"], "ends in .wlm"),
         (["compress", "{set}"], "--output"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
-        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "many"], "'--steps'"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "many"], "--steps"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--samples", "100"], "--samples: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--tiles", "0-9"], "tile 9 is out of range"),
@@ -340,24 +340,3 @@ def test_a_closed_pipe_is_no_traceback(fitted):
         os.close(write)
         _, errors = process.communicate()
     assert process.returncode == 1 and errors == ""
-
-
-def test_bench_report_makes_pages(tmp_path):
-    from benchmarks import Row, describe_environment, write_json
-
-    file, index = tmp_path / "here.json", tmp_path / "index.md"
-    row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
-    write_json(file, [row], describe_environment("cpu", "python -m benchmarks"))
-    text = call("bench", "report", file)
-    assert "`here.json`" in text and "| 45.98 |" in text
-    call("bench", "report", file, "-o", index)
-    assert "index/lightmap.md" in index.read_text(encoding="utf-8")
-    assert "| 45.98 |" in (tmp_path / "index" / "lightmap.md").read_text(encoding="utf-8")
-    assert "ends in" in fails("bench", "report", file, "-o", tmp_path / "index.txt")
-    assert "absent.json" in fails("bench", "report", tmp_path / "absent.json")
-
-
-def test_bench_checks_its_outputs_before_the_work(tmp_path):
-    (tmp_path / "mine.json").write_text("{}")
-    assert "ends in" in fails("bench", "lightmap", "--plot", tmp_path / "p.txt")
-    assert "not a result file" in fails("bench", "smoke", "--json", tmp_path / "mine.json")

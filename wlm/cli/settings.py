@@ -11,13 +11,15 @@ import re
 import types
 from collections.abc import Callable, Iterator
 from importlib import import_module
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import typer
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from typer.core import TyperCommand
 from typer.main import get_command
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from pydantic.fields import FieldInfo
 
 _PANEL = "Settings; default: as the profile says"
 _SENTENCE_END = re.compile(r"(?<=[.;:])\s+(?=[A-Z\"`0-9])")
@@ -28,7 +30,7 @@ class _Field(NamedTuple):
     """A field of a settings model or of a model inside it, by the names of the fields that lead to it."""
 
     path: tuple[str, ...]
-    info: FieldInfo
+    info: "FieldInfo"
 
     @property
     def parameter(self) -> str:
@@ -87,10 +89,10 @@ def _expanded(command: Callable[..., None], settings: "list[_Field]", into: str)
     return run
 
 
-def _fields(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[_Field]:
+def _fields(model: "type[BaseModel]", path: tuple[str, ...] = ()) -> Iterator[_Field]:
     for name, info in model.model_fields.items():
         inner = _bare(info.annotation)
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
+        if hasattr(inner, "model_fields"):
             yield from _fields(inner, (*path, name))
         elif (*path, name) != ("name",):
             yield _Field((*path, name), info)
@@ -125,7 +127,7 @@ def _metavar(kind: Any) -> str:
     return {int: "INTEGER", float: "NUMBER"}.get(kind, "TEXT")
 
 
-def _help(info: FieldInfo) -> str:
+def _help(info: "FieldInfo") -> str:
     """The first sentence of a field's docstring and the range of its values."""
     text = " ".join((info.description or "").split())
     sentence = _SENTENCE_END.split(text)[0].rstrip(".;:") if text else ""
