@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
@@ -28,10 +28,12 @@ from wlm.config import check_settings, load_settings, profile_path
 from wlm.errors import WlmError
 from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read_artifact, write_artifact
 
+if TYPE_CHECKING:
+    from wlm.bundle import Bundle
+
 # The package that reads the files of each system.
 _PACKAGES = {
     "lightmap": "wlm.lightmap",
-    "lightmap-layers": "wlm.lightmap.layers",
     "atlas": "wlm.atlas",
     "atlas-scene": "wlm.atlas.scene",
     "probe": "wlm.probe",
@@ -242,6 +244,18 @@ class Model:
         """
         module, name = self.DECODER
         return getattr(_module(self.SYSTEM, module), name)(self, device, **options)
+
+    def bundle(self, device: str = "cpu", **options: Any) -> "Bundle":
+        """Converts the model to textures, buffers and shader source for a GPU.
+
+        Args:
+            device: Device that computes the reference values.
+            options: Further options of the system's `bundle`.
+
+        Raises:
+            WlmError: No such device.
+        """
+        return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
         """Returns settings, parts and source of the file."""

@@ -170,7 +170,7 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     assert torch.equal(default, same) and not torch.equal(default, other)
     # On the shipped one's own smoke the others would take minutes.
     monkeypatch.setattr(codec, "shipped", lambda: network)
-    monkeypatch.setattr(onnx_file, "export", lambda model, path, **size: model.settings.width)
+    monkeypatch.setattr(onnx_file, "export_onnx", lambda model, path, **size: model.settings.width)
     assert "512 x 512 pixels" in call("smoke", "export-onnx", "-o", tmp_path / "a.onnx")
 
 

@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bake, compare, doctor, inspect, lightmap, probe, smoke, verbs, view, web
+from wlm.cli import atlas, bake, compare, doctor, inspect, probe, smoke, verbs, view, web
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
@@ -113,7 +113,6 @@ app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)
 app.command()(doctor.doctor)
-app.add_typer(lightmap.app, name="lightmap")
 app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")

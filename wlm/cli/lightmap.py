@@ -1,251 +1,148 @@
-"""`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, look into it, export it."""
+"""The verbs for lightmaps over time: compress, evaluate, decode, export, info."""
 
-import time as clock
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from wlm.cli import models
 from wlm.cli.console import (
     check_output,
     escape,
     exclusive,
     note,
-    note_start,
+    note_warnings,
     number,
     quiet_warp,
     running,
     show,
-    show_json,
+    show_facts,
     table,
     write_json,
 )
-from wlm.cli.lightmap_layers import refuse_layers, show_layered, show_layered_info, show_layered_report, write_layer
-from wlm.cli.lightmap_tables import show_contest, show_report, show_tiles
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
     Device,
-    EngineOrRaw,
+    Engine,
     ExactShader,
     ModelFile,
     PageFile,
+    Profile,
     ReportFile,
     Resume,
     Seed,
     ShaderLanguage,
     Trust,
     output_option,
-    shader_of,
 )
+from wlm.cli.settings import with_settings
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.lightmap import LayeredModel, LayeredSet, LightmapModel, LightmapSet, Profile
-    from wlm.lightmap.rate import Choice
-
-_LAYERED = "lightmap-layers"
-
-app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
+    from wlm.lightmap import LightmapModel, LightmapSet, Report
+    from wlm.lightmap.evaluation import SheetReport
+    from wlm.lightmap.model import SheetModel
 
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET",
-        help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds), of Unity's states or of a contest.",
+        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity's states."
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, by commas.")
+    str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, separated by commas.")
 ]
-_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
-_Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
+_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default that of the set.')]
+_Period = Annotated[float | None, typer.Option(help="Length of the day; default that of the set.")]
 _Layers = Annotated[
-    str | None, typer.Option(metavar="NAMES", help="Of a set with layers: which to read, by commas; default all.")
-]
-_Map = Annotated[
-    str | None, typer.Option("--map", metavar="ID", help="Which lightmap of a contest's folder: ID or LEVEL/ID.")
+    str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
 ]
 
+# Columns of the scores of a sheet: heading, attribute, format, factor.
+_SCORES = (
+    ("PSNR, dB", "psnr", ".2f", 1.0),
+    ("SSIM", "ssim", ".4f", 1.0),
+    ("FLIP", "flip", ".4f", 1.0),
+)
+_SHOWN = (
+    ("filtered reads, dB", "seen", ".2f", 1.0),
+    ("texels beside charts, dB", "ring", ".2f", 1.0),
+    ("between stored times, dB", "between", ".2f", 1.0),
+    ("error at tile borders relative to inside", "border", ".2f", 1.0),
+    ("flicker, %", "flicker", ".3f", 100.0),
+    ("views, dB", "view_psnr", ".2f", 1.0),
+    ("views, FLIP", "view_flip", ".4f", 1.0),
+)
 
-@app.command()
+
+@with_settings("wlm.lightmap:Profile")
 @exclusive
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, ..., frames, video, levels, or a YAML file of settings.")] = "M",
-    tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
-    samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
-    target_psnr: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="Choose the maps' size, or a video's quality, for it; takes longer."),
-    ] = None,
-    max_bpp: Annotated[
-        float | None,
-        typer.Option(metavar="BITS", help="Choose the same for a file of at most so many bits a texel and time."),
-    ] = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
+    settings: dict[str, Any],
+    profile: Profile = "M",
+    times: _Times = None,
+    mask: _Mask = None,
+    period: _Period = None,
+    layers: _Layers = None,
     workers: Annotated[
         int | None,
         typer.Option(
             min=1,
             metavar="N",
-            help="Processes that fit tiles side by side; the file is the same. Default: one for two cores, one on a "
-            "GPU, what a cluster has room for; with cuda N are spread over the GPUs.",
+            help="Processes that fit tiles in parallel, with the same result; default one for two cores, one on a GPU.",
         ),
     ] = None,
     cluster: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help='Fit on a cluster of Ray (extra `cluster`): ray://HOST:10001, or "auto" on one of its machines.',
-        ),
+        typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
     ] = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
-    times: _Times = None,
-    mask: _Mask = None,
-    period: _Period = None,
-    map_id: _Map = None,
-    layers: _Layers = None,
     trust: Trust = False,
 ) -> None:
-    """Compress a lightmap set into one file.
+    """Compress lightmaps over time into one file.
 
-    The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
-    on exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
+    The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
+    continue exactly. Lightmaps of more than 1 GiB are kept in a temporary file (TMPDIR) during the fit.
     """
-    check_output(output, ".wlm")
-    quiet_warp()
-    from wlm.interop import check_device
-    from wlm.lightmap.evaluation import bits_per_texel, count_kinds, lost_light
-    from wlm.lightmap.front import compress, open_checkpoint
-    from wlm.lightmap.layers.data import LayeredSet
-    from wlm.lightmap.model import Profile
-    from wlm.lightmap.tiles import TileGrid, parse_tiles
+    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
+    options |= {"workers": workers, "cluster": cluster}
+    data, model, facts = models.fit(
+        "lightmap", lambda: _load(set_path, times, mask, period, layers, trust), output, profile, settings, **options
+    )
+    from wlm.lightmap.evaluation import lost_light
 
-    settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
-    # The device of a cluster is none of this machine's.
-    own_device = "cpu" if cluster is not None else check_device(device)
-    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
-    layered = isinstance(lightmaps, LayeredSet)
-    if layered:
-        refuse_layers(**{"tiles": tiles, "target-psnr": target_psnr, "max-bpp": max_bpp})
-    numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
-    places = {"workers": workers, "cluster": cluster}
-    if target_psnr is not None or max_bpp is not None:
-        if numbers is not None:
-            raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
-        wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
-        choice = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
-        settings, places["survey"] = choice.profile, choice.survey
-    options = {"seed": seed, "device": device} | ({} if layered else {"tiles": numbers})
-    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
-    note_start(checkpoint, resume, "at step 0")
-    start = clock.perf_counter()
-    with running("fit", checkpoint.path) as progress:
-        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
-        seconds = clock.perf_counter() - start
-        size = model.save(output)
-        checkpoint.remove()
-    if layered:
-        show_layered(output, model, lightmaps, size, seconds, own_device)
-        return
-    kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
-    rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])
-    # Tiles without a valid texel leave nothing to count.
-    bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
-    rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
-    show(rows)
-    if bpp is not None and max_bpp is not None and bpp > max_bpp:
-        note(f"warning: --max-bpp {max_bpp:g}: the trials were smaller than the file, which has {bpp:.3f}")
-    for warning in (*model.warnings, *(lost_light(model, lightmaps, own_device) if model.kind.any() else ())):
-        note(f"warning: {warning}")
+    show_facts(model.name, facts | _facts(model))
+    _show_sheets(model)
+    # The device of a cluster is not on this machine.
+    note_warnings((*model.warnings, *lost_light(model, data, "cpu" if cluster is not None else device)))
 
 
-@app.command()
-def decode(
-    file: ModelFile,
-    time: Annotated[float, typer.Option(help="In the unit of the set's times; any, also between stored ones.")],
-    output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
-    eight_bit: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FRAME.png",
-            help="Also write what a texture cache holds: 8 bits, radiance = (byte / 255 * bound) ** gamma, with gamma "
-            "and the bound of each tile in the PNG's text.",
-        ),
-    ] = None,
-    texture: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="MAP.dds",
-            help="Also write what a renderer samples: one texture of RGB9E5 texels, 32 bits each, with mips.",
-        ),
-    ] = None,
-    layer: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of a file with layers: which; default the first of light.")
-    ] = None,
-    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Of such a file: which; default the first.")] = None,
-    device: Device = "cpu",
-) -> None:
-    """Decode the whole map at one time."""
-    check_output(output, ".exr")
-    if texture is not None:
-        check_output(texture, ".dds")
-    if eight_bit is not None:
-        check_output(eight_bit, ".png")
-    quiet_warp()
-    from wlm.formats.exr import write_exr
-    from wlm.lightmap.exporter import write_8bit, write_texture
-
-    model = _model(file)
-    decoder = model.decoder(device)
-    if model.SYSTEM == _LAYERED:
-        refuse_layers(texture=texture)
-        frame = write_layer(decoder, time, layer, atlas, output, eight_bit)
-    else:
-        for name, value in {"layer": layer, "atlas": atlas}.items():
-            if value is not None:
-                raise WlmError(f"{file}: --{name} means nothing to a file without layers")
-        frame = decoder.frame(time)
-        write_exr(output, frame)
-        if eight_bit is not None:
-            write_8bit(eight_bit, decoder, time)
-        if texture is not None:
-            write_texture(texture, model, time, device)
-    rows = table(str(file), ["time", "size", "mean", "largest", "file"])
-    size, mean, largest = f"{frame.shape[1]}x{frame.shape[0]}", f"{frame.mean():.4g}", f"{frame.max():.4g}"
-    rows.add_row(f"{time:g}", size, mean, largest, escape(str(output)))
-    show(rows)
-
-
-@app.command()
 def evaluate(
     file: ModelFile,
     set_path: _Set,
     json_path: ReportFile = None,
     html_path: PageFile = None,
     views: Annotated[
-        int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
+        int, typer.Option(min=0, help="Number of rendered views of the set's mesh to score, if it names one.")
     ] = 50,
-    score: Annotated[
-        Literal["hprc"] | None, typer.Option(help="Add the score of a contest, as far as its rules are public.")
-    ] = None,
-    device: Device = "cpu",
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
-    map_id: _Map = None,
     layers: _Layers = None,
+    device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
-    """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, bits per texel, and what is seen of it.
+    """Compare compressed lightmaps with the originals: PSNR, SSIM and FLIP by tile and time, and bits per texel.
 
-    As it is seen: filtered, in the gaps beside charts, between stored times, across tiles, over time, in views of the
-    set's mesh.
+    The error is also measured where light is shown: filtered, beside charts, between stored times, across tiles, over
+    time, and in views of the set's mesh.
     """
     if json_path is not None:
         check_output(json_path, ".json")
@@ -253,186 +150,223 @@ def evaluate(
         check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import contest_score
-    from wlm.lightmap.front import evaluate
-    from wlm.system import plain
+    from wlm.lightmap import evaluate
+    from wlm.system import load
 
     device = check_device(device)
-    model = _model(file)
-    if model.SYSTEM == _LAYERED:
-        refuse_layers(html=html_path, score=score)
-    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
+    model = load(file, "lightmap")
+    lightmaps = _load(set_path, times, mask, period, layers, trust)
+    note_warnings(lightmaps.warnings)
     with running("score") as progress:
         size = file.stat().st_size
         report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
-    if model.SYSTEM == _LAYERED:
-        if json_path is not None:
-            write_json(json_path, report.to_json())
-        show_layered_report(file, report)
-        return
     if html_path is not None:
         from wlm.view.reports import lightmap_report
 
         lightmap_report(html_path, model, lightmaps, report)
-    extra: dict[str, Any] = {}
-    contest = None
-    if score is not None:
-        with running("contest") as progress:
-            contest = contest_score(model, lightmaps, device=device, progress=progress)
-        extra[score] = plain(contest)
     if json_path is not None:
-        write_json(json_path, report.to_json() | extra)
-    show_report(file, report)
-    if contest is not None:
-        show_contest(contest)
+        write_json(json_path, report.to_json())
+    _show_report(file, report)
 
 
-@app.command()
-def info(
+def decode(
     file: ModelFile,
-    tiles: Annotated[bool, typer.Option("--tiles", help="List each tile: its kind, its bytes, and why.")] = False,
-    as_json: AsJson = False,
-    device: Annotated[str, typer.Option(help="Where to load it, to say what memory its maps take there.")] = "cpu",
+    time: Annotated[float, typer.Option(help="Time in the unit of the set, stored or between stored times.")],
+    output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
+    texture: Annotated[
+        Path | None,
+        typer.Option(metavar="MAP.dds", help="Also write the texture of the runtime: RGB9E5 texels with mips."),
+    ] = None,
+    eight_bit: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FRAME.png",
+            help="Also write 8 bits for a texture cache: radiance = (byte / 255 * bound) ** gamma, with gamma and the "
+            "bound of each tile in the text of the PNG.",
+        ),
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first of radiance.")
+    ] = None,
+    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas to decode; default the first.")] = None,
+    device: Device = "cpu",
 ) -> None:
-    """Say what a file holds, without decoding it."""
+    """Decode a whole lightmap at one time."""
+    check_output(output, ".exr")
+    if texture is not None:
+        check_output(texture, ".dds")
+    if eight_bit is not None:
+        check_output(eight_bit, ".png")
     quiet_warp()
-    from wlm.lightmap.evaluation import count_kinds, part_bytes
-    from wlm.lightmap.held import held_tiles
+    import numpy as np
 
-    model = _model(file)
-    if tiles and model.SYSTEM == _LAYERED:
-        raise WlmError(f"{file}: --tiles is of files of one lightmap, not of layers")
-    if model.SYSTEM == _LAYERED:
-        show_layered_info(file, model, model.decoder(device), as_json)
-        return
+    from wlm.formats.channels import read_channels
+    from wlm.formats.exr import HALF_MAX, write_part
+    from wlm.lightmap.runtime_texture import write_8bit, write_texture
+    from wlm.system import load
+
+    model = load(file, "lightmap")
+    sheets = model.layer(layer, atlas)
+    if (eight_bit or texture) and len(sheets) > 1:
+        raise WlmError(
+            f"--eight-bit, --texture: expected a layer of at most three channels, {sheets[0].layer} has more"
+        )
+    if texture is not None and sheets[0].linear:
+        raise WlmError(f"--texture: expected a layer of light, found {sheets[0].layer}")
     decoder = model.decoder(device)
-    size = file.stat().st_size
-    facts: dict[str, Any] = {
-        "name": model.name,
-        "bytes": size,
-        "width": model.width,
-        "height": model.height,
-        "times": model.times.tolist(),
-        "period": model.period,
-        "source": model.source,
-        "tiles": count_kinds(model),
-        "parts": part_bytes(model, size),
-        "device": decoder.device,
-        "device_bytes": decoder.device_bytes,
-        "profile": model.profile.model_dump(mode="json"),
-    }
-    held = held_tiles(model) if tiles else []
-    if tiles:
-        facts["each_tile"] = [vars(tile) for tile in held]
-    if as_json:
-        show_json(facts)
-        return
-    sections = (
-        {
-            "name": escape(model.name),
-            "bytes": f"{size:,}",
-            "size": f"{model.width}x{model.height}",
-            "times": f"{len(model.times)}, {model.times[0]:g} to {model.times[-1]:g}",
-            "period": number(model.period, "g"),
-            "source": escape(model.source),
-            "profile": escape(model.profile.name),
-        },
-        {f"{kind} tiles": str(count) for kind, count in facts["tiles"].items()},
-        {f"bytes of {part}": f"{count:,}" for part, count in facts["parts"].items()},
-        {f"bytes on {decoder.device}": f"{decoder.device_bytes:,}"},
-    )
-    rows = table(str(file), ["", "value"])
-    for section in sections:
-        for row in section.items():
-            rows.add_row(*row)
-        rows.add_section()
-    show(rows)
-    if tiles:
-        show_tiles(held)
+    frame = decoder.frame(time, layer, atlas)
+    names = [name for sheet in sheets for name in sheet.channels]
+    planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)
+    channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
+    write_part(output, channels, read_channels)
+    if eight_bit is not None:
+        write_8bit(eight_bit, decoder.sheets[sheets[0]], time, sheets[0].values)
+    if texture is not None:
+        write_texture(texture, model.sheets[sheets[0]], time, device)
+    facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
+    facts |= {"size": f"{frame.shape[1]}x{frame.shape[0]}", "mean": float(frame.mean()), "largest": float(frame.max())}
+    show_facts(str(file), facts)
 
 
-@app.command()
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: EngineOrRaw = "raw",
+    engine: Engine = None,
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
-    device: Annotated[str, typer.Option(help="Of raw, where the frame to compare with is decoded.")] = "cpu",
+    device: Device = "cpu",
 ) -> None:
-    """Write the light for an engine: textures, floats, a decoder, and for an engine by name what puts them together.
-
-    Of raw, frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet
-    of three channels has a folder of its own, for an engine by name each sheet of light; sheets.json names them.
-    """
-    language = shader_of(engine, shader, exact)
-    if engine != "raw" and device != "cpu":
-        raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
-    quiet_warp()
-    from wlm.export import export as export_kit
-    from wlm.lightmap.front import export
-
-    model = _model(file)
-    rows = table(str(output), ["file", "bytes"])
-    if engine == "raw":
-        paths = export(model, output, device=device, shader=language, exact=exact)
-    else:
-        paths = export_kit(model, output, engine)
-        left = [] if model.SYSTEM != _LAYERED else [sheet.label for sheet in model.sheets if sheet.linear]
-        if left:
-            note(f"warning: left out, since --engine {engine} shows light alone: {', '.join(left)}")
-    for path in paths:
-        rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
-    show(rows)
+    """Write lightmaps for an engine: textures, buffers and a shader, or with --engine a kit that shows them."""
+    models.export(file, output, engine, shader, exact, device)
 
 
-def _model(file: Path) -> "LightmapModel | LayeredModel":
-    """Reads a file of lightmaps, with layers or without."""
-    from wlm.system import load
+def info(
+    file: ModelFile,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="List each tile: its encoding, bytes, and the reason.")
+    ] = False,
+    as_json: AsJson = False,
+    device: Device = "cpu",
+) -> None:
+    """Show what a file of lightmaps contains, and its memory on a device."""
+    from wlm.lightmap.tile_report import report_tiles
 
-    model = load(file)
-    if model.SYSTEM not in ("lightmap", _LAYERED):
-        raise WlmError(f"{file}: expected an artifact of lightmap, found one of {model.SYSTEM}")
-    return model
+    def facts(model: "LightmapModel") -> dict[str, Any]:
+        sheets = [
+            {"name": sheet.label, "encoding": sheet.encoding} | _sheet(own) for sheet, own in model.sheets.items()
+        ]
+        listed = [vars(tile) for tile in report_tiles(model.light)]
+        own = {"tiles": listed} if tiles else {}
+        return _facts(model) | ({"sheets": sheets} | own if as_json else {})
 
-
-def _chosen(
-    lightmaps: "LightmapSet",
-    settings: "Profile",
-    wanted: dict[str, float | None],
-    options: dict[str, Any],
-) -> "Choice":
-    """Chooses the size of the maps, or the quality of video, and says what it was and why."""
-    from wlm.lightmap.rate import choose
-
-    with running("choose") as progress:
-        choice = choose(lightmaps, settings, **wanted, **options, progress=progress)
-    resolution, quality = choice.profile.uvt_resolution, choice.profile.video_quality
-    chosen = f"F_uvt of {resolution}x{resolution}" if settings.frames != "video" else f"video of quality {quality}"
-    psnr = "" if choice.psnr is None else f", {choice.psnr:.1f} dB"
-    note(f"{chosen}: about {choice.bpp:.3f} bits a texel and time{psnr}")
-    if choice.limited:
-        psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
-        note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")
-    return choice
+    model = models.describe(file, device, as_json, facts)
+    if not as_json:
+        _show_sheets(model)
+        if tiles:
+            rows = table(
+                "tiles", ["tile", "row", "column", "encoding", "texels", "bytes", "reason"], ["encoding", "reason"]
+            )
+            for tile in report_tiles(model.light):
+                cells = map(str, (tile.number, tile.row, tile.column))
+                rows.add_row(*cells, tile.kind, f"{tile.valid:,}", f"{tile.bytes:,}", escape(tile.why))
+            show(rows)
 
 
 def _load(
-    path: Path,
-    times: str | None,
-    mask: str | None,
-    period: float | None,
-    trust: bool,
-    map_id: str | None,
-    layers: str | None,
-) -> "LightmapSet | LayeredSet":
-    """Reads a set and prints what was repaired in it."""
+    path: Path, times: str | None, mask: str | None, period: float | None, layers: str | None, trust: bool
+) -> "LightmapSet":
+    from wlm.lightmap import load
     from wlm.lightmap.data import parse_times
-    from wlm.lightmap.front import load
 
     stamps = None if times is None else parse_times(times)
     names = None if layers is None else [name.strip() for name in layers.split(",")]
-    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, map_id=map_id, layers=names)
-    for warning in lightmaps.warnings:
-        note(f"warning: {warning}")
-    return lightmaps
+    return load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names)
+
+
+def _facts(model: "LightmapModel") -> dict[str, Any]:
+    stored = f"{len(model.times)}, {model.times[0]:g} to {model.times[-1]:g}"
+    return {"times": stored, "period": model.period, "GPU_bytes": model.memory_bytes}
+
+
+def _sheet(model: "SheetModel") -> dict[str, Any]:
+    from wlm.lightmap.evaluation import count_kinds
+
+    tiles = {kind: count for kind, count in count_kinds(model).items() if count}
+    return {"width": model.width, "height": model.height, "GPU_bytes": model.memory_bytes, "tiles": tiles}
+
+
+def _show_sheets(model: "LightmapModel") -> None:
+    from wlm.lightmap.codec import sheet_bytes
+
+    sizes = sheet_bytes(model)
+    columns = ["sheet", "values", "size", "bytes on disk", "GPU bytes", "tiles"]
+    rows = table("sheets", columns, text=["values", "tiles"])
+    for sheet, own in model.sheets.items():
+        facts = _sheet(own)
+        tiles = ", ".join(f"{count} {kind}" for kind, count in facts["tiles"].items())
+        size = f"{facts['width']}x{facts['height']}"
+        rows.add_row(escape(sheet.label), sheet.encoding, size, f"{sizes[sheet]:,}", f"{facts['GPU_bytes']:,}", tiles)
+    show(rows)
+
+
+def _show_report(file: Path, report: "Report") -> None:
+    columns = [heading for heading, *_ in _SCORES]
+    rows = table(str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"])
+    for sheet, own in report.sheets.items():
+        sizes = (f"{own.bytes:,}", f"{own.bpp:.3f}", f"{own.memory_bpp:.3f}")
+        rows.add_row(escape(sheet.label), *_cells(own, _SCORES), *sizes)
+    rows.add_section()
+    light = report.light
+    scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
+    for stamp, *values in zip(report.times, *scores, strict=True):
+        rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
+    rows.add_section()
+    for tile, values in enumerate(
+        zip(light.psnr_by_tile.ravel(), light.ssim_by_tile.ravel(), light.flip_by_tile.ravel(), strict=True)
+    ):
+        # Tiles that are empty or not in the file have no score.
+        if any(value == value for value in values):
+            rows.add_row(f"tile {tile}", *map(number, values, (".2f", ".4f", ".4f")))
+    show(rows)
+    _show_where_shown(report)
+    _note_worst(light)
+    note_warnings(report.warnings)
+
+
+def _cells(report: "SheetReport", columns: Any) -> list[str]:
+    return [number(factor * getattr(report, name), form) for _, name, form, factor in columns]
+
+
+def _show_where_shown(report: "Report") -> None:
+    """Shows the scores of light where it is shown; columns without any score are left out."""
+    columns = [
+        column for column in _SHOWN if any(math.isfinite(getattr(own, column[1])) for own in report.sheets.values())
+    ]
+    if columns:
+        rows = table("PSNR and errors where light is shown", ["", *(heading for heading, *_ in columns)])
+        for sheet, own in report.sheets.items():
+            rows.add_row(escape(sheet.label), *_cells(own, columns))
+        show(rows)
+
+
+def _note_worst(report: "SheetReport") -> None:
+    """Notes the worst tiles, times and views, and the tiles without a score."""
+    if report.worst_tile is not None:
+        worst = report.worst_tile
+        note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    for what, worst in (("filtered read", report.worst_seen), ("between times", report.worst_between)):
+        if worst is not None:
+            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    if (worst := report.worst_seen_time) is not None:
+        note(f"worst time, mean of filtered reads: {worst['psnr']:.2f} dB at {worst['time']:g}")
+    if (worst := report.worst_seen_tile) is not None:
+        note(f"worst tile, mean of filtered reads: {worst['psnr']:.2f} dB, tile {worst['tile']}")
+    if (worst := report.worst_view) is not None:
+        place = f"camera {worst['view']} at {worst['time']:g}"
+        note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
+    reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
+    if reasons:
+        note(f"tiles times times without a score: {reasons}")
+    if report.format_limited:
+        psnr = number(report.psnr_unlimited, ".2f")
+        note(f"{len(report.format_limited)} scored tiles span few steps of half float; without them PSNR is {psnr} dB")

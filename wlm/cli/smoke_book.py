@@ -1,7 +1,6 @@
 """`wlm smoke shade` and `flipbook`: six-way lightmaps as pictures, as textures, and as folders for engines."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -160,9 +159,9 @@ def flipbook(
         contents, clipped = _write_textures(packed, output)
     else:
         from wlm.export import export
-        from wlm.export.bundles import bundle_of
+        from wlm.smoke.bundle import bundle as bundle_of
 
-        bundle = replace(bundle_of(packed, device), name=lightmaps.resolve().stem)
+        bundle = bundle_of(packed, name=lightmaps.resolve().stem)
         paths = export(bundle, output, engine, shader=shader or "glsl")
         contents, clipped = {path: packed.channels.get(path.stem, ()) for path in paths}, bundle.document["clipped"]
     _show(str(output), packed, contents, clipped)

@@ -46,7 +46,7 @@ def register(app: typer.Typer) -> None:
 @with_settings("wlm.smoke:Profile")
 @exclusive
 def train(
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
     settings: dict[str, Any],
     minutes: Annotated[
@@ -108,7 +108,7 @@ def export_onnx(
 
     network = network or shipped()
     model = open_network(network)
-    size = onnx_file.export(model, output, height=resolution, width=resolution)
+    size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
     facts = {"input planes": " ".join(GUIDES[model.settings.guide]), "output planes": " ".join(PLANES)}
     show_facts(str(output), facts | {"image": f"{resolution} x {resolution} pixels", "bytes": size})
 
@@ -171,7 +171,7 @@ def info(file: ModelFile, as_json: AsJson = False) -> None:
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     """Returns the shape of a network and the facts about its training that its file states."""
-    from wlm.smoke.network.unet import parameter_count
+    from wlm.smoke.model import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
     training = {name: model.summary[name] for name in names if name in model.summary}

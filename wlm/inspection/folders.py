@@ -16,8 +16,7 @@ from wlm.inspection.files import BAKED, FRAMES, document_of, file_system, inspec
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, picture_of, said
 from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
-from wlm.lightmap.layers.listing import list_layers, state_folders
-from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
+from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders, time_of_name
 
 MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
@@ -170,12 +169,12 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
     stated: list[float] = [float(i) for i in range(len(states))]
     try:
-        listing = list_layers(folder, stated, None, False)
+        listing = list_set(folder, stated)
     except WlmError as error:
         problems.append(said(error, folder))
         shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
         options += ["--layers", ",".join(shared)]
-        listing = list_layers(folder, stated, shared, False)
+        listing = list_set(folder, stated, shared)
     sizes = []
     for atlas in listing.atlases:
         paths = [one[atlas.name, "light"].path for one in listing.states]
@@ -202,7 +201,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
 
 def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
     try:
-        list_layers(folder, times, layers, False)
+        list_set(folder, times, layers)
     except WlmError:
         return False
     return True

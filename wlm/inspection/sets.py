@@ -7,9 +7,9 @@ from typing import NamedTuple
 from wlm.errors import WlmError
 from wlm.inspection.finding import Finding, compress_command
 from wlm.inspection.pictures import Picture, picture_of, read_lit, said
-from wlm.lightmap.layers.listing import is_layered, list_layers
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
-from wlm.lightmap.listing import Listing, count_of, parse_set
+from wlm.lightmap.listing import Listing, count_of, list_set
+from wlm.lightmap.sheet import LIGHT
 
 UNREADABLE_SET = "a lightmap set that cannot be read"
 
@@ -17,15 +17,15 @@ UNREADABLE_SET = "a lightmap set that cannot be read"
 def inspect_set(path: Path) -> Finding:
     """Describes the set that a `set.json` lists, and its missing files."""
     try:
-        if is_layered(path):
-            listing = list_layers(path, None, None, False)
+        listing = list_set(path)
+        if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):
             sheets = f"{count_of(listing.atlases, 'atlas')} with {', '.join(layer.name for layer in listing.layers)}"
             problems = sorted(
                 {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
             )
             what = f"a set of lightmaps with layers at {count_of(listing.states, 'time')}: {sheets}"
             return Finding(path.parent, what, compress_command(path.parent), tuple(problems[:4]))
-        return _checked(path.parent, parse_set(path, None))
+        return _checked(path.parent, listing)
     except WlmError as error:
         return Finding(path.parent, UNREADABLE_SET, problems=(said(error, path),))
 
@@ -33,12 +33,10 @@ def inspect_set(path: Path) -> Finding:
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
     """Returns the files that a `set.json` names."""
     try:
-        if is_layered(path):
-            return {source.path for one in list_layers(path, None, None, False).states for source in one.values()}
-        listing = parse_set(path, None)
+        listing = list_set(path)
     except WlmError:
         return set()
-    return {*listing.files, Path(listing.mask)} & set(files)
+    return {*listing.files, *(Path(str(atlas.mask)) for atlas in listing.atlases)} & set(files)
 
 
 def _checked(folder: Path, listing: Listing) -> Finding:

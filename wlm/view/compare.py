@@ -118,8 +118,6 @@ def compare(
         return _lightmaps(paths, models, original, device, progress)
     if systems[0] == "probe":
         return _probes(paths, models, original, key, device, progress)
-    if systems[0] == "lightmap-layers":
-        raise WlmError(f"{paths[0]}: expected lightmaps without layers; wlm lightmap evaluate scores each layer")
     if systems[0] == "atlas":
         raise WlmError(f"{paths[0]}: expected the folder that wlm atlas compress wrote, which has the mesh")
     raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")

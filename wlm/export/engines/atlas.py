@@ -13,9 +13,9 @@ from wlm.atlas.model import BLOCK_SIDE, AtlasModel
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.export.engines.kit import ENGINES, README_FILE, asset_name, filled, godot_uniforms
+from wlm.export.shading import ENDINGS, check_language, custom_node, translate
 from wlm.formats.dds import write_dds
 from wlm.formats.folder import made_parents, staged, write_index
-from wlm.shading import ENDINGS, check_language, custom_node, translate
 
 FORMAT = "wlm-bundle"
 _VERSION = 1
@@ -33,7 +33,7 @@ def export_atlas(
         output: The folder of the compression.
         directory: Another folder; made if it isn't there. A new export replaces an earlier one.
         engine: One of `wlm.export.engines.ENGINES`, or "raw": the shader alone beside textures and mesh.
-        shader: Of "raw", its language, one of `wlm.shading.LANGUAGES`.
+        shader: Of "raw", its language, one of `wlm.export.shading.LANGUAGES`.
         exact: Of "raw", texels are fetched and mixed in floats rather than filtered.
 
     Returns:

@@ -13,12 +13,12 @@ from wlm.atlas.scene.model import SceneModel
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.errors import WlmError
 from wlm.export.engines.kit import ENGINES, README_FILE, asset_name, check_sides, filled, godot_uniforms, stacked
+from wlm.export.shading import ENDINGS, check_language, custom_node, translate
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.shared_exponent import unpack_rgb9e5
-from wlm.lightmap.packed import MOST_LAYERS
-from wlm.shading import ENDINGS, check_language, custom_node, translate
+from wlm.lightmap.bundle import MOST_LAYERS
 
 FORMAT = "wlm-bundle"
 INFO_FILE = "bundle.json"
@@ -46,7 +46,7 @@ def export_scene(
         source: The folder of the compression.
         directory: Another folder; made if it isn't there. A new export replaces an earlier one.
         engine: One of `wlm.export.engines.ENGINES`, or "raw": the shader alone beside textures and scene.
-        shader: Of "raw", its language, one of `wlm.shading.LANGUAGES`.
+        shader: Of "raw", its language, one of `wlm.export.shading.LANGUAGES`.
 
     Returns:
         The files written, `scene.json` last.

@@ -1,6 +1,0 @@
-"""Translation of the systems' GLSL into other shading languages."""
-
-from wlm.shading.node import custom_node
-from wlm.shading.translation import ENDINGS, LANGUAGES, check_language, translate
-
-__all__ = ["ENDINGS", "LANGUAGES", "check_language", "custom_node", "translate"]
