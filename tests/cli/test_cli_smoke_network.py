@@ -70,7 +70,7 @@ def volume(tmp_path):
 def test_train(trained):
     folder, text, stderr = trained
     assert sorted(os.listdir(folder)) == ["a.safetensors", "a.safetensors.csv", "tiny.yaml"]
-    assert "8 of 8" in text and "best validation, dB" in text
+    assert "8 of 8" in text and "best validation PSNR, dB" in text
     assert re.search(r"train: 8 of 8, PSNR \d+\.\d+ dB, loss \d", stderr)
     model = wlm.load(folder / "a.safetensors")
     assert model.settings.guide == "six" and model.summary["seed"] == 3
@@ -126,7 +126,7 @@ def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypa
         patch.setattr(dataset, "make_pool", interrupted)
         call(*words, "--resume", code=130)
     assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
-    assert "stopped at step 0: the same command with --resume goes on" in call.stderr
+    assert "stopped at step 0: repeat the command with --resume to continue" in call.stderr
     call(*words, "--resume")
     assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
     content = (tmp_path / "a.safetensors").read_bytes()
@@ -232,7 +232,7 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     out = tmp_path / "a.exr"
     predict = ("smoke", "predict", volume, "-o", out)
     assert "--coarse: expected no --network" in fails(*predict, "--coarse", "--network", network)
-    assert "--step: expected --coarse beside it" in fails(*predict, "--step", 3)
+    assert "--step: expected --coarse: a network" in fails(*predict, "--step", 3)
     assert "--step" in fails(*predict, "--coarse", "--step", 0)
     assert "gone.safetensors: cannot read" in fails(*predict, "--network", tmp_path / "gone.safetensors")
     assert "expected an artifact" in fails(*predict, "--network", volume)

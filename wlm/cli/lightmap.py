@@ -252,21 +252,21 @@ def info(
     from wlm.lightmap.tile_report import report_tiles
 
     def facts(model: "LightmapModel") -> dict[str, Any]:
-        sheets = [
-            {"name": sheet.label, "encoding": sheet.encoding} | _sheet(own) for sheet, own in model.sheets.items()
-        ]
-        listed = [vars(tile) for tile in report_tiles(model.light)]
-        own = {"tiles": listed} if tiles else {}
-        return _facts(model) | ({"sheets": sheets} | own if as_json else {})
+        if not as_json:
+            return _facts(model)
+        sheets = []
+        for sheet, own in model.sheets.items():
+            listed = {"each_tile": [vars(tile) for tile in report_tiles(own)]} if tiles else {}
+            sheets.append(vars(sheet) | _sheet(own) | listed)
+        return _facts(model) | {"times": model.times.tolist(), "sheets": sheets}
 
     model = models.describe(file, device, as_json, facts)
     if not as_json:
         _show_sheets(model)
-        if tiles:
-            rows = table(
-                "tiles", ["tile", "row", "column", "encoding", "texels", "bytes", "reason"], ["encoding", "reason"]
-            )
-            for tile in report_tiles(model.light):
+        for sheet, own in model.sheets.items() if tiles else ():
+            columns = ["tile", "row", "column", "encoding", "texels", "bytes", "reason"]
+            rows = table(f"tiles of {sheet.label}", columns, text=["encoding", "reason"])
+            for tile in report_tiles(own):
                 cells = map(str, (tile.number, tile.row, tile.column))
                 rows.add_row(*cells, tile.kind, f"{tile.valid:,}", f"{tile.bytes:,}", escape(tile.why))
             show(rows)
@@ -312,9 +312,10 @@ def _show_sheets(model: "LightmapModel") -> None:
 def _show_report(file: Path, report: "Report") -> None:
     columns = [heading for heading, *_ in _SCORES]
     rows = table(str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"])
-    for sheet, own in report.sheets.items():
+    sheets = {escape(sheet.label): own for sheet, own in report.sheets.items()} if len(report.sheets) > 1 else {}
+    for name, own in {f"wlm {escape(report.profile)}": report, **sheets}.items():
         sizes = (f"{own.bytes:,}", f"{own.bpp:.3f}", f"{own.memory_bpp:.3f}")
-        rows.add_row(escape(sheet.label), *_cells(own, _SCORES), *sizes)
+        rows.add_row(name, *_cells(own, _SCORES), *sizes)
     rows.add_section()
     light = report.light
     scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
@@ -333,7 +334,7 @@ def _show_report(file: Path, report: "Report") -> None:
     note_warnings(report.warnings)
 
 
-def _cells(report: "SheetReport", columns: Any) -> list[str]:
+def _cells(report: "Report | SheetReport", columns: Any) -> list[str]:
     return [number(factor * getattr(report, name), form) for _, name, form, factor in columns]
 
 

@@ -79,7 +79,7 @@ def train(
     if not training.finished:
         note(f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}")
     facts: dict[str, Any] = {
-        "steps": f"{training.steps:,} of {training.training.total:,}",
+        "steps": f"{training.steps:,} of {checked.training.total:,}",
         "skipped steps": training.skipped,
         "best validation PSNR, dB": training.best,
     }
