@@ -85,7 +85,7 @@ def test_what_run_refuses(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert "pip install 'wlm[film]'" in fails("smoke", "run", scene, "-o", tmp_path / "a.mp4", "--frames", 1)
     odd = ("--resolution", 9)
-    assert "expected frames of even sizes" in fails("smoke", "run", scene, "-o", tmp_path / "a.mp4", *odd)
+    assert "expected frames of even width and height" in fails("smoke", "run", scene, "-o", tmp_path / "a.mp4", *odd)
     assert sorted(os.listdir(tmp_path)) == ["b.yaml", "scene.yaml"]
 
 

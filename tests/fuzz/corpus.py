@@ -20,8 +20,8 @@ from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
-from wlm.probe.three_grid import export_grid
-from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
+from wlm.probe.engines.three import export_grid
+from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES, export_unreal
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.flipbook.shots import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke

@@ -93,14 +93,14 @@ def test_what_is_refused(tmp_path):
     writer, random = Writer(), np.random.default_rng(0)
     points, path = random.random((9, 3)), tmp_path / "a.lmbake"
     path.write_bytes(writer.file(bake(writer, points, np.ones((9, 9, 3)))))
-    model = wlm.probe.compress(from_arrays(points[::-1], np.ones((9, 27))))
+    model = wlm.probe.compress(from_arrays(points[::-1] + 1.0, np.ones((9, 27))))
     for refused, settings, message in [
         (random_model(outputs=12), {}, "expected L2 in RGB"),
         (random_model(outputs=12), {"bake": path}, "expected L2 in RGB"),
         (random_model(), {"cells": 65}, "cells: expected 1 to 64"),
         (random_model(), {"cells": 4, "bake": path}, "cells: expected none"),
         (model, {"bake": path}, "a.lmbake: expected the 9 probes"),
-        (model, {}, "holds no positions"),
+        (model, {}, "stores no positions"),
     ]:
         with pytest.raises(WlmError, match=message):
             export_godot(refused, tmp_path / "out", **settings)

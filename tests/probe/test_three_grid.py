@@ -9,7 +9,7 @@ from builders.probe_models import random_model
 
 from wlm.errors import WlmError
 from wlm.probe import export_grid, load, load_positions
-from wlm.probe.lattice import grid_places
+from wlm.probe.engines.lattice import grid_places
 
 
 @pytest.fixture(scope="module")

@@ -65,8 +65,8 @@ def test_what_is_refused(tmp_path):
         (random_model(outputs=48, positions=True), {}, "expected L0, L1 or L2"),
         (random_model(outputs=5, positions=True), {}, "expected L0, L1 or L2"),
         (random_model(positions=True), {"mirror": "w"}, "mirror: expected x, y or z"),
-        (random_model(), {}, "holds no positions"),
-        (random_model(), {"position": np.zeros((3, 3))}, "expected the positions of 200 probes"),
+        (random_model(), {}, "stores no positions"),
+        (random_model(), {"position": np.zeros((3, 3))}, "expected the positions of its own 200 probes"),
     ]:
         with pytest.raises(WlmError, match=message):
             export_unity(model, tmp_path / "out", **settings)

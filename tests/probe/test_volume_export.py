@@ -6,13 +6,14 @@ import subprocess
 
 import numpy as np
 import pytest
+from wlm.shading import translate
 
 from wlm.errors import WlmError
-from wlm.probe.light import StoredLight
+from wlm.probe.exporter import export_volume
 from wlm.probe.sphere import irradiance
-from wlm.probe.volume import Volume
-from wlm.probe.volume_export import export_volume
-from wlm.probe.volume_shader import volume_glsl, volume_hlsl
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.shader import volume_glsl
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def volume() -> Volume:
     return made
 
 
-# GLSL's and HLSL's types for a C++ compiler.
+# GLSL's types for a C++ compiler.
 _PRELUDE = """
 #include <cmath>
 #include <cstdint>
@@ -35,14 +36,12 @@ _PRELUDE = """
 #include <vector>
 typedef uint32_t uint;
 struct vec3 { float x, y, z; vec3(float x, float y, float z) : x(x), y(y), z(z) {} };
-typedef vec3 float3;
 vec3 operator*(float s, vec3 v) { return vec3(s * v.x, s * v.y, s * v.z); }
 vec3& operator+=(vec3& a, vec3 b) { a.x += b.x; a.y += b.y; a.z += b.z; return a; }
 template <class T, class U> T min(T a, U b) { return a < (T)b ? a : (T)b; }
 template <class T, class U> T max(T a, U b) { return a > (T)b ? a : (T)b; }
 float floor(float x) { return std::floor(x); }
 float uintBitsToFloat(uint i) { float f; std::memcpy(&f, &i, 4); return f; }
-float asfloat(uint i) { return uintBitsToFloat(i); }
 template <class T> std::vector<T> load(const char* path)
 {
     std::vector<T> data;
@@ -82,7 +81,7 @@ int main()
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
-def test_shaders_read_what_the_volume_has(volume, tmp_path):
+def test_the_shader_reads_what_the_volume_has(volume, tmp_path):
     export_volume(volume, tmp_path)
     document = json.loads((tmp_path / "volume.json").read_text())
     reference = json.loads((tmp_path / "reference.json").read_text())
@@ -92,20 +91,19 @@ def test_shaders_read_what_the_volume_has(volume, tmp_path):
     normals = np.random.default_rng(1).normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sent = np.concatenate([points - document["viewpoint"], normals], 1).astype("<f4").tobytes()
-    for name in ("volume.glsl", "volume.hlsl"):
-        (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / name).read_text() + _MAIN)
-        subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
-        out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
-        got = np.frombuffer(out, "<f4").reshape(-1, 58)
-        np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
-        # Divided by a small weight, a rounding of the place counts for more.
-        want = np.array(reference["values"])
-        np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
-        ahead = volume.read(points, normals)
-        far = ahead.weight[:, None]
-        np.testing.assert_allclose(got[:, 28:55] * far, ahead.values * far, atol=2e-5)
-        shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 28:55], normals, strict=True)])
-        np.testing.assert_allclose(got[:, 55:], shown / np.pi, atol=2e-5)
+    (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / "volume.glsl").read_text() + _MAIN)
+    subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
+    out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
+    got = np.frombuffer(out, "<f4").reshape(-1, 58)
+    np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
+    # Divided by a small weight, a rounding of the place counts for more.
+    want = np.array(reference["values"])
+    np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
+    ahead = volume.read(points, normals)
+    far = ahead.weight[:, None]
+    np.testing.assert_allclose(got[:, 28:55] * far, ahead.values * far, atol=2e-5)
+    shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 28:55], normals, strict=True)])
+    np.testing.assert_allclose(got[:, 55:], shown / np.pi, atol=2e-5)
 
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
@@ -114,7 +112,7 @@ def test_shaders_read_what_the_volume_has(volume, tmp_path):
 def test_the_shaders_compile(language, outputs, tmp_path):
     if language == "hlsl":
         call = "RWStructuredBuffer<float> o : register(u0);\n[numthreads(1, 1, 1)] void main()\n"
-        text, options = volume_hlsl(outputs) + call, ["-D", "-V", "-e", "main"]
+        text, options = translate(volume_glsl(outputs), "hlsl") + call, ["-D", "-V", "-e", "main"]
         body = f"{{ float v[{outputs}]; float3 p = float3(1.0, 2.0, 3.0); o[0] = wlm_volume_read(p, p, v) + v[0]; }}\n"
     else:
         body = "layout(std430, binding = 7) buffer O { float o[]; };\n"

@@ -7,13 +7,12 @@ import typer
 
 from wlm.cli.console import escape, quiet_warp, show, table
 from wlm.cli.options import Device, ModelFile, ShaderLanguage, output_option, shader_of
-from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from wlm.probe import ProbeModel, Transform
+    from wlm.probe import ProbeModel
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +46,6 @@ def export(
         typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
     ] = None,
     shader: ShaderLanguage = None,
-    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the light for an engine, as files that it takes as they are.
@@ -61,13 +59,12 @@ def export(
     language = shader_of(engine, shader)
     quiet_warp()
     from wlm import probe
-    from wlm.probe.three_grid import CELLS
+    from wlm.probe.engines.lattice import CELLS
     from wlm.system import load
 
-    model = at_time(load(file, "probe"), time)
+    model = load(file, "probe")
     if engine == "raw":
-        given = given_positions(model, original)
-        paths = probe.export(model, output, device=device, position=given, shader=language)
+        paths = probe.export(model, output, device=device, shader=language)
     elif engine in ("three", "unreal"):
         given, size = given_positions(model, original), CELLS if cells is None else cells
         write = probe.export_grid if engine == "three" else probe.export_unreal
@@ -85,18 +82,13 @@ def export(
     show(rows)
 
 
-def given_positions(model: "ProbeModel | Transform", original: Path | None) -> "np.ndarray | None":
-    """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
-    if original is None:
-        return None
-    position = own_positions(model, original)
-    if model.profile.method != "transform":
-        raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
-    return position
+def given_positions(model: "ProbeModel", original: Path | None) -> "np.ndarray | None":
+    """Returns the positions of the model's own probes in another file, or None."""
+    return None if original is None else own_positions(model, original)
 
 
-def own_positions(model: "ProbeModel | Transform", original: Path) -> "np.ndarray":
-    """The positions of the model's own probes in another file."""
+def own_positions(model: "ProbeModel", original: Path) -> "np.ndarray":
+    """Reads the positions of the model's own probes from another file."""
     from wlm.probe import load_positions
 
     position = load_positions(original)

@@ -220,8 +220,6 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model, system = load(path), system_of(path)
-    if hasattr(model, "check_pieces"):
-        model.check_pieces()
     what = f"{_MODELS[system]}: {model.name}"
     if system == "smoke":
         return Finding(path, _MODELS[system], command("info", path))
