@@ -90,7 +90,7 @@ def _probe() -> Subject:
         lambda: probe_sets.synthetic(300, dead=5),
         lambda data, **options: wlm.probe.compress(data, profile, **options),
         lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.probe.export(model, folder),
+        lambda model, data, folder: wlm.export.export(model, folder),
         checkpoint,
     )
 
@@ -104,7 +104,7 @@ def _probe_pca() -> Subject:
         lambda: probe_sets.synthetic(300, dead=5),
         lambda data, **options: wlm.probe.compress(data, "pca", positions=True, **options),
         lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.probe.export(model, folder),
+        lambda model, data, folder: wlm.export.export(model, folder),
     )
 
 

@@ -293,10 +293,10 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", "1,2.5,-3")
     files = list((tmp_path / "out").iterdir())
     assert len(files) == 7 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
-    document = json.loads((tmp_path / "out" / "volume.json").read_text())
+    document = json.loads((tmp_path / "out" / "bundle.json").read_text())
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
     call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
-    assert json.loads((tmp_path / "out" / "volume.json").read_text())["levels"][0]["block"] == 0.5
+    assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
     assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
 
 

@@ -152,13 +152,13 @@ def command(request, tmp_path_factory):
         case "lightmap export":
             lightmaps = small_sets.moving_light(40, 24)
             wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(place / "a.wlm")
-            check = earlier_or_unfinished("weights.json")
+            check = earlier_or_unfinished("bundle.json")
             earlier = exported("lightmap", "lightmap.wlm")
             return Command((*words, place / "a.wlm"), "out", earlier, file_bytes, check, None)
         case "probe export":
             profile = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=30, hidden=16, latent=3)
             wlm.probe.compress(probe_sets.synthetic(300), profile).save(place / "a.wlm")
-            check = earlier_or_unfinished("probe.json")
+            check = earlier_or_unfinished("bundle.json")
             return Command((*words, place / "a.wlm"), "out", exported("probe", "probe.wlm"), file_bytes, check, None)
     raise WlmError(request.param)
 

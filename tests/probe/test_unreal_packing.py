@@ -11,7 +11,7 @@ from builders.probe_models import random_model
 
 import wlm
 from wlm.errors import WlmError
-from wlm.probe import export_unreal
+from wlm.export import export
 from wlm.probe.conventions import from_canonical
 from wlm.probe.engines.lattice import grid_places
 from wlm.probe.engines.unreal import SH_FILES, pack_unreal, unpack_unreal
@@ -124,9 +124,10 @@ def model() -> wlm.probe.ProbeModel:
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 def test_the_shader_reads_the_light(model, tmp_path):
-    paths = export_unreal(model, tmp_path / "out", cells=6)
-    assert [path.name for path in paths] == [*FILES, "WlmProbes.usf", "light.json"]
-    content = json.loads(paths[-1].read_text())
+    paths = export(model, tmp_path / "out", "unreal", cells=6)
+    assert {path.name for path in paths} == {*FILES, "WlmProbes.usf", "light.json", "bundle.json"}
+    paths = [tmp_path / "out" / name for name in (*FILES, "WlmProbes.usf")]
+    content = json.loads((tmp_path / "out" / "light.json").read_text())
     box, count = (np.array(content[field]) for field in ("box", "resolution"))
     assert count[0] == 6 and len(set(count.tolist())) == 3
     centre = grid_places(box, count)
@@ -153,7 +154,7 @@ def test_the_shader_reads_the_light(model, tmp_path):
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
 def test_the_shader_compiles(model, tmp_path):
-    export_unreal(model, tmp_path, cells=2)
+    export(model, tmp_path, "unreal", cells=2)
     names = ("Ambient", *(f"Sh{number}" for number in range(6)))
     declared = "".join(f"Texture3D {name} : register(t{number});\n" for number, name in enumerate(names))
     call = f"o[0] = WlmProbeDiffuse({', '.join(names)}, S, float3(1, 2, 3), float3(0, 1, 0));"
@@ -167,7 +168,7 @@ def test_the_shader_compiles(model, tmp_path):
 
 def test_it_is_read_as_probes(model, tmp_path):
     """Of three channels and nine coefficients each in its place, in the lattice's order."""
-    export_unreal(model, tmp_path / "out", cells=6)
+    export(model, tmp_path / "out", "unreal", cells=6)
     path = tmp_path / "out" / "light.json"
     probes = wlm.probe.load(path)
     content = json.loads(path.read_text())
@@ -204,7 +205,7 @@ def test_it_is_read_as_probes(model, tmp_path):
     ],
 )
 def test_a_damaged_export_is_one_line(model, tmp_path, name, change, message):
-    export_unreal(model, tmp_path, cells=6)
+    export(model, tmp_path, "unreal", cells=6)
     path = tmp_path / name
     if change is None:
         path.unlink()
@@ -225,5 +226,5 @@ def test_what_is_refused(model, tmp_path):
         (bright, {}, "expected light within 64512"),
     ]:
         with pytest.raises(WlmError, match=message):
-            export_unreal(made, tmp_path / "out", **settings)
+            export(made, tmp_path / "out", "unreal", **settings)
     assert not (tmp_path / "out").exists()

@@ -1,19 +1,20 @@
 """A volume's export: buffers that hold what is read, and shaders that read it, compiled and run as C++."""
 
-import json
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from builders.exported import read_export
 
 from wlm.errors import WlmError
-from wlm.probe.exporter import export_volume
+from wlm.export import export
+from wlm.export.shading import translate
 from wlm.probe.sphere import irradiance
+from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.shader import volume_glsl
-from wlm.shading import translate
 
 
 @pytest.fixture(scope="module")
@@ -82,22 +83,20 @@ int main()
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 def test_the_shader_reads_what_the_volume_has(volume, tmp_path):
-    export_volume(volume, tmp_path)
-    document = json.loads((tmp_path / "volume.json").read_text())
-    reference = json.loads((tmp_path / "reference.json").read_text())
-    points = np.array(reference["position"])
-    weight = np.array(reference["weight"])
+    export(volume_bundle(volume), tmp_path)
+    document, arrays = read_export(tmp_path)
+    points, weight = arrays["position"], arrays["weight"]
     assert (weight == 0.0).any() and ((weight > 0.1) & (weight < 0.9)).any() and (weight > 0.999).any()
     normals = np.random.default_rng(1).normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sent = np.concatenate([points - document["viewpoint"], normals], 1).astype("<f4").tobytes()
-    (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / "volume.glsl").read_text() + _MAIN)
+    (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / "probe.glsl").read_text() + _MAIN)
     subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
     out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
     got = np.frombuffer(out, "<f4").reshape(-1, 58)
     np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
     # Divided by a small weight, a rounding of the place counts for more.
-    want = np.array(reference["values"])
+    want = arrays["values"]
     np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
     ahead = volume.read(points, normals)
     far = ahead.weight[:, None]
@@ -129,19 +128,18 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     with pytest.raises(ValueError, match="viewpoint"):
         _ = nothing.viewpoint
     with pytest.raises(WlmError, match="no block"):
-        export_volume(nothing, tmp_path / "none")
+        export(volume_bundle(nothing), tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    paths = export_volume(volume, tmp_path / "out")
-    assert [path.exists() for path in paths] == [True] * 7 and export_volume(volume, tmp_path / "out") == paths
-    document = json.loads(paths[-1].read_text())
-    pages = np.fromfile(tmp_path / "out" / "pages.bin", "<i4").reshape(4, 8, 8, 8)
-    pool = np.fromfile(tmp_path / "out" / "pool.bin", "<f4").reshape(-1, 27)
+    paths = export(volume_bundle(volume), tmp_path / "out")
+    assert [path.exists() for path in paths] == [True] * 8 and export(volume_bundle(volume), tmp_path / "out") == paths
+    document, arrays = read_export(tmp_path / "out")
+    pages, pool = arrays["pages"].reshape(4, 8, 8, 8), arrays["pool"].reshape(-1, 27)
     values, valid = volume.unscroll()
     for level, described in enumerate(document["levels"]):
         place = np.argwhere(valid[level])
         block = place + np.array(described["base"]) - np.array(described["start"], int)
         np.testing.assert_array_equal(pool[pages[level][tuple((block % 8).T)]], values[level][tuple(place.T)])
     assert (pages >= 0).sum() == valid.sum() == len(pool)
-    (tmp_path / "out" / "volume.json").write_text("{}")
+    (tmp_path / "out" / "bundle.json").write_text("{}")
     with pytest.raises(WlmError):
-        export_volume(volume, tmp_path / "out")
+        export(volume_bundle(volume), tmp_path / "out")

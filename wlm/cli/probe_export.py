@@ -58,24 +58,14 @@ def export(
         raise WlmError("--mirror: means nothing without --engine unity")
     language = shader_of(engine, shader)
     quiet_warp()
-    from wlm import probe
-    from wlm.probe.engines.lattice import CELLS
+    from wlm.export import export as export_files
     from wlm.system import load
 
     model = load(file, "probe")
-    if engine == "raw":
-        paths = probe.export(model, output, device=device, shader=language)
-    elif engine in ("three", "unreal"):
-        given, size = given_positions(model, original), CELLS if cells is None else cells
-        write = probe.export_grid if engine == "three" else probe.export_unreal
-        paths = write(model, output, cells=size, position=given, device=device)
-    elif engine == "godot":
-        bake = original if original is not None and original.suffix.lower() == ".lmbake" else None
-        given = None if bake is not None else given_positions(model, original)
-        paths = probe.export_godot(model, output, bake=bake, cells=cells, position=given, device=device)
-    else:
-        given = None if original is None else own_positions(model, original)
-        paths = probe.export_unity(model, output, mirror=mirror, position=given, device=device)
+    given = {name: value for name, value in (("cells", cells), ("mirror", mirror), ("original", original))}
+    given = {name: value for name, value in given.items() if value is not None}
+    engine_or_raw = None if engine == "raw" else engine
+    paths = export_files(model, output, engine_or_raw, shader=language, device=device, **given)
     rows = table(str(output), ["file", "bytes"])
     for path in paths:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")

@@ -98,7 +98,8 @@ def volume(
 ) -> None:
     """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
     quiet_warp()
-    from wlm.probe import export_volume
+    from wlm.export import export
+    from wlm.probe.volume.bundle import volume_bundle
     from wlm.probe.volume.walk import settle
     from wlm.system import load
 
@@ -107,7 +108,7 @@ def volume(
     lit = made.position[made.numbers]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
     rows = table(str(output), ["file", "bytes"])
-    for path in export_volume(made, output):
+    for path in export(volume_bundle(made), output):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 

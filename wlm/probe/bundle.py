@@ -2,9 +2,6 @@
 
 from wlm.bundle import Bundle
 from wlm.probe.model import ProbeModel
-from wlm.probe.volume.bundle import volume_bundle
-
-__all__ = ["bundle", "volume_bundle"]
 
 
 def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:

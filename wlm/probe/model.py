@@ -6,7 +6,7 @@ The method of compression is data: `ProbeModel.content` holds the light, either 
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -14,9 +14,6 @@ from pydantic import ConfigDict, Field
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
-
-if TYPE_CHECKING:
-    from wlm.probe.decode import Decoder
 
 CODES = 65535
 """Largest 16-bit code of a stored coordinate."""
@@ -75,11 +72,11 @@ class Content(ABC):
         """Bytes of the buffers that a GPU holds, those of `wlm.probe.bundle`."""
 
     @abstractmethod
-    def decoder(self, model: "ProbeModel", device: str, **options: Any) -> "Decoder":
+    def decoder(self, model: "ProbeModel", device: str, **options: Any) -> Any:
         """Loads a model with this content onto a device."""
 
     @abstractmethod
-    def bundle(self, model: "ProbeModel", decoder: "Decoder") -> Bundle:
+    def bundle(self, model: "ProbeModel", decoder: Any) -> Bundle:
         """Returns buffers, shader, document and reference of a model with this content."""
 
     @abstractmethod
@@ -137,7 +134,7 @@ class ProbeModel(Model):
         """Whether the probes' positions are stored."""
         return len(self.positions) > 0
 
-    def decoder(self, device: str = "cpu", **options: Any) -> "Decoder":
+    def decoder(self, device: str = "cpu", **options: Any) -> Any:
         """Loads the model onto a device.
 
         Args:
@@ -148,12 +145,6 @@ class ProbeModel(Model):
             WlmError: The device does not exist, or the options do not fit the model.
         """
         return self.content.decoder(self, device, **options)
-
-    def bundle(self, *, device: str = "cpu") -> Bundle:
-        """Returns what a GPU holds of the model; see `wlm.probe.bundle.bundle`."""
-        from wlm.probe.bundle import bundle
-
-        return bundle(self, device=device)
 
     def normalise(self, position: np.ndarray) -> np.ndarray:
         """Converts positions to the normalised frame and clamps them to the probes' box.

@@ -1,6 +1,5 @@
 """Every shader that we export, in every language that runs here, beside what Python decodes."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +11,7 @@ import torch
 from builders.atlas_meshes import charts
 from builders.atlas_models import KINDS, MIXED, WIDE
 from builders.atlas_models import random_model as random_atlas
+from builders.exported import read_export
 from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
@@ -29,10 +29,11 @@ from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_til
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
+from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder as LightmapDecoder
-from wlm.probe.exporter import export_volume
+from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.shader import volume_glsl
@@ -174,9 +175,9 @@ def volume(folder) -> Subject:
     made = Volume(position, StoredLight(random.normal(size=(400, 27))), side=8, budget=40)
     for _ in range(6):
         made.update([4000.3, -29.0, 0.2])
-    export_volume(made, folder)
-    reference, document = (json.loads((folder / f"{name}.json").read_text()) for name in ("reference", "volume"))
-    points = np.array(reference["position"])
+    export(volume_bundle(made), folder)
+    document, arrays = read_export(folder)
+    points = arrays["position"]
     normals = random.normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = made.read(points, normals)
@@ -300,11 +301,7 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("name", "language"),
-    [
-        (name, language)
-        for name in SUBJECTS
-        for language in (*HEADS, "hlsl", "wgsl")
-    ],
+    [(name, language) for name in SUBJECTS for language in (*HEADS, "hlsl", "wgsl")],
 )
 def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     subject = SUBJECTS[name](tmp_path)

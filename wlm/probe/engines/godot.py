@@ -11,20 +11,17 @@ Godot's own takes minutes for 2,000 probes.
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
-from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.godot import lmbake_bytes, relit
 from wlm.probe.conventions import from_canonical
 from wlm.probe.data import load_positions
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
-from wlm.probe.model import ProbeModel
+from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of, positions_of
 
-FORMAT = "wlm-godot-light"
-_VERSION = 1
-INFO_FILE = "light.json"
 BAKE_FILE = "light.lmbake"
 _MOST_CELLS = 64
 _LARGEST = float(np.finfo(np.float32).max)
@@ -43,35 +40,39 @@ _COMPARED = ((0, 1), (1, 2), (0, 2), (0, 2), (1, 2))
 _NEXT = ((1, 3), (-1, 2), (-2, -3), (-4, 4), (-5, -6))
 
 
-def export_godot(
-    model: ProbeModel,
-    directory: str | os.PathLike[str],
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
     *,
-    bake: str | os.PathLike[str] | None = None,
     cells: int | None = None,
-    position: np.ndarray | None = None,
+    original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
-) -> list[Path]:
-    """Writes a model's light as a bake of Godot 4: `light.lmbake`, and `light.json`, which explains it.
+) -> dict[str, Any]:
+    """Writes a model's light as a bake of Godot 4, `light.lmbake`.
 
     Args:
-        model: A model of L2 in RGB.
-        directory: The folder; it is created if it does not exist. A new export replaces an earlier one.
-        bake: The `.lmbake` that was compressed, whose light is replaced. None: a bake of probes at the corners of cubic
-            cells that fill the probes' box, with the decoded light there.
+        bundle: The bundle of a model of L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
         cells: Cells along the longest side of the box, 1 to 64, without a bake; None: 24.
-        position: [N, 3], of the model's own probes, if the method needs them and the file stores none.
+        original: The `.lmbake` that was compressed, whose light is replaced. Otherwise the bake has probes at the
+            corners of cubic cells that fill the probes' box, with the decoded light there; another file that was
+            compressed gives the positions, if the method needs them and the model stores none.
         device: Where the light is decoded.
 
     Returns:
-        The files written, `light.json` last.
+        The entry "about" of the index, and entries that describe the lattice.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range or given with a bake, the bake has
-            other probes, the light exceeds floats, the device does not exist, or the folder cannot be written.
+            other probes, the light exceeds floats, or the device does not exist.
     """
+    model = bundle.model
+    bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
     info: dict[str, object] = {"probes": model.probes}
     if bake is None:
+        position = positions_of(model, original)
         lattice = lattice_of(model, CELLS if cells is None else cells, _MOST_CELLS, position, device)
         points, count = lattice.corners(), lattice.count
         values = _godot(model.name, lattice.light(points))
@@ -94,12 +95,8 @@ def export_godot(
         if not model.has_probes_at(places):
             raise WlmError(f"{bake}: expected the {model.probes} probes of {model.name}, in their order")
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
-    folder = Path(directory)
-    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, {INFO_FILE, BAKE_FILE}.__contains__) as temporary:
-        (temporary / BAKE_FILE).write_bytes(content)
-        document = {"format": FORMAT, "version": _VERSION, "about": _ABOUT, "name": model.name}
-        write_index(temporary / INFO_FILE, document | info)
-    return [folder / BAKE_FILE, folder / INFO_FILE]
+    (folder / BAKE_FILE).write_bytes(content)
+    return {"about": _ABOUT} | info
 
 
 def tetrahedra_of(count: np.ndarray) -> np.ndarray:

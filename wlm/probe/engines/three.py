@@ -14,19 +14,18 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
-from wlm.formats.folder import made_parents, staged, write_index
+from wlm.formats.folder import write_index
 from wlm.formats.ktx2 import read_half_volume, write_ktx2
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import THREE_GRID as FORMAT
-from wlm.probe.engines.lattice import CELLS, NUMBERS, grid_places, lattice_of, read_cells
-from wlm.probe.model import ProbeModel
+from wlm.probe.engines.lattice import CELLS, NUMBERS, grid_places, lattice_of, positions_of, read_cells
 
 _VERSION = 1
 INFO_FILE = "grid.json"
 TEXTURE_FILE = "grid.ktx2"
 LOADER_FILE = "grid.js"
-_FILES = {INFO_FILE, TEXTURE_FILE, LOADER_FILE}
 _PARTS = 7
 _MOST_CELLS = 256
 _ABOUT = (
@@ -64,34 +63,37 @@ export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
 """
 
 
-def export_grid(
-    model: ProbeModel,
-    directory: str | os.PathLike[str],
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
     *,
     cells: int = CELLS,
-    position: np.ndarray | None = None,
+    original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
-) -> list[Path]:
+) -> dict[str, Any]:
     """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
 
     The grid's probes are at the centres of cubic cells that fill the probes' box, with the decoded light there in half
     floats.
 
     Args:
-        model: A model of L2 in RGB.
-        directory: The folder; it is created if it does not exist. A new export replaces an earlier one.
+        bundle: The bundle of a model of L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
         cells: Cells along the longest side of the box, 1 to 256.
-        position: [N, 3], of the model's own probes, if the method needs them and the file stores none.
+        original: The file that was compressed, if the method needs positions and the model stores none.
         device: Where the light is decoded.
 
     Returns:
-        The files written, `grid.json` last.
+        The entry "about" of the index.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, the
-            device does not exist, or the folder cannot be written.
+        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the
+            device does not exist.
     """
-    lattice = lattice_of(model, cells, _MOST_CELLS, position, device)
+    model = bundle.model
+    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
     low, size, count = lattice.low, lattice.size, lattice.count
     box = np.stack([low, low + count * size])
     values = lattice.light(lattice.centres())
@@ -108,17 +110,15 @@ def export_grid(
         "box": box.tolist(),
         "corners": [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()],
     }
-    folder = Path(directory)
-    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
-        depth, height, width, _ = texels.shape
-        write_ktx2(temporary / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
-        (temporary / LOADER_FILE).write_text(_LOADER, encoding="utf-8")
-        write_index(temporary / INFO_FILE, document)
-    return [folder / name for name in (TEXTURE_FILE, LOADER_FILE, INFO_FILE)]
+    depth, height, width, _ = texels.shape
+    write_ktx2(folder / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
+    (folder / LOADER_FILE).write_text(_LOADER, encoding="utf-8")
+    write_index(folder / INFO_FILE, document)
+    return {"about": _ABOUT}
 
 
 def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a grid that `export_grid` wrote.
+    """Reads a grid that `write_kit` wrote.
 
     Args:
         path: Path of `grid.json`.

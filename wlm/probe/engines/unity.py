@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
-from wlm.formats.folder import compact_json, made_parents, rounded, staged
+from wlm.formats.folder import compact_json, rounded
 from wlm.probe.conventions import UNITY_PROBES as FORMAT
 from wlm.probe.conventions import from_canonical
+from wlm.probe.engines.lattice import positions_of
 from wlm.probe.json_fields import fields_of
-from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
 
 _VERSION = 1
@@ -165,32 +166,35 @@ public class WlmLightProbes : MonoBehaviour
 """
 
 
-def export_unity(
-    model: ProbeModel,
-    directory: str | os.PathLike[str],
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
     *,
     mirror: str | None = None,
-    position: np.ndarray | None = None,
+    original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
-) -> list[Path]:
+) -> dict[str, Any]:
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
     Args:
-        model: A model of L0, L1 or L2 in RGB.
-        directory: The folder; it is created if it does not exist. A new export replaces an earlier one.
+        bundle: The bundle of a model of L0, L1 or L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
         mirror: Axis to mirror, "x", "y" or "z". Unity is left-handed: importers mirror a glTF scene along x or along z;
             a scene that came from Unity needs no mirroring.
-        position: [N, 3], of the model's own probes; None: those stored with the model.
+        original: The file that was compressed, for its positions; None: those stored with the model.
         device: Where the light is decoded.
 
     Returns:
-        The files written, `probes.json` last.
+        The entry "about" of the index.
 
     Raises:
         WlmError: The numbers are not spherical harmonics of up to L2, there are more than 131,072 probes, the axis does
-            not exist, the positions are unknown or of other probes, a number exceeds floats, the device does not exist,
-            or the folder cannot be written.
+            not exist, the positions are unknown or of other probes, a number exceeds floats, or the device does not
+            exist.
     """
+    model, position = bundle.model, positions_of(bundle.model, original)
     coefficients = sh_count(model.outputs)
     if coefficients is None or coefficients > _L2:
         raise WlmError(f"{model.name}: expected L0, L1 or L2 in RGB, got {model.outputs} numbers a probe")
@@ -216,15 +220,13 @@ def export_unity(
         # [N, C, 3] to channel after channel.
         "sh": rounded(light.astype(np.float32).swapaxes(1, 2).reshape(-1)),
     }
-    folder = Path(directory)
-    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, {INFO_FILE, SCRIPT_FILE}.__contains__) as temporary:
-        (temporary / SCRIPT_FILE).write_text(_SCRIPT, encoding="utf-8")
-        (temporary / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
-    return [folder / SCRIPT_FILE, folder / INFO_FILE]
+    (folder / SCRIPT_FILE).write_text(_SCRIPT, encoding="utf-8")
+    (folder / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
+    return {"about": _ABOUT}
 
 
 def read_unity(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads probes that `export_unity` wrote.
+    """Reads probes that `write_kit` wrote.
 
     Args:
         path: Path of `probes.json`.

@@ -13,21 +13,20 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.dds import read_word_volume, write_dds
-from wlm.formats.folder import made_parents, staged, write_index
+from wlm.formats.folder import write_index
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import UNREAL_LIGHT as FORMAT
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import CELLS, grid_places, lattice_of, read_cells
-from wlm.probe.model import ProbeModel
+from wlm.probe.engines.lattice import CELLS, grid_places, lattice_of, positions_of, read_cells
 
 _VERSION = 1
 INFO_FILE = "light.json"
 AMBIENT_FILE = "ambient.dds"
 SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
 SHADER_FILE = "WlmProbes.usf"
-_FILES = {INFO_FILE, AMBIENT_FILE, SHADER_FILE, *SH_FILES}
 _MOST_CELLS = 128
 _BANDS = 3
 _ROWS = 65536  # probes unpacked at a time
@@ -110,34 +109,37 @@ float3 WlmProbeDiffuse(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3
 """
 
 
-def export_unreal(
-    model: ProbeModel,
-    directory: str | os.PathLike[str],
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
     *,
     cells: int = CELLS,
-    position: np.ndarray | None = None,
+    original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
-) -> list[Path]:
+) -> dict[str, Any]:
     """Writes a model's light as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
 
     Probes are at the centres of cubic cells that fill the probes' box. A coefficient beyond the bound of non-negative
     light is clamped, and a negative ambient colour becomes 0.
 
     Args:
-        model: A model of L2 in RGB.
-        directory: The folder; it is created if it does not exist. A new export replaces an earlier one.
+        bundle: The bundle of a model of L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
         cells: Cells along the longest side of the box, 1 to 128.
-        position: [N, 3], of the model's own probes, if the method needs them and the file stores none.
+        original: The file that was compressed, if the method needs positions and the model stores none.
         device: Where the light is decoded.
 
     Returns:
-        The files written, `light.json` last.
+        The entry "about" of the index.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds 11-bit floats, the
-            device does not exist, or the folder cannot be written.
+        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds 11-bit floats, or
+            the device does not exist.
     """
-    lattice = lattice_of(model, cells, _MOST_CELLS, position, device)
+    model = bundle.model
+    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
     corner, size = lattice.low, lattice.count * lattice.size
     sh = from_canonical(lattice.light(lattice.centres()).reshape(-1, 9, 3).astype(np.float64), "unreal")
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
@@ -160,17 +162,15 @@ def export_unreal(
         "box": [corner.tolist(), (corner + size).tolist()],
         "resolution": lattice.count.tolist(),
     }
-    folder = Path(directory)
-    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _FILES.__contains__) as temporary:
-        for name, (fmt, texels) in textures.items():
-            write_dds(temporary / name, texels.tobytes(), width, height, depth, fmt, volume=True)
-        (temporary / SHADER_FILE).write_text(text, encoding="utf-8")
-        write_index(temporary / INFO_FILE, document)
-    return [folder / name for name in (*textures, SHADER_FILE, INFO_FILE)]
+    for name, (fmt, texels) in textures.items():
+        write_dds(folder / name, texels.tobytes(), width, height, depth, fmt, volume=True)
+    (folder / SHADER_FILE).write_text(text, encoding="utf-8")
+    write_index(folder / INFO_FILE, document)
+    return {"about": _ABOUT}
 
 
 def read_unreal(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the textures that `export_unreal` wrote, as probes at the centres of the cells.
+    """Reads the textures that `write_kit` wrote, as probes at the centres of the cells.
 
     Args:
         path: Path of `light.json`.

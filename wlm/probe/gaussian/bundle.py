@@ -113,7 +113,6 @@ def _document(model: ProbeModel, content: Gaussians) -> dict[str, Any]:
     scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)
     return {
         "about": _ABOUT,
-        "name": model.name,
         "source": model.source,
         "method": model.method,
         "probes": model.probes,

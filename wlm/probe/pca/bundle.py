@@ -127,7 +127,6 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     words += [halves.reshape(-1).view("<u4"), codes.view("<u4")]
     document = {
         "about": _ABOUT,
-        "name": model.name,
         "source": model.source,
         "method": model.method,
         "probes": model.probes,
