@@ -145,9 +145,9 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     assert "worst:" in call.stderr and said == report.warnings
 
 
-def test_evaluate_against_another_set(fitted, tmp_path):
-    probes = synthetic(PROBES, seed=3, dead=DEAD)
-    save_probes(tmp_path / "a.npz", probes.position, probes.values)
+def test_evaluate_against_another_set(room, fitted, tmp_path):
+    probes = data.load(room)
+    save_probes(tmp_path / "a.npz", probes.position, 2 * probes.values)
     call("probe", "evaluate", fitted, tmp_path / "a.npz")
     assert f"warning: {tmp_path / 'a.npz'}: not what {fitted} was made of" in call.stderr
     save_probes(tmp_path / "b.npz", probes.position[1:], probes.values[1:])
