@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 import warp as wp
-from wlm_kernels.lightmap.video import VIDEO
 
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
-from wlm_kernels.lightmap.frames import FRAMES
+from wlm_kernels.lightmap.frames import KERNELS as FRAMES
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
@@ -137,10 +136,9 @@ def test_matrix_decode(hidden: int, shared: bool, tmp_path: Path):
     _compile_all(vars(matrix_decode.matrix_kernels(hidden, shared)).values(), tmp_path)
 
 
-@pytest.mark.parametrize("kernels", [FRAMES, VIDEO], ids=["frames", "video"])
-def test_images(kernels: object, tmp_path: Path):
-    """Decoding what is stored as an image at each time."""
-    _compile_all(vars(kernels).values(), tmp_path)
+def test_frames(tmp_path: Path):
+    """Decoding tiles that are stored as an image for each time."""
+    _compile_all(FRAMES, tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
