@@ -137,7 +137,7 @@ def test_a_frame_of_another_length_is_one_line(tmp_path, size):
 
 def test_endpoints_beyond_7_bits_are_one_line(tmp_path):
     sheet = random_model((3, 2, 1, 0)).sheets[LIGHT]
-    content = bytearray(encoding_of(3).pack(sheet, 0))
+    content = bytearray(b"".join(encoding_of(3).pack(sheet, 0)))
     content[1] = 128
     assert "part tiles: tile 0: expected endpoints of 7 bits" in _changed(tmp_path, **_first_frame(bytes(content)))
 
@@ -161,7 +161,7 @@ def test_each_tile_is_read_alone(tmp_path):
     start = sum(sizes[:2])
     frame = tensors["0.tiles"][start : start + sizes[2]].tobytes()
     data = zstd.decompress(frame, encoding_of(4).packed_size(sheet, 2), "tile 2")
-    assert data == encoding_of(4).pack(sheet, 2)
+    assert data == b"".join(encoding_of(4).pack(sheet, 2))
     assert tile_sizes(sheet).tolist() == [*sizes, 0]
 
 

@@ -62,13 +62,6 @@ PICTURE_BYTES = 256 << 20
 IMAGE_BYTES = 2 << 30
 """Of a PNG or TGA: 16384 x 16384 texels of 8 bytes."""
 
-VIDEO_GROWTH = 4096
-"""Bytes of a video's pictures, 6 for a texel, that a byte of it may become: 0.012 bits a texel. One that stands still
-takes less."""
-
-VIDEO_BYTES = 256 << 20
-"""The same of one however small it is."""
-
 TIMES = 100_000
 """Lightmaps of a set."""
 

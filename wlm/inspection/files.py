@@ -39,10 +39,8 @@ _PROBE_EXPORTS = {
 _EXPORTS = _PROBE_EXPORTS | {
     "wlm-atlas": ATLAS,
     "wlm-bake": BAKED,
-    "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
-    "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",
     "wlm-godot-light": "light probes for Godot",

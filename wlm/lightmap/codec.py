@@ -195,7 +195,7 @@ def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
     """Packs each tile as one zstd frame: `tiles`, uint8, and `tile_sizes`, uint32 [n]."""
 
     def pack(number: int) -> bytes:
-        return zstd.compress(encoding_of(sheet.kind[number]).pack(sheet, number))
+        return zstd.compress(*encoding_of(sheet.kind[number]).pack(sheet, number))
 
     frames = list(each(pack, _packed_tiles(sheet)))
     if not frames:
