@@ -9,7 +9,6 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import OpenEXR
-import torch
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_models, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
@@ -17,17 +16,15 @@ from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from benchmarks import Row, write_json
+from wlm.export import export
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
-from wlm.probe.three_grid import export_grid
-from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
+from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.flipbook.shots import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
-from wlm.smoke.network.pool import Pool, save_pool
-from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
@@ -172,10 +169,10 @@ def _probe_files(folder: Path) -> None:
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
     with tempfile.TemporaryDirectory() as grid:
-        export_grid(probe_models.random_model(count=3), Path(grid) / "out", cells=2)
+        export(probe_models.random_model(count=3), Path(grid) / "out", "three", cells=2)
         for name in ("grid.json", "grid.ktx2"):
             (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
-        export_unreal(probe_models.random_model(count=3), Path(grid) / "unreal", cells=2)
+        export(probe_models.random_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
         for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
             (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)
@@ -199,9 +196,6 @@ def _smoke(folder: Path) -> None:
     six = bake_smoke(plume, smoke_plumes.facing(plume, size=12), estimate=False)
     looks = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE]}).looks(1)
     write_six_way(folder / "six-way.exr", with_surface(six, plume, looks), looks)
-    guides, targets = (torch.linspace(0, 1, 2 * planes * 16).reshape(1, 2, planes, 4, 4).half() for planes in (3, 8))
-    pool = Pool(guides, targets, torch.zeros(1, 2, 4, 4).half(), torch.zeros(1, dtype=torch.int64))
-    save_pool(folder / "pool.safetensors", pool, DatasetSettings(), "seed-0")
     scene = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE], "frames": 1})
     open_frames(folder / "frames", scene)
     (folder / "frames" / "scene.json").rename(folder / "scene.json")

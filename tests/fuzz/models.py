@@ -16,16 +16,12 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
-from wlm.probe.day import DayModel
-from wlm.probe.regions import RegionModel
-from wlm.probe.transform import Transform
 from wlm.smoke.march.motion import read_velocity, write_velocity
-from wlm.smoke.network.pool import load_pool
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
 
 from .containers import vary_artifact, vary_compact, vary_npz
-from .reader import Reader, check_digest, check_finite, corpus, stored
+from .reader import Reader, check_digest, check_finite, stored
 
 
 def _lightmap(path: Path) -> None:
@@ -42,20 +38,11 @@ def _lightmap(path: Path) -> None:
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
-    if isinstance(model, RegionModel):
-        # Its pieces are looked at when they are asked for, and errors have the name alone.
-        with suppress(WlmError):
-            check_finite(values=model.decoder().decode_probes())
+    check_finite(origin=model.origin, extent=model.extent, size=model.size)
+    if model.method == "pca":
+        check_finite(values=model.decoder().decode_probes())
         return
-    if isinstance(model, Transform):
-        if model.has_positions:
-            values = model.decoder().decode_probes()
-            check_finite(values=values, position=model.stored_positions())
-            assert values.shape == (model.probes, model.outputs), "decodes to another size"
-            if isinstance(model, DayModel):
-                check_finite(**{f"hour{time}": model.at(time + 0.5).stored_values for time in model.times})
-        return
-    check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
+    check_finite(bounds=model.content.bounds, net=model.content.net, gain=model.content.gain)
     places = np.linspace(0.0, 1.0, 8)[:, None]
     with np.errstate(over="ignore"):
         position = model.origin + model.extent * model.size * places
@@ -117,15 +104,6 @@ def _velocity(path: Path) -> None:
     velocity = read_velocity(path)
     check_finite(velocity=velocity)
     assert velocity.ndim == 4 and velocity.shape[3] == 3, f"accepted {velocity.shape}"
-
-
-def _pool(path: Path) -> None:
-    pool = load_pool(path)
-    check_digest(path)
-    parts = {"guides": pool.guides, "targets": pool.targets, "motion": pool.motion}
-    check_finite(**parts)
-    assert all(part.dtype == torch.half for part in parts.values()), "accepted parts that aren't half floats"
-    assert pool.sequence.dtype == torch.int64, "accepted sequences that aren't 64-bit"
 
 
 # Checkpoints: a fit goes on from each, to its end.
@@ -196,7 +174,7 @@ def _lightmap_checkpoint(path: Path) -> None:
 def _probe_fit() -> tuple[Any, Any]:
     from builders.probe_sets import synthetic
 
-    return synthetic(60), wlm.probe.Profile(name="tiny", ratio=0.1, steps=10, hidden=16, latent=3)
+    return synthetic(60), wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=10, hidden=16, latent=3)
 
 
 @functools.cache
@@ -310,11 +288,10 @@ READERS = (
         vary_artifact,
         _lightmap,
     ),
-    Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
     Reader(
-        "probe-compact",
+        "probe",
         "a.wlm",
-        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm", "probe-packed.wlm"),
+        stored("probe.wlm", "probe-pca.wlm"),
         vary_compact,
         _probe,
     ),
@@ -335,7 +312,6 @@ READERS = (
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-velocity", "a.npz", _velocities, vary_npz, _velocity),
-    Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),
     Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
     Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),
     Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),

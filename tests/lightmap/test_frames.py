@@ -206,7 +206,7 @@ def test_the_command_says_that_the_encoder_is_missing(monkeypatch, tmp_path):
     write_set(tmp_path / "set", moving_light(24, 40, hours=(6.0,)))
     profile = tiny_profile(frames="auto", steps=10).model_dump(mode="json")
     (tmp_path / "tiny.yaml").write_text(json.dumps(profile))
-    command = ["lightmap", "compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
+    command = ["compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
     for missing, kind in ((False, "frames"), (True, "static")):
         if missing:
             monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
