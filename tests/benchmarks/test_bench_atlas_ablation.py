@@ -82,9 +82,9 @@ def test_what_is_refused(lightmaps):
         run(lightmaps, "paper", ["lut_scale 0.7"], quick=True, device="cpu")
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
+def test_the_command(given_rows, tmp_path, monkeypatch):
     words = ["atlas-ablation", "--quick", "--profile", "cascade", "--only", "ASTC", "--steps", "9"]
-    command, (lightmaps, *names), options = check_command(monkeypatch, bench, rows[:5], words, tmp_path)
+    command, (lightmaps, *names), options = check_command(monkeypatch, bench, given_rows[:5], words, tmp_path)
     assert command == "python -m benchmarks atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC"
     assert [lightmap.scene for lightmap in lightmaps] == ["room"] and names == ["cascade", ["ASTC"]]
     assert options["quick"] and options["steps"] == 9

@@ -100,9 +100,9 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS)
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
+def test_the_command(given_rows, tmp_path, monkeypatch):
     words = ["lightmap", "--device", "cpu", "--set", tmp_path / "city"]
-    command, _, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    command, _, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
     assert command == "python -m benchmarks lightmap --device cpu --set three"
     assert options["set_path"] == tmp_path / "city" and not options["quick"]
 

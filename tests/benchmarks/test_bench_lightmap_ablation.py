@@ -98,11 +98,11 @@ def test_names_are_checked_before_a_set_is_read(tmp_path):
         bench.run(["none"], quick=True, device="cpu", set_path=tmp_path / "none")
 
 
-def test_the_command(made, monkeypatch, tmp_path):
+def test_the_command(given_rows, monkeypatch, tmp_path):
     from benchmarks.app import app
 
     words = ["lightmap-ablation", "--quick", "--set", tmp_path / "city", "--steps", "20", "--only", "3D alone"]
-    command, arguments, options = check_command(monkeypatch, bench, made[0], words, tmp_path)
+    command, arguments, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
     expected = "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'"
     assert command == f"python -m benchmarks {expected}"
     assert arguments == (["3D alone"],) and options["set_path"] == tmp_path / "city" and options["steps"] == 20
