@@ -132,7 +132,7 @@ def probe(
     elif rivals_at is not None:
         if quick or not rivals or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
-        rows, options = run_rivals(rivals_at, **common), {"rivals_at": rivals_at}
+        rows, options = run_rivals(**common), {"rivals_at": rivals_at}
     else:
         rows = run(quick=quick, device=device, rivals=rivals, **common)
     _finish(rows, device, json_path, "probe", partial=volume_only, **options, probes=probes_path, key=keys)
@@ -269,7 +269,7 @@ def smoke_network(
 
 @app.command("smoke-ablation")
 def smoke_ablation(
-    profile: Annotated[str, typer.Option(metavar="NAME", help="The profile or YAML file to vary.")] = "24",
+    profile: Annotated[str, typer.Option(metavar="NAME", help="The profile or YAML file to vary.")] = "fast",
     quick: Annotated[bool, typer.Option("--quick", help="Use small images and few steps, for a CPU.")] = False,
     device: Device = "cpu",
     rounds: Annotated[int | None, typer.Option(min=1, help="Rounds of each training, with new samples.")] = None,

@@ -181,8 +181,8 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     assert {row.method for row in plotted(rows)} == {"guide", "six ways"}
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
-    command, _, options = check_command(monkeypatch, bench, rows, ["smoke", "--quick"], tmp_path)
+def test_the_command(given_rows, tmp_path, monkeypatch):
+    command, _, options = check_command(monkeypatch, bench, given_rows, ["smoke", "--quick"], tmp_path)
     assert command == "python -m benchmarks smoke --quick --device cpu" and options["quick"]
 
 
