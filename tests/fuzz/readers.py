@@ -30,7 +30,7 @@ from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
-from wlm.formats.obj import read_obj
+from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.probe.unreal import AMBIENT_FILE, SH_FILES
@@ -131,7 +131,7 @@ def _mesh(path: Path) -> None:
 
 
 def _obj(path: Path) -> None:
-    mesh = read_obj(path)
+    mesh = read_mesh(path)
     assert not len(mesh.triangle) or mesh.triangle.max() < len(mesh.position), "a corner beyond the vertices"
     _lit(path)
 

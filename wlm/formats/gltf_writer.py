@@ -56,7 +56,29 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Writes a document as `.glb` with some primitives replaced and all else as it was, whole or not at all.
+    """Writes `encode_glb` to a file, whole or not at all.
+
+    Args:
+        path: The file to write; its folder must exist.
+        document, replacements, uv_set: As for `encode_glb`.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        ValueError: As for `encode_glb`.
+        WlmError: As for `encode_glb`, or the file can't be written.
+    """
+    return atomic_write(path, encode_glb(document, replacements, uv_set, path))
+
+
+def encode_glb(
+    document: GltfDocument,
+    replacements: Sequence[Replacement] = (),
+    uv_set: int = 1,
+    path: str | os.PathLike[str] | None = None,
+) -> list[bytes]:
+    """Encodes a document as `.glb` with some primitives replaced and all else as it was.
 
     Attributes and morph targets keep their encoding. Where a primitive lacks sets below `uv_set`, which glTF wants in
     a row, they are given the new UVs too. Data that nothing uses any more is left out, unless the file has an
@@ -64,18 +86,18 @@ def write_glb(
     (CESIUM_primitive_outline, EXT_mesh_primitive_edge_visibility) are dropped.
 
     Args:
-        path: The file to write; its folder must exist.
         document: As it was read.
         replacements: At most one for each of its primitives.
         uv_set: n of the new `TEXCOORD_n`, the same for all of them.
+        path: The file that is written, for messages; None: the document's own.
 
     Returns:
-        The number of bytes written.
+        The bytes of the file, in pieces.
 
     Raises:
         ValueError: A primitive replaced twice or with that set already, a shape that is wrong or a number out of range.
-        WlmError: What isn't drawn, and so wasn't checked when it was read, is malformed; the file can't be written,
-            or would be beyond the 4 GiB that the format allows.
+        WlmError: What isn't drawn, and so wasn't checked when it was read, is malformed; or the file would be beyond
+            the 4 GiB that the format allows.
     """
     for each in replacements:
         _check(each, uv_set)
@@ -91,7 +113,7 @@ def write_glb(
                     tree.replace(primitives[each.primitive.primitive], each, uv_set)
         tree.embed_images()
         tree.drop_unused()
-    return atomic_write(path, _pack(path, tree.content, tree.payloads))
+    return _pack(document.path if path is None else path, tree.content, tree.payloads)
 
 
 class _Tree:

@@ -23,8 +23,8 @@ JSON_BYTES = 512 << 20
 BAKE_BYTES = 1 << 30
 """Of a Godot bake: a probe has 156 bytes, and its tetrahedra and BSP tree some hundred."""
 
-OBJ_BYTES = 2 << 30
-"""Of an OBJ: ten million vertices have about 1.5 GB."""
+MODEL_BYTES = 2 << 30
+"""Of an OBJ, PLY, STL or OFF file: ten million vertices of an OBJ have about 1.5 GB."""
 
 MESH_BYTES = (4 << 30) - 1
 """Of a `.glb`, whose format allows no more, and of a buffer or an image beside a glTF file."""

@@ -2,8 +2,8 @@
 
 The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
 B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 it is the lightmap itself.
-Tiles share no sample, so each is a small weighted least squares problem of its own, solved for every size, and its
-error is that of the samples as they are stored. The sizes are then allocated within a budget, `wlm.atlas.layout`.
+Tiles share no sample, so each is a small weighted least squares problem, solved for every size. The error of a tile is
+that of its samples after they are stored. The sizes are then allocated within a budget, `wlm.atlas.tiles.layout`.
 
 This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get samples and evenly lit walls next
 to none, within a triangle too, which that paper names as its limit (section 5.1).
@@ -18,10 +18,20 @@ import torch
 
 from wlm import interop
 from wlm.atlas import colour
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.layout import Layout, Size, composed, layout, sizes_of
-from wlm.atlas.model import BLOCKS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tail_bits, tile_counts
+from wlm.atlas.data import LightmappedScene, Sheet
+from wlm.atlas.model import (
+    BLOCKS,
+    LUT_BITS,
+    SOURCE_BITS,
+    TEXELS,
+    AtlasModel,
+    Profile,
+    SheetPlace,
+    tail_bits,
+    tile_counts,
+)
 from wlm.atlas.stages import Stages
+from wlm.atlas.tiles.layout import Layout, Size, composed, layout, sizes_of
 from wlm.atlas.weights import FineGrid, weights
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part, check_parts
@@ -30,15 +40,15 @@ from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import solve as kernels
 
 SUPERSAMPLING = 2
-"""Points per texel and axis that a tile is fitted to."""
+"""Points per texel and axis at which a tile is fitted."""
 
 _AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles
-_SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # of the second of two texels, at a point
-# Rounds of conjugate gradients, from the unweighted solution: of curves, of those of blocks, and of what is stored.
+_SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # weight of the second texel at a point
+# Rounds of conjugate gradients from the unweighted solution: for curves, for curves of blocks, and for stored samples.
 _ROUGH, _MEDIUM, _FINE = 3, 10, 24
-# A sample that reaches no point with a weight stays near the unweighted solution.
+# Ridge regularisation: a sample that reaches no point with a weight stays near the unweighted solution.
 _RIDGE = 1e-4
-# A bit must save this fraction of the squared range, of one texel of the lightmap: half float's rounding there.
+# The fraction of the squared range of one texel that a bit must save: half float's rounding there.
 _LEAST_GAIN = 2.0**-24 / 48
 
 
@@ -59,12 +69,15 @@ class Tiles:
     size: int
 
 
-def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> AtlasModel | None:
+def fit_tiles(
+    scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
+) -> AtlasModel | None:
     """Compresses a lightmap to tiles.
 
     Args:
-        grid: The mesh, with its lightmap, and the device.
-        profile: `budget`, `colour`, `tile` and the settings of `weights`.
+        scene: A scene of one sheet and one state.
+        grid: The fine grid of its sheet.
+        profile: `budget`, `colour`, `tile`, `mips` and the settings of `weights`.
         seed: Seed of the random views.
         stages: Reports and times the stages.
 
@@ -74,10 +87,10 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     Raises:
         WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
     """
-    mesh = grid.mesh
+    (sheet,) = scene.sheets
     with stages("weights"):
-        tiles = cut(mesh.filled, weights(grid, profile, seed), profile.tile, grid.device)
-    height, width = mesh.mask.shape
+        tiles = cut(sheet.lightmap, weights(scene, grid, profile, seed), profile.tile, grid.device)
+    height, width = sheet.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
     if profile.mips:
@@ -89,17 +102,17 @@ def fit_tiles(grid: FineGrid, profile: Profile, seed: int, stages: Stages) -> At
     with stages("curves"):
         error = curves(tiles, sizes, stages.progress, stages.checkpoint)
     with stages("allocate"):
-        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(mesh))
+        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(sheet))
         if packed is None:
             return None
     with stages("solve"):
         samples = solved(tiles, sizes, packed.chosen)
     with stages("write"):
-        return composed_model(mesh, profile, samples, sizes, packed, tiles.index.cpu().numpy(), grid.device)
+        return composed_model(scene, profile, samples, sizes, packed, tiles.index.cpu().numpy(), grid.device)
 
 
 def composed_model(
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     profile: Profile,
     samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
     sizes: list[Size],
@@ -107,25 +120,26 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """The model of tiles whose samples are solved for.
+    """Makes the model of tiles whose samples are solved for.
 
     Args:
-        mesh: The mesh, whose lightmap was cut.
+        scene: The scene whose lightmap was cut.
         profile: `colour` and `tile`.
         samples: `solved`.
-        sizes: The sizes that there are.
+        sizes: The sizes that a tile may have.
         packed: The tiles' sizes and places.
         index: int64 [T], `Tiles.index`.
         device: "cpu" or "cuda:N", where blocks are encoded.
     """
-    height, width = mesh.mask.shape
-    counts = tile_counts(height, width, profile.tile)
+    size = scene.sheets[0].mask.shape
+    counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
     mixed = profile.colour == "mixed"
     textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], device)
     if mixed:
         blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], device)
         textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
+    textures = {name: texture[None] for name, texture in textures.items()}
     chosen = [sizes[number] for number in packed.chosen]
     report = {
         "tiles": len(index),
@@ -135,13 +149,14 @@ def composed_model(
     }
     if mixed:
         report["tiles of blocks"] = sum(size.second for size in chosen)
-    settings = (mesh.name, mesh.source, profile, "tiles", profile.colour, height, width)
+    place = SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts)
+    settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, (place,))
     return AtlasModel(*settings, **textures, lut=lut, report=report)
 
 
-def least_gain(mesh: LightmappedMesh) -> float:
+def least_gain(sheet: Sheet) -> float:
     """The error that a bit must save to be allocated."""
-    return float(np.ptp(mesh.filled[mesh.mask])) ** 2 * _LEAST_GAIN / mesh.mask.size
+    return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
 
 
 def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
@@ -164,7 +179,7 @@ def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device:
 
 
 def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """The tiles that have a weight.
+    """Selects the tiles that have a weight.
 
     Args:
         weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
@@ -182,7 +197,7 @@ def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tenso
 
 
 def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -> torch.Tensor:
-    """The texels [T, B + 1, B + 1, ...] of tiles of an image [H, W, ...], its last texels repeated beyond it."""
+    """Cuts the texels [T, B + 1, B + 1, ...] of tiles out of an image [H, W, ...]; beyond it its last texels repeat."""
     step = torch.arange(size + 1, device=image.device)
     row = ((index // columns)[:, None] * size + step).clamp(max=image.shape[0] - 1)
     column = ((index % columns)[:, None] * size + step).clamp(max=image.shape[1] - 1)
@@ -190,7 +205,7 @@ def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -
 
 
 def tile_light(patch: torch.Tensor) -> torch.Tensor:
-    """Light at the points of tiles, `Tiles.light`, of their texels [T, B + 1, B + 1, 3]."""
+    """Computes the light at the points of tiles, `Tiles.light`, from their texels [T, B + 1, B + 1, 3]."""
     near, far = patch[:, :-1], patch[:, 1:]
     down = torch.stack([near + share * (far - near) for share in _SHARES], 2).flatten(1, 2)
     near, far = down[:, :, :-1], down[:, :, 1:]
@@ -199,8 +214,8 @@ def tile_light(patch: torch.Tensor) -> torch.Tensor:
 
 
 def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
-    """Weights [2 H, N] at the points of tiles along the first axis; those beyond the outermost texel centres go to
-    these centres."""
+    """Folds weights [2 H, N] to the points of tiles along the first axis; weights beyond the outermost texel centres
+    are added to those of the centres."""
     padded = weight.new_zeros((points, weight.shape[1]))
     inner = weight[1:-1]
     padded[: len(inner)] = inner
@@ -210,7 +225,7 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
 
 
 def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
-    """float [points, samples], weights of linear interpolation from samples to points along an axis of a tile."""
+    """Weights of linear interpolation from samples to points along an axis of a tile, float [points, samples]."""
     place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0)).long()
     result = torch.zeros((points, samples), device=device)
@@ -224,12 +239,12 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Solves for the samples of least weighted squared error, at one size for all tiles.
 
-    Conjugate gradients on the normal equations from the solution with equal weights, each channel of a tile for itself.
+    Conjugate gradients on the normal equations, from the solution with equal weights, for each channel of a tile.
 
     Args:
         tiles: T of them.
         nx, ny: Samples along x and y.
-        rounds: Of conjugate gradients, at most.
+        rounds: Rounds of conjugate gradients, at most.
 
     Returns:
         float [T, ny, nx, 3].
@@ -245,7 +260,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
         kernels.gather_system(weight, scale, grid, system)
         start = space(3, nx * ny)
         kernels.gather(light, grid, interop.to_warp(start))
-        # Of equal weights the equations fall apart into those of the axes.
+        # With equal weights the equations separate into those of the axes.
         across, down = (_axis(samples, grid.points, str(start.device))[2] for samples in (nx, ny))
         start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
         *work, out = (space(3, nx * ny) for _ in range(4))
@@ -258,7 +273,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
 
 
 def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
-    """nx x ny samples of tiles, for kernels."""
+    """Describes nx x ny samples of tiles for kernels."""
     grid = kernels.Grid()
     grid.points, grid.nx, grid.ny = SUPERSAMPLING * tiles.size, nx, ny
     axes = [_axis(samples, grid.points, str(tiles.light.device)) for samples in (nx, ny)]
@@ -269,14 +284,14 @@ def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
 
 
 def _laid_out(values: torch.Tensor) -> torch.Tensor:
-    """Values [T, ...] with tiles last in the memory of a GPU, whose threads read one place of many tiles at once."""
+    """Lays out values [T, ...]; on a GPU tiles come last, since its threads read one place of many tiles at once."""
     if values.device.type == "cpu":
         return values.contiguous()
     return values.movedim(0, -1).contiguous().movedim(-1, 0)
 
 
 def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
-    """float [T, ...], `_laid_out`."""
+    """Allocates float [T, ...] in the layout of `_laid_out`."""
     count, device = len(tiles.index), tiles.light.device
     if device.type == "cpu":
         return torch.empty((count, *shape))
@@ -285,8 +300,8 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Along an axis: the sample before each point, the share of the next one, and the inverse of the products of
-    interpolation's columns; on GPUs that would take longer than all else."""
+    """Interpolation along an axis: the sample before each point, the weight of the next one, and the inverse of the
+    interpolation matrix's Gram matrix, which would dominate the time if a GPU computed it each time."""
     matrix = linear(samples, points)
     place = (torch.arange(points) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0))
@@ -312,7 +327,7 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
 
 
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
-    """How much each sample's own squared error counts, float [T, ny, nx]."""
+    """The weight of each sample's squared error, float [T, ny, nx]."""
     points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
     down, across = (linear(count, points, device).square() for count in (ny, nx))
     return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
@@ -324,13 +339,13 @@ def curves(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
-    """The error of every tile at every size, float64 [sizes, T].
+    """Computes the error of every tile at every size, float64 [sizes, T].
 
     Args:
         tiles: T of them.
-        sizes: The sizes; an error is that of the samples as the size's format stores them.
+        sizes: The sizes; an error is that of the samples after the size's format has stored them.
         progress: Called with the sizes done.
-        checkpoint: Where the errors of the sizes done are kept, as batch 0.
+        checkpoint: Keeps the errors of the sizes done, as batch 0.
     """
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
@@ -368,11 +383,11 @@ def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np
     Args:
         tiles: T of them.
         sizes: The sizes.
-        chosen: int [T], each tile's number in them.
+        chosen: int [T], the number of each tile's size.
 
     Returns:
-        For some tiles of one size each: their numbers, int [n], and on the tiles' device samples, float32 [n, ny, nx,
-        3], not negative, and the weights of the samples' squared errors [n, ny, nx]; all tiles together.
+        All tiles, in groups of one size: their numbers, int [n], and on the tiles' device samples, float32 [n, ny, nx,
+        3], not negative, and the weights of the samples' squared errors [n, ny, nx].
     """
     result = []
     for number in np.unique(chosen).tolist():

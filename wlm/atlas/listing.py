@@ -1,6 +1,6 @@
-"""What says which lightmaps a scene has, and which node reads which part of which: a JSON file, or its materials.
+"""Lists of a scene's lightmaps: the files of each sheet, and the node that reads each part of a sheet.
 
-The JSON file:
+A JSON file:
 
     {
      "states": ["noon", "night"],
@@ -9,25 +9,24 @@ The JSON file:
      "convention": "gltf"
     }
 
-A sheet is one layout of charts: it has a file for each state. `name`, `encoding`, `flip` and `mask` of a sheet are as
+A sheet is one layout of charts and has a file for each state. `name`, `encoding`, `flip` and `mask` of a sheet are as
 for `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
-UV * (scale x, y) + (offset x, y). Without `objects` every sheet goes to the mesh that it fits (`belonging`).
-`convention` says whose numbers the rectangles are:
+UV * (scale x, y) + (offset x, y). Without `objects` every sheet goes to the mesh that it fits (`matching`).
+`convention` states how the rectangles are written:
 
     gltf     v runs down, as in glTF.
-    unity    v runs up: `lightmapIndex` and `lightmapScaleOffset` (x, y, z, w) of a `Renderer` may be written as they
-             are, in place of `sheet` and `scale_offset`. The glTF file's v is 1 - Unity's, as its exporters write it.
-    godot    `path`, `slice_index` and `uv_scale` (x, y, width, height) of `LightmapGIData`'s users, v down; of the path
-             the last name is the node's.
+    unity    v runs up: `lightmapIndex` and `lightmapScaleOffset` (x, y, z, w) of a `Renderer` may be written
+             unchanged, in place of `sheet` and `scale_offset`. The glTF file's v is 1 - Unity's, as its exporters
+             write it.
+    godot    `path`, `slice_index` and `uv_scale` (x, y, width, height) of the users of `LightmapGIData`, v down; the
+             last name of the path is the node's.
 
-A `.lmbake` of Godot 4 does too: its texture, an EXR beside it, and the rectangles of its users. Of several slices, or
-of directional ones, the texture is a stack that is to be cut first.
+Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stack of slices or of directional layers has
+to be cut first); a `set.json` of `wlm lightmap`, which is one sheet with a state for each time; and a folder, which
+stands for its `set.json` or else for each picture of light in it, a sheet of one state for the mesh that it fits.
 
-A `set.json` of `wlm lightmap` does too: one sheet, a state for each time. Of a folder that has one it is read; of any
-other folder each picture of light in it is a sheet of one state, for the mesh that it fits.
-
-Without a file the materials' own lightmaps are read, `MOZ_lightmap`: each texture is a sheet, `KHR_texture_transform`
-gives the rectangle, `intensity` is a factor, and PNGs are sRGB, as that extension's writers have them.
+Without a list the materials' own lightmaps are read, `MOZ_lightmap`: each texture is a sheet, `KHR_texture_transform`
+gives the rectangle, `intensity` is a factor, and PNGs are sRGB, as the writers of that extension store them.
 """
 
 import json
@@ -52,7 +51,7 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet, as the module says."""
+    """The files of a sheet; the module says what the fields mean."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -65,7 +64,7 @@ class SheetFiles(BaseModel):
 
 
 class ObjectPlace(BaseModel):
-    """Which part of which sheet a node reads, v down: UV times the first two, plus the last two."""
+    """The rectangle of a sheet that a node reads, v down: UV times the first two numbers, plus the last two."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -85,33 +84,55 @@ class _Content(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Description:
-    """What the module's sources come to.
+class Listing:
+    """A list of lightmaps, from any of the module's sources.
 
     Attributes:
         path: The file that names the lightmaps.
-        states: Names, the same number as each sheet's files.
+        states: Names of the states; each sheet has a file for each.
         sheets: The files.
         objects: Nodes and their rectangles; None: every sheet goes to the mesh that it fits.
         uv_set: n of `TEXCOORD_n`; None: 1 where there is one, else 0.
+        direct: Whether the names of files are paths that the caller gave, and not names in a file.
     """
 
     path: str
     states: tuple[str, ...]
     sheets: tuple[SheetFiles, ...]
-    objects: tuple[ObjectPlace, ...] | None
-    uv_set: int | None
+    objects: tuple[ObjectPlace, ...] | None = None
+    uv_set: int | None = None
+    direct: bool = False
 
     def file(self, name: str, trust: bool) -> Path:
-        """The place of a file that it names.
+        """The path of a file of the list.
 
         Raises:
-            WlmError: It lies outside the folder, and isn't trusted.
+            WlmError: It lies outside the list's folder, and the list isn't trusted.
         """
+        if self.direct:
+            return Path(name)
         return named_file(self.path, name, f"{self.path}: {name}", trust)
 
 
-def read_description(path: str | os.PathLike[str]) -> Description:
+def is_listing(path: str | os.PathLike[str] | None) -> bool:
+    """Whether a path is a list of lightmaps rather than one lightmap. None stands for the materials' own."""
+    return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
+
+
+def lone_lightmap(
+    path: str | os.PathLike[str],
+    name: str,
+    mask: str | os.PathLike[str] | None = None,
+    encoding: str | None = None,
+    flip: bool = False,
+) -> Listing:
+    """Makes the list of one lightmap that the caller names; the arguments are as for `wlm.atlas.load`."""
+    mask = None if mask is None else os.fspath(mask)
+    files = SheetFiles(files=[os.fspath(path)], name=name, encoding=encoding, flip=flip, mask=mask)
+    return Listing(os.fspath(path), ("light",), (files,), direct=True)
+
+
+def read_listing(path: str | os.PathLike[str]) -> Listing:
     """Reads the JSON file, or lists a folder.
 
     Raises:
@@ -142,11 +163,11 @@ def read_description(path: str | os.PathLike[str]) -> Description:
         if each.sheet >= len(checked.sheets):
             raise WlmError(f"{path}: objects[{i}].sheet: expected below {len(checked.sheets)}, found {each.sheet}")
     objects = None if checked.objects is None else tuple(checked.objects)
-    return Description(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set)
+    return Listing(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set)
 
 
-def material_lightmaps(document: GltfDocument) -> Description | None:
-    """The lightmaps that a glTF file's materials have; None: no material has one.
+def material_lightmaps(document: GltfDocument) -> Listing | None:
+    """Lists the lightmaps that the materials of a glTF file name; None: no material names one.
 
     Raises:
         WlmError: A texture is malformed, of another UV set than the others', or within the file: not beside it.
@@ -170,7 +191,7 @@ def material_lightmaps(document: GltfDocument) -> Description | None:
                 order.append(key)
             transform = info.get("extensions", {}).get(_TRANSFORM, {})
             if transform.get("rotation"):
-                raise WlmError(f"{document.path}: nodes[{number}]: {_MOZ}: a rotated rectangle isn't read")
+                raise WlmError(f"{document.path}: nodes[{number}]: {_MOZ}: a rotated rectangle can't be read")
             sets.add(transform.get("texCoord", info.get("texCoord", 0)))
             scale, offset = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
             found.add((order.index(key), *map(float, (*scale, *offset))))
@@ -182,7 +203,7 @@ def material_lightmaps(document: GltfDocument) -> Description | None:
         return None
     if len(sets) > 1:
         raise WlmError(f"{document.path}: {_MOZ}: expected one texCoord for all lightmaps, found {sorted(sets)}")
-    return Description(document.path, ("light",), tuple(sheets[key] for key in order), tuple(objects), sets.pop())
+    return Listing(document.path, ("light",), tuple(sheets[key] for key in order), tuple(objects), sets.pop())
 
 
 def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFiles:
@@ -191,14 +212,14 @@ def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFile
     source = texture.get("extensions", {}).get("KHR_texture_basisu", {}).get("source", texture.get("source"))
     image = document.item("images", source)
     if "uri" not in image or str(image["uri"]).startswith("data:"):
-        raise WlmError(f"{where}: expected a lightmap in a file beside it, found one inside: write it out first")
+        raise WlmError(f"{where}: expected a lightmap in a file beside it, found one inside: write it to a file first")
     uri = str(image["uri"])
     encoding = "srgb" if uri.lower().endswith(".png") else None
     return SheetFiles(files=[uri], name=image.get("name"), encoding=encoding, intensity=intensity)
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
-    """An object in an engine's own words as one of ours; what is neither stays, to be told."""
+    """Turns an object in an engine's convention into one of ours; anything else stays, and is refused later."""
     if not isinstance(entry, dict):
         return entry
     entry = dict(entry)
@@ -232,8 +253,8 @@ def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
     return [float(each) for each in value]
 
 
-def _from_bake(path: str) -> Description:
-    """Godot's bake: one texture of one slice, and who reads which part of it."""
+def _from_bake(path: str) -> Listing:
+    """Reads Godot's bake: one texture of one slice, and the rectangles of its users."""
     bake = read_users(path)
     slices = {user.slice for user in bake.users}
     if len(bake.textures) != 1 or bake.directional or slices != {0}:
@@ -244,7 +265,7 @@ def _from_bake(path: str) -> Description:
         )
     sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
     objects = tuple(_godot_place(user) for user in bake.users)
-    return Description(path, ("light",), (sheet,), objects, None)
+    return Listing(path, ("light",), (sheet,), objects, None)
 
 
 def _godot_place(user: GodotUser) -> ObjectPlace:
@@ -252,8 +273,8 @@ def _godot_place(user: GodotUser) -> ObjectPlace:
     return ObjectPlace(node=user.node.rsplit("/", 1)[-1], sheet=0, scale_offset=[width, height, x, y])
 
 
-def _from_folder(where: str, folder: Path) -> Description:
-    """Every picture of light in a folder."""
+def _from_folder(where: str, folder: Path) -> Listing:
+    """Lists every picture of light in a folder."""
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
     except OSError as error:
@@ -263,11 +284,11 @@ def _from_folder(where: str, folder: Path) -> Description:
     ]
     if not sheets:
         raise WlmError(f"{where}: expected lightmaps ({', '.join(SUFFIXES)}), found none")
-    return Description(str(folder), ("light",), tuple(sheets), None, None)
+    return Listing(str(folder), ("light",), tuple(sheets), None, None)
 
 
-def _from_set(path: str, content: dict[str, Any]) -> Description:
-    """A `set.json`: one sheet."""
+def _from_set(path: str, content: dict[str, Any]) -> Listing:
+    """Reads a `set.json`, which is one sheet."""
     entries = content["lightmaps"]
     fields = ("time_hours", "file")
     entries = entries if isinstance(entries, list) else [None]
@@ -278,4 +299,4 @@ def _from_set(path: str, content: dict[str, Any]) -> Description:
     sheet = check_settings(SheetFiles, {"files": files, "mask": mask}, f"{path}: lightmaps: ")
     if len(states) != len(files):
         raise WlmError(f"{path}: lightmaps: expected a number as each time_hours")
-    return Description(path, tuple(states), (sheet,), None, None)
+    return Listing(path, tuple(states), (sheet,), None, None)

@@ -28,9 +28,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wlm.atlas.cascade.cluster import Clusters
 from wlm.atlas.charts import charts, welded
-from wlm.atlas.cluster import Clusters
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import Sheet
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
 from wlm.ops.raster import rasterize_uv, texture
@@ -69,12 +69,12 @@ class Packed:
     to_lightmap: np.ndarray
 
 
-def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float) -> Packed:
+def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
     """Gives the mesh new UVs in which the triangles of a group share texels.
 
     Args:
-        mesh: The mesh.
-        clusters: Its groups; None: no triangle shares.
+        sheet: The triangles.
+        clusters: Their groups; None: no triangle shares.
         scale: epsilon, texels of the atlas per texel of the lightmap, along a side.
 
     Returns:
@@ -86,20 +86,20 @@ def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float) -> Pack
     """
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected above 0, got {scale}")
-    count = len(mesh.triangle)
+    count = len(sheet.triangle)
     source, order = np.arange(count, dtype=np.int32), np.zeros((count, 3), np.int64) + np.arange(3)
     if clusters is not None:
         if len(clusters.group) != count:
             raise ValueError(f"clusters: expected {count} triangles, got {len(clusters.group)}")
         source = clusters.representative[clusters.group].astype(np.int32)
         order = np.array(ORDERS)[clusters.order]
-    source = np.where(mesh.active, source, -1).astype(np.int32)
+    source = np.where(sheet.active, source, -1).astype(np.int32)
 
-    height, width = mesh.mask.shape
-    numbers = welded(mesh.position, mesh.uv, mesh.triangle)
-    old = (mesh.uv * [width, height])[mesh.triangle]
+    height, width = sheet.mask.shape
+    numbers = welded(sheet.position, sheet.uv, sheet.triangle)
+    old = (sheet.uv * [width, height])[sheet.triangle]
     heads = np.flatnonzero(source == np.arange(count))  # those that keep their texels
-    head_chart, rotation, shift, size = _pack_charts(mesh.name, old[heads], numbers[heads], scale)
+    head_chart, rotation, shift, size = _pack_charts(sheet.name, old[heads], numbers[heads], scale)
 
     chart = np.full(count, -1, np.int32)
     chart[heads] = head_chart
@@ -123,15 +123,15 @@ def pack(mesh: LightmappedMesh, clusters: Clusters | None, scale: float) -> Pack
     return Packed(int(size[1]), int(size[0]), corner, uv, source, chart, to_lightmap)
 
 
-def regenerate(mesh: LightmappedMesh, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
     """Renders the atlas: each texel that a bilinear read of a chart can meet takes the lightmap's colour at its place.
 
     Inside a triangle that is the place with the same barycentrics, the paper's three steps. Since a chart moved
     rigidly, one affine map gives it for all its triangles, and beyond its border, where the lightmap's gaps are filled.
 
     Args:
-        mesh: The mesh.
-        packed: Its new UVs.
+        sheet: The triangles and their lightmap.
+        packed: Their new UVs.
         device: "cpu" or "cuda:N".
 
     Returns:
@@ -148,8 +148,8 @@ def regenerate(mesh: LightmappedMesh, packed: Packed, device: str = "cpu") -> tu
     row, column = np.nonzero(mask)
     to_lightmap = packed.to_lightmap[packed.chart[heads[fans[mask] // len(fan)]]]
     place = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], -1)
-    uv = (to_lightmap @ place[:, :, None])[:, :, 0] / mesh.mask.shape[::-1]
-    image = torch.tensor(mesh.filled, device=device)
+    uv = (to_lightmap @ place[:, :, None])[:, :, 0] / sheet.mask.shape[::-1]
+    image = torch.tensor(sheet.lightmap, device=device)
     out = np.zeros((height, width, 3), np.float32)
     out[mask] = texture(image, torch.tensor(uv, dtype=torch.float32, device=device)).cpu().numpy()
     return out, mask

@@ -1,5 +1,5 @@
-"""The method "cascade", the paper's: group triangles, pack them, and tune two small textures
-(lightmap-uv-clustering-cascade, sections 3.1 to 3.3).
+"""The paper's method: group triangles, pack them, and tune two small textures (lightmap-uv-clustering-cascade,
+sections 3.1 to 3.3).
 
 T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coordinates of its own texels' centres;
 `wlm_kernels.atlas.cascade` says how they are read. Adam then tunes both:
@@ -13,11 +13,11 @@ T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coo
                     seams don't, since a pair doesn't cross one. Ours.
 
 Where the paper is silent: the loss is a sum and not a mean, which changes Adam's steps by its epsilon alone; radiance,
-and so T_p's rate, is in units of the lightmap's mean, since a map of a dark room would else be tuned more coarsely than
-that of a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], which is the range
-of its 16 bits and where F is the identity. The paper's rates stay as they are; `Profile.final_rate` lets them decay,
-so that less of the last steps' noise is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to
-1.3 dB better than the best constant rates, with 300 steps as with 2,000.
+and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned more coarsely than
+a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range of its 16 bits,
+where F is the identity. The paper's rates are constant; `Profile.final_rate` lets rates decay, so that less noise of
+the last steps is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to 1.3 dB better than the
+best constant rates, with 300 steps as with 2,000.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
@@ -30,13 +30,13 @@ import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.cluster import Clusters, Stats, cluster
+from wlm.atlas.cascade.cluster import Clusters, Stats, cluster
+from wlm.atlas.cascade.pack import pack, regenerate
 from wlm.atlas.colour import quantise
 from wlm.atlas.corners import snapped
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile
-from wlm.atlas.pack import pack, regenerate
-from wlm.atlas.resize import resize
+from wlm.atlas.data import LightmappedScene, Sheet
+from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace
+from wlm.atlas.resize import resized
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
@@ -44,14 +44,15 @@ from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part, check_parts
 from wlm.ops.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.system import Meter, OnProgress
+from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade as kernels
 from wlm_kernels.atlas.patches import ORDERS
 from wlm_kernels.raster import texture as texture_kernels
 from wlm_kernels.raster.rasterize import Rasterizer
 
 _CHUNK = {"cpu": 5, "cuda": 100}  # steps between two looks at the clock
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
-_PIXELS_PER_POINT = 4  # of space "uv": about that share of a view's pixels show the mesh
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # state of Adam
+_PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show the mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +68,11 @@ class Textures:
     lut: np.ndarray
 
 
-def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> Clusters | None:
+def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
     """Groups triangles whose lighting is alike (sections 3.1 and 3.2).
 
     Args:
-        mesh: The mesh.
+        sheet: The triangles and their lightmap.
         profile: `threshold`, `colour_threshold` and `max_radiance`.
         stages: Reports and times the stage.
 
@@ -81,21 +82,21 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
     if profile.threshold == 0:
         return None
     # Any number will do for a black lightmap, whose triangles are all alike.
-    brightest = float(mesh.lightmap[mesh.mask].max()) or 1.0
+    brightest = float(sheet.lightmap[sheet.mask].max()) or 1.0
     with stages("cluster"):
         if (
             stages.checkpoint is not None
-            and (kept := _kept_clusters(stages.checkpoint, len(mesh.triangle))) is not None
+            and (kept := _kept_clusters(stages.checkpoint, len(sheet.triangle))) is not None
         ):
             return kept
         clusters = cluster(
-            mesh.uv,
-            mesh.triangle,
-            mesh.filled,
+            sheet.uv,
+            sheet.triangle,
+            sheet.lightmap,
             threshold=profile.threshold,
             colour_threshold=profile.colour_threshold,
             max_radiance=brightest if profile.max_radiance is None else profile.max_radiance,
-            active=mesh.active,
+            active=sheet.active,
             device=stages.device,
             progress=stages.progress,
         )
@@ -106,7 +107,7 @@ def group_triangles(mesh: LightmappedMesh, profile: Profile, stages: Stages) -> 
 
 
 def fit_cascade(
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     clusters: Clusters | None,
     profile: Profile,
     seed: int,
@@ -117,8 +118,8 @@ def fit_cascade(
     """Compresses a lightmap whose triangles are grouped.
 
     Args:
-        mesh: The mesh.
-        clusters: Its groups; None: no triangle shares.
+        scene: A scene of one sheet and one state.
+        clusters: The groups of its triangles; None: no triangle shares.
         profile: The settings.
         seed: Seed of the cameras or points.
         stages: Reports and times the stages.
@@ -131,14 +132,15 @@ def fit_cascade(
     Raises:
         WlmError: As `pack` and `tune`; or a package for the blocks of T_p is missing.
     """
-    count, facts = len(mesh.triangle), {}
-    # What the file holds is what is tuned: snapped.
+    (sheet,), facts = scene.sheets, {}
+    count = len(sheet.triangle)
+    # UVs are tuned at the places that the file holds.
     if repack:
         with stages("pack"):
-            packed = pack(mesh, clusters, profile.scale)
+            packed = pack(sheet, clusters, profile.scale)
             uv = snapped(packed.uv)
         with stages("regenerate"):
-            start = initial(*regenerate(mesh, packed, stages.device), profile)
+            start = initial(*regenerate(sheet, packed, stages.device), profile)
         shares = np.bincount(packed.source[packed.source >= 0], minlength=count)
         facts = {
             "groups": int(np.count_nonzero(shares)),
@@ -147,21 +149,22 @@ def fit_cascade(
             "packed": [packed.height, packed.width],
         }
     else:
-        uv, start = snapped(mesh.uv[mesh.triangle].astype(np.float32)), initial(mesh.lightmap, mesh.mask, profile)
+        uv = snapped(sheet.uv[sheet.triangle].astype(np.float32))
+        start = initial(sheet.lightmap, sheet.mask, profile)
     with stages("fit"):
         options = {"device": stages.device, "progress": stages.progress, "checkpoint": stages.checkpoint}
-        textures = tune(mesh, uv, start, profile, seed=seed, **options)
+        textures = tune(sheet, uv, start, profile, seed=seed, **options)
     with stages("write"):
         stored = quantise(textures.colour, profile.colour)
     return AtlasModel(
-        name=mesh.name,
-        source=mesh.source,
+        name=scene.name,
+        source=scene.source,
         profile=profile,
         method="cascade" if textures.lut.size else "plain",
         colour=profile.colour,
-        height=mesh.mask.shape[0],
-        width=mesh.mask.shape[1],
-        **stored,
+        states=scene.states,
+        sheets=(SheetPlace(sheet.name, *sheet.mask.shape),),
+        **{name: texture[None] for name, texture in stored.items()},
         lut=np.rint(textures.lut * LUT_STEPS).astype(np.uint16),
         uv=uv,
         report={"triangles": count, **facts, "steps": profile.steps},
@@ -180,7 +183,8 @@ def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Texture
         T_p, each texel the mean of those it covers, and T_c; no T_c if `lut_scale` is 0.
     """
     height, width = mask.shape
-    colour = resize(lightmap, mask, *_sides(height, width, profile.colour_scale), "box").astype(np.float32)
+    sides = _sides(height, width, profile.colour_scale)
+    colour = resized(fill_gaps(lightmap, mask), mask, *sides, "box").numpy().astype(np.float32)
     if profile.lut_scale == 0.0:
         return Textures(colour, np.zeros((0, 0, 2), np.float32))
     rows, columns = _sides(height, width, profile.lut_scale)
@@ -189,7 +193,7 @@ def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Texture
 
 
 def tune(
-    mesh: LightmappedMesh,
+    sheet: Sheet,
     uv: np.ndarray,
     textures: Textures,
     profile: Profile,
@@ -202,14 +206,14 @@ def tune(
     """Tunes a cascade to show the mesh as its lightmap does.
 
     Args:
-        mesh: The mesh.
+        sheet: The triangles and their lightmap.
         uv: float32 [F, 3, 2], the corners' UVs under which the cascade is read.
         textures: Initial values.
         profile: `space`, `steps`, `colour_rate`, `lut_rate`, `final_rate`, `resolution` and `gradient`.
         seed: Seed of the cameras or points.
         device: "cpu" or "cuda:N".
         progress: Called about twice a second with the steps done.
-        checkpoint: Where the steps' state is kept, as batch 1.
+        checkpoint: Keeps the state of the steps, as batch 1.
 
     Returns:
         The tuned cascade.
@@ -219,7 +223,7 @@ def tune(
     """
     device = interop.check_device(device)
     with interop.stream(device):
-        step = _Step(mesh, uv, textures, profile, seed, device)
+        step = _Step(sheet, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
         if checkpoint is not None and checkpoint.restore(1, step.load):
@@ -242,12 +246,12 @@ def tune(
                 checkpoint.save_running(1, step.state())
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
-        raise WlmError(f"{mesh.name}: the fit diverged; expected smaller rates than those of {profile.name}")
+        raise WlmError(f"{sheet.name}: the fit diverged; expected smaller rates than those of {profile.name}")
     return tuned
 
 
 def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    """The groups of `count` triangles that an interrupted compression had formed, or None."""
+    """Reads the groups of `count` triangles that an interrupted compression had formed; None: there are none."""
     triangle = Part(np.int32, (count,), least=0, most=count - 1)
     table = {
         "group": triangle,
@@ -269,11 +273,11 @@ def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
 
 
 class _Step:
-    """One step of tuning. Its buffers are allocated once, so that it may be captured in a CUDA graph."""
+    """One step of tuning. Its buffers are allocated once, so that a CUDA graph may capture it."""
 
     def __init__(
         self,
-        mesh: LightmappedMesh,
+        sheet: Sheet,
         uv: np.ndarray,
         textures: Textures,
         profile: Profile,
@@ -281,8 +285,8 @@ class _Step:
         device: str,
     ) -> None:
         self._gradient = profile.gradient
-        # A black map has no mean to divide by, and needs none.
-        self._unit = float(mesh.lightmap[mesh.mask].mean(dtype=np.float64)) or 1.0
+        # A black lightmap has no mean to divide by, and needs none.
+        self._unit = float(sheet.lightmap[sheet.mask].mean(dtype=np.float64)) or 1.0
         self._colour = torch.tensor(textures.colour / np.float32(self._unit), device=device).requires_grad_()
         self._lut = torch.tensor(textures.lut, device=device).requires_grad_()
         # Rates are read on the device, since the arguments of a captured step are fixed.
@@ -300,19 +304,19 @@ class _Step:
         self._adam = torch.optim.Adam(groups, capturable=on_cuda, fused=True)
         self._textures = [_wrap(each, device) for each in (self._colour, self._lut)]
         self._texture_grads = [_wrap(each, device) for each in self._grads]
-        self._image = _wrap(torch.tensor(mesh.filled / np.float32(self._unit), device=device), device)
+        self._image = _wrap(torch.tensor(sheet.lightmap / np.float32(self._unit), device=device), device)
 
         self._step = torch.zeros(1, dtype=torch.int32, device=device)
         # An inactive triangle hides what is behind it; NaN excludes it from the loss.
-        active = mesh.active[:, None, None]
+        active = sheet.active[:, None, None]
         self._corner, self._new_corner = (
             wp.array(np.where(active, each, np.nan).astype(np.float32), dtype=wp.vec2, device=device)
-            for each in (mesh.uv[mesh.triangle], uv)
+            for each in (sheet.uv[sheet.triangle], uv)
         )
         if profile.space == "views":
-            self._points = _Views(mesh, profile, self._step, seed, device)
+            self._points = _Views(sheet, profile, self._step, seed, device)
         else:
-            self._points = _Surface(mesh, profile, self._step, seed, device)
+            self._points = _Surface(sheet, profile, self._step, seed, device)
         count, shape = self._points.count, self._points.shape
         self._uv, self._new_uv = (wp.empty(count, dtype=wp.vec2, device=device) for _ in range(2))
         self._value, self._target, grad = (torch.zeros(count, 3, device=device) for _ in range(3))
@@ -342,7 +346,7 @@ class _Step:
             self._lut.clamp_(0.0, 1.0)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that later steps depend on."""
+        """The state that later steps depend on."""
         tensors = {"step": self._step}
         for group in self._adam.param_groups:
             for parameter in group["params"]:
@@ -356,7 +360,7 @@ class _Step:
         """Goes back to a `state`.
 
         Raises:
-            ValueError: It is none of this tuning; nothing has changed.
+            ValueError: The state belongs to another fit; nothing has changed.
         """
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
         for group in self._adam.param_groups:
@@ -374,7 +378,7 @@ class _Step:
                 moments = self._adam.state[parameter]
                 moments["step"] = values[f"{name}.step"].to(parameter.device)
                 for key in _MOMENTS[1:]:
-                    # In the parameter's order of memory: the fused step takes both as they lie there.
+                    # In the parameter's memory layout, which the fused step expects of both.
                     moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
 
     @property
@@ -390,15 +394,15 @@ class _Step:
 class _Views:
     """Points of space "views": the pixels of one random view per step."""
 
-    def __init__(self, mesh: LightmappedMesh, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
+    def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         side = profile.resolution
         self.count, self.shape = side * side, (side, side, 3)
         axes = np.array([view.axes for view in sphere_views(profile.steps, seed)], np.float32).reshape(-1, 3, 3)
         self._axes = torch.tensor(axes, device=device)
         self._step = step
-        self._position = torch.tensor(normalised(mesh.position, mesh.triangle), dtype=torch.float32, device=device)
-        self._clip = torch.zeros(len(mesh.position), 4, device=device)
-        triangle = wp.array(mesh.triangle, dtype=int, device=device)
+        self._position = torch.tensor(normalised(sheet.position, sheet.triangle), dtype=torch.float32, device=device)
+        self._clip = torch.zeros(len(sheet.position), 4, device=device)
+        triangle = wp.array(sheet.triangle, dtype=int, device=device)
         self._rasterizer = Rasterizer(triangle, side, side)
         self._clip_array = _wrap(self._clip, device)
         raster = self._rasterizer.raster
@@ -406,7 +410,7 @@ class _Views:
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
-        # Sums by hand, as in `views`: vertices at one place must stay at one.
+        # Written out, as in `wlm.ops.views`: vertices at one place must stay at one place.
         x, y, back = (sum(self._position[:, k] * axes[i, k] for k in range(3)) for i in range(3))
         w = DISTANCE - back
         # z / w only has to increase with the distance.
@@ -421,15 +425,15 @@ class _Views:
 class _Surface:
     """Points of space "uv": pairs of random points on the mesh, new ones per step."""
 
-    def __init__(self, mesh: LightmappedMesh, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
+    def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))
         self.count, self.shape = 2 * pairs, (2 * pairs, 3)
         self._seed = int(seed) % (1 << 30)
-        position = normalised(mesh.position, mesh.triangle)[mesh.triangle]
+        position = normalised(sheet.position, sheet.triangle)[sheet.triangle]
         normal = np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0])
-        area = np.where(mesh.active, np.linalg.norm(normal, axis=1), 0.0)
+        area = np.where(sheet.active, np.linalg.norm(normal, axis=1), 0.0)
         self._area = wp.array(np.cumsum(area), dtype=wp.float64, device=device)
-        texels = (mesh.uv * mesh.mask.shape[::-1])[mesh.triangle]
+        texels = (sheet.uv * sheet.mask.shape[::-1])[sheet.triangle]
         self._texels = wp.array(texels.astype(np.float32), dtype=wp.vec2, device=device)
         self._step = _wrap(step, device)
         self.triangle = wp.empty(self.count, dtype=int, device=device)
@@ -444,7 +448,7 @@ class _Surface:
 
 
 def _wrap(tensor: torch.Tensor, device: str) -> wp.array:
-    """An array over a tensor's memory; an empty one for an empty tensor, which Warp doesn't wrap."""
+    """Wraps a tensor's memory; an empty tensor, which Warp can't wrap, becomes an empty array."""
     if tensor.numel():
         return interop.to_warp(tensor)
     return wp.empty(tuple(tensor.shape), dtype=float, device=device)

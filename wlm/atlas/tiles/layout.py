@@ -1,8 +1,8 @@
-"""Sizes of tiles: which a tile may have, which it gets within a budget of bits, and where it lies in the texture.
+"""Sizes of tiles: the sizes that a tile may have, the one that it gets within a budget of bits, and its place.
 
 Each tile has a curve of error against bits. At the optimum one more bit gains as much in every tile. That gain, a
-Lagrange multiplier, is found by bisection. Of colour "mixed" a tile's sizes are of two formats, each with a texture of
-its own: blocks for what they follow well, single texels for what they don't, and for tiles of few samples.
+Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each with its own
+texture: blocks for light that they follow well, single texels for other light and for tiles of few samples.
 """
 
 import math
@@ -28,18 +28,18 @@ from wlm.formats.exr import HALF_MAX
 
 _BISECTIONS, _CLOSE = 60, 1e-6
 _TILES_AT_ONCE = 1 << 16
-_WIDTHS = np.linspace(0.7, 1.5, 17)  # of T_p, over the square root of its number of samples
-# Of "mixed", sides in texels: between 6 and the largest every other one is enough.
+_WIDTHS = np.linspace(0.7, 1.5, 17)  # widths of T_p that are tried, over the square root of its number of samples
+# Sides in texels for "mixed": above 6 every other one is enough.
 _MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 
 
 @dataclass(frozen=True)
 class Size:
-    """What a tile may become.
+    """A size that a tile may have.
 
     Attributes:
         nx, ny: Samples along x and y.
-        format: How they are stored, of `COLOUR_BITS`.
+        format: Their format, a key of `COLOUR_BITS`.
         second: Whether they are in the second texture of "mixed".
     """
 
@@ -50,12 +50,12 @@ class Size:
 
     @property
     def bits(self) -> int:
-        """On a GPU."""
+        """Bits on a GPU."""
         return self.nx * self.ny * COLOUR_BITS[self.format]
 
     @property
     def step(self) -> int:
-        """What its sides are multiples of."""
+        """The number of which its sides are multiples."""
         return BLOCK_SIDE if self.format in ("bc6h", "astc") else 1
 
 
@@ -75,7 +75,7 @@ class Layout:
 
 
 def sizes_of(profile: Profile) -> list[Size]:
-    """The sizes that a tile may have; of blocks whole ones, so that no block has two tiles."""
+    """Lists the sizes that a tile may have; blocks are whole, so that no block has two tiles."""
     most = profile.tile + 1
 
     def of_blocks(format: str, second: bool) -> list[Size]:
@@ -137,7 +137,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Of some widths of shelves the one whose texture is smallest; and the texture's rows and columns."""
+    """Finds the width of shelves with the smallest texture; and gives the texture's rows and columns."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -160,19 +160,19 @@ def composed(
     counts: tuple[int, int],
     device: str,
 ) -> tuple[list[tuple[torch.Tensor, torch.Tensor]], np.ndarray]:
-    """The textures and the table.
+    """Composes T_p and T_c.
 
     Args:
-        samples: Of some tiles of one size each: their rows in `layout`, int [n], and on the device float32 [n, ny, nx,
-            3] and the weights of their squared errors [n, ny, nx].
+        samples: Groups of tiles of one size: their rows in `layout`, int [n], and on the device float32 [n, ny, nx, 3]
+            and the weights of their squared errors [n, ny, nx].
         sizes: The sizes.
-        layout: Of the tiles.
+        layout: Sizes and places of the tiles.
         index: int64 [T], the tiles' numbers in the grid.
         counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
         device: "cpu" or "cuda:N": a large texture takes seconds to pass through the host.
 
     Returns:
-        Of each texture on the device the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
+        For each texture, on the device, the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
     """
     textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
     for members, values, weight in samples:
@@ -210,7 +210,7 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
         least: Error that a bit must save to be allocated.
 
     Returns:
-        int [T], numbers of sizes. The cheapest of all where even they are over the budget.
+        int [T], numbers of sizes. All tiles have the cheapest size where even that is over the budget.
     """
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
@@ -236,14 +236,14 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 
 @dataclass(frozen=True)
 class _Run:
-    """Where the rectangles of one size are: some beside the last of another size, then whole shelves of them.
+    """The places of the rectangles of one size: some beside those of another size, the rest on shelves of their own.
 
     Attributes:
-        beside: How many are beside others, from (x, y) on.
-        x, y: Of the first of these.
-        each: How many are on a shelf of their own, of which the first is at `below`.
-        below: Its y.
-        widest: Where the rightmost ends.
+        beside: Number of rectangles beside others, from (x, y) on.
+        x, y: Place of the first of these.
+        each: Number of rectangles on each of the further shelves.
+        below: y of the first of those shelves.
+        widest: Right end of the rightmost rectangle.
     """
 
     beside: int
@@ -256,19 +256,19 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Kinds:
-    """The sizes of rectangles, the highest first, and of these the widest; and how many there are of each."""
+    """The sizes of rectangles, the highest first and then the widest, and the number of rectangles of each."""
 
     size: np.ndarray
     count: np.ndarray
 
     @classmethod
     def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
-        """Sorts sizes, int [K, 2], all different."""
+        """Sorts sizes, int [K, 2], all different, with their counts."""
         order = np.lexsort((-size[:, 0], -size[:, 1]))
         return cls(size[order], count[order])
 
     def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Where each size goes on shelves of a width, and the height of all."""
+        """Places each size on shelves of a width; gives the places and the height of all shelves."""
         runs, x, y, height = [], 0, 0, 0
         for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
             each = width // w
@@ -289,7 +289,7 @@ def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
     Args:
         sizes: int [R, 2], width and height of each.
-        width: Of the shelves, at least that of the widest.
+        width: Width of the shelves, at least that of the widest rectangle.
 
     Returns:
         int64 [R, 2], x and y of each; and the height of all shelves.

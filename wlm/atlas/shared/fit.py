@@ -1,85 +1,61 @@
-"""From a scene's lightmaps to one model: mixtures of the states, tiles of all sheets, one allocation.
+"""From the lightmaps of several sheets and states to one model: mixtures of the states, tiles of all sheets, and one
+allocation.
 
-The states' light is divided by how much it varies, so that each counts by its PSNR (`detail`). Tiles are dealt to
-mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), they
-count by what the views that show them lose (`balance`), and numbers and sizes are allocated to the tiles of all sheets
-at once (`allocation`): one more bit gains as much in every object.
+The states' light is divided by how much it varies, so that each counts by its PSNR (`weights`). Tiles are dealt to
+mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), is
+weighted by the error of the views that show it (`balance`), and numbers and sizes are allocated to the tiles of all
+sheets at once (`allocation`): one more bit gains as much in every object.
 
-States that have little in common, a shadow mask and the light of a sky, lose by sharing sizes. So the same is done with
-the tiles of each state apart, and the better of the two is kept. Apart, all that an object and a state has by itself is
-there to be allocated: a scene is no worse than its parts.
+States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. So the same is
+done with separate tiles for each state, and the better of the two is kept (`sharing`). A scene so is no worse than its
+parts.
 """
-
-import os
-from typing import Any
 
 import numpy as np
 import torch
 
-from wlm import interop
 from wlm.atlas.colour import encode
-from wlm.atlas.layout import Size, texels_of
-from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS
-from wlm.atlas.scene.allocation import Allocated
-from wlm.atlas.scene.curves import SceneTiles, Tried
-from wlm.atlas.scene.data import LightmappedScene
-from wlm.atlas.scene.detail import peaks_of, scales, variation
-from wlm.atlas.scene.model import (
-    SceneModel,
-    SceneProfile,
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    TEXELS,
+    AtlasModel,
+    Profile,
     SheetPlace,
     coarse_place,
     extent,
     pack_tiles,
 )
-from wlm.atlas.scene.planes import planes_of
-from wlm.atlas.scene.seen import scene_weights
-from wlm.atlas.scene.sharing import Layout, fitted
-from wlm.atlas.stages import Stages, one_thread
-from wlm.atlas.tiles import (
-    Tiles,
-    solved,
-)
-from wlm.formats.shared_exponent import pack_rgb9e5
-from wlm.system import OnProgress
+from wlm.atlas.shared.allocation import Allocated
+from wlm.atlas.shared.curves import Candidate, SceneTiles
+from wlm.atlas.shared.sharing import Layout, fitted, planes_of
+from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
+from wlm.atlas.stages import Stages
+from wlm.atlas.tiles.fit import Tiles, solved
+from wlm.atlas.tiles.layout import Size, texels_of
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 _AT_ONCE = 1024  # tiles
-_BRIGHT = 1024.0  # what a component's largest texel becomes: RGB9E5 has as many octaves below it as above
+_BRIGHT = 1024.0  # a component's largest texel after scaling: RGB9E5 has as many octaves below it as above
 
 
-def compress_scene(
-    scene: LightmappedScene,
-    profile: str | os.PathLike[str] | SceneProfile = "standard",
-    *,
-    seed: int = 0,
-    device: str = "cpu",
-    progress: OnProgress | None = None,
-    **overrides: Any,
-) -> SceneModel:
-    """Compresses all lightmaps of a scene into one table and one texture.
+def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
+    """Compresses all lightmaps of a scene into one lookup texture and one or two colour textures.
 
     Args:
         scene: The scene.
-        profile: The settings: a profile's name, a YAML file or a `SceneProfile`.
-        seed: Of the random views.
-        device: "cpu" or "cuda:N".
-        progress: Called as each stage begins, and about twice a second in stages of many steps.
-        overrides: Settings that replace the profile's, by name.
+        profile: `budget`, `colour`, `tile`, `views` and `mips`.
+        seed: Seed of the random views and mixtures.
+        stages: Reports and times the stages.
 
     Returns:
-        The model; its report says how many tiles, samples and components each sheet has, and the error left where tiles
-        may have up to so many components.
+        The model; its report has the numbers of tiles, samples and components of each sheet, and the error for each
+        number of components that was tried.
 
     Raises:
-        WlmError: No such profile or device, a wrong setting, or a budget that the smallest model exceeds.
+        WlmError: The budget is less than the smallest model takes.
     """
-    device = interop.check_device(device)
-    profile = SceneProfile.load(profile).override(overrides)
-    with one_thread(device):
-        return _compressed(scene, profile, seed, Stages(device, progress))
-
-
-def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stages: Stages) -> SceneModel:
     device = stages.device
     with stages("weights"):
         peak = peaks_of(scene)
@@ -89,10 +65,10 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         planes = planes_of(scene, weights, profile.mips, device)
     kept = fitted(scene, planes, unit, varies, profile, seed, stages)
     planes, layout, tiles, tried, given = kept.planes, kept.layout, kept.tiles, kept.tried, kept.given
-    stride = len(planes) // kept.apart
+    stride = len(planes) // kept.states
     with stages("solve"):
-        texels, blocks, scale = _texels(tiles, tried, given)
-    lut = np.ascontiguousarray(_table(tiles, layout, given)[..., : kept.numbers])
+        textures, scale = _textures(tiles, tried, given)
+    lut = np.ascontiguousarray(_lookup(tiles, layout, given)[..., : kept.numbers])
     rows = [
         SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
         for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
@@ -108,33 +84,45 @@ def _compressed(scene: LightmappedScene, profile: SceneProfile, seed: int, stage
         "tiles": counts.astype(int).tolist(),
         "samples": samples.astype(int).tolist(),
         "components by sheet": (many / np.maximum(counts, 1)).round(2).tolist(),
-        "pages": len(texels),
-        "apart": kept.apart > 1,
-        "expected gain of states apart": kept.gain,
+        "pages": len(textures["texels"]),
+        "separate": kept.states > 1,
+        "expected gain of separate tiles": kept.gain,
         "tiles of blocks": int(given.second.sum()),
         "coarse components": int(given.coarse.sum()),
         "error by components": {str(each.rank): each.left for each in tried},
         "units": unit.tolist(),
-        "seconds": stages.seconds,
     }
-    # Apart, all states have the factors of one, times their units.
+    # With separate tiles all states have the factors of one, times their units.
     factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
-    levels = tuple(rows[sheets:stride])
-    parts = (tuple(rows[:sheets]), np.ascontiguousarray(factor), texels, lut, levels, report)
-    second = {"blocks": blocks[0], "block_texels": blocks[1].astype(np.float16)} if blocks else {}
-    return SceneModel(scene.name, scene.source, profile, scene.states, *parts, **second, later=tuple(rows[stride:]))
+    return AtlasModel(
+        name=scene.name,
+        source=scene.source,
+        profile=profile,
+        method="shared",
+        colour="mixed" if "blocks" in textures else TEXELS,
+        states=scene.states,
+        sheets=tuple(rows[:sheets]),
+        lut=lut,
+        factor=np.ascontiguousarray(factor),
+        levels=tuple(rows[sheets:stride]),
+        later=tuple(rows[stride:]),
+        report=report,
+        **textures,
+    )
 
 
 def _of_texels(weight: np.ndarray) -> np.ndarray:
-    """Weights of texels [H, W] of those of their quarters [2 H, 2 W]."""
+    """Sums the weights of quarters [2 H, 2 W] to those of texels [H, W]."""
     return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
 
 
-def _texels(
-    tiles: SceneTiles, tried: list[Tried], given: Allocated
-) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
-    """T_p, uint32 [pages, Hp, Wp]; the second texture, blocks and what they decode to, if there is one; and what each
-    component was multiplied by, float64 [C, 3]."""
+def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Solves for the samples of all components and composes the colour textures.
+
+    Returns:
+        `texels` and, if there is a second texture, `blocks` and `block_texels` of the model; and the factor by which
+        each component was multiplied, float64 [C, 3].
+    """
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)
@@ -165,13 +153,16 @@ def _texels(
                     np.maximum.at(largest, number, values.amax((1, 2)).cpu().numpy())
     scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
     first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
+    textures = {"texels": unpack_rgb9e5(pack_rgb9e5(first)).astype(np.float16)}
     pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
-    blocks = tuple(np.stack(each) for each in zip(*pages, strict=True))
-    return pack_rgb9e5(first), blocks, scale.astype(np.float64)
+    if pages:
+        blocks, decoded = (np.stack(each) for each in zip(*pages, strict=True))
+        textures |= {"blocks": blocks, "block_texels": decoded.astype(np.float16)}
+    return textures, scale.astype(np.float64)
 
 
-def _table(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
-    """T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
+def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
+    """Composes T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
     columns = np.array([each[1] for each in layout.grid])[tiles.plane]
     row = tiles.index // columns + np.array(layout.row)[tiles.plane]
     column = tiles.index % columns + np.array(layout.column)[tiles.plane]
