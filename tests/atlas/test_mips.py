@@ -18,8 +18,8 @@ from wlm.atlas.mips import Tail, make_tail, tail_light
 from wlm.atlas.model import tail_bits, tail_shapes
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
-from wlm.formats.dds_reader import read_dds
-from wlm.formats.ktx2_reader import read_ktx2
+from wlm.formats.dds import read_dds
+from wlm.formats.ktx2 import read_ktx2
 
 HALF = {"views": 2, "mips": True, "fallback": False}
 

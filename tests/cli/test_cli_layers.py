@@ -46,7 +46,7 @@ def test_evaluate_scores_every_sheet(made):
     content = json.loads(report.read_text())
     assert [sheet["encoding"] for sheet in content["sheets"]] == ["radiance", "unit", "unit"] * 2
     assert content["psnr_by_layer"]["dir"] > 10 and content["sheets"][1]["flip"] is None
-    for option in ("--baselines", "--html=a.html", "--score=hprc"):
+    for option in ("--html=a.html", "--score=hprc"):
         assert "one with layers" in fails("lightmap", "evaluate", folder / "a.wlm", folder / "scene", option)
 
 

@@ -1,6 +1,5 @@
 import json
 import re
-from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from builders.probe_sets import synthetic
 from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
-from benchmarks.rivals import probe as baselines
 from wlm.probe import data, evaluate, save_probes
 
 PROBES, DEAD = 160, 5
@@ -133,36 +131,17 @@ def test_decode_in_an_engines_convention(fitted, room, tmp_path):
     np.testing.assert_allclose(data.load(tmp_path / "a.npz").values, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path, monkeypatch):
-    # Two of the rivals, for time; one of them has no room.
-    few = {name: baselines.RIVALS[name] for name in ("global_pca", "unreal")}
-    monkeypatch.setattr(baselines, "RIVALS", few)
-    monkeypatch.setattr(baselines, "at_bytes", partial(baselines.at_bytes, bits=(8,)))
+def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     words = ["probe", "evaluate", fitted, room, "--json", tmp_path / "r.json"]
-    text = call(*words, "--baselines")
+    text = call(*words)
     probes, size = data.load(room), fitted.stat().st_size
     report = evaluate(wlm.load(fitted), probes)
     stored = json.loads((tmp_path / "r.json").read_text())
-    rivals = stored.pop("baselines")
     assert stored == report.to_json()
     for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "band 2"):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
     assert "worst:" in call.stderr and said == report.warnings
-    names = [rival["method"] for rival in rivals]
-    assert names == [name for name in few if f"probes: {name}: nothing fits" not in call.stderr]
-    assert "global_pca" in names and "PCA, K=" in text
-    for rival in rivals:
-        assert rival["bytes"] <= size and rival["probes"] == PROBES and rival["encode_seconds"] >= 0
-        assert f"{rival['psnr']:.2f}" in text
-    call(*words)
-    assert "baselines" not in json.loads((tmp_path / "r.json").read_text())
-
-
-def test_rivals_without_room_are_named(fitted, room, monkeypatch):
-    monkeypatch.setattr(baselines, "RIVALS", {"unreal": lambda position, values, size, bits: None})
-    text = call("probe", "evaluate", fitted, room, "--baselines")
-    assert "nothing fits into" in call.stderr and "Unreal" not in text
 
 
 def test_evaluate_against_another_set(fitted, tmp_path):

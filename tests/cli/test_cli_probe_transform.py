@@ -115,7 +115,7 @@ def test_several_hours_in_one_file(folder, tmp_path):
         (["decode", file, "-o", tmp_path / "x.npz"], "expected --time, the file holds 6, 18.5"),
         (["decode", folder / "b.wlm", "--time", 9, "-o", tmp_path / "x.npz"], "expected a file of several hours"),
         (["evaluate", file, day, "--time", 9], "expected one of the file's hours to compare with, 6, 18.5, got 9"),
-        (["evaluate", file, day, "--volume"], "--time: expected with --baselines"),
+        (["evaluate", file, day, "--volume"], "--time: expected with --volume"),
         (["evaluate", file, day, "--time", 6, "--hold-out"], "--hold-out: expected no --time"),
         (["compress", day, "--times", "6,x", "-o", tmp_path / "x.wlm"], "--times: expected hours as 9,12,21.5"),
         (["compress", day, day, "-o", tmp_path / "x.wlm"], "expected one file of probes"),

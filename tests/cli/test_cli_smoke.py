@@ -14,7 +14,7 @@ from builders.smoke_plumes import SPHERE, plume, write_frames
 from PIL import Image
 
 from wlm.fluid.volume import from_array, load_volume, save_volume
-from wlm.formats.exr_planes import read_planes
+from wlm.formats.exr import read_planes
 from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.data import load_frames, read_shaded, read_six_way

@@ -7,7 +7,7 @@ from builders.smoke_plumes import SPHERE, plume, write_frames
 from PIL import Image
 
 from wlm.fluid.volume import load_volume, save_volume
-from wlm.formats.exr_planes import read_planes
+from wlm.formats.exr import read_planes
 from wlm.smoke.camera import Camera
 from wlm.smoke.scene import CameraSettings, make_camera
 from wlm.smoke.shading import Light

@@ -5,7 +5,7 @@ import pytest
 from builders.checks import error_of
 from PIL import Image
 
-from wlm.formats.encoded import ENCODINGS, read_encoded
+from wlm.formats.channels import ENCODINGS, read_encoded
 from wlm.formats.exr import write_exr
 from wlm.formats.light import read_light
 

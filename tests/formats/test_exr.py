@@ -8,8 +8,7 @@ import OpenEXR
 import pytest
 
 from wlm.errors import WlmError
-from wlm.formats.exr import HALF_MAX, read_exr, write_exr
-from wlm.formats.exr_planes import read_planes, write_planes
+from wlm.formats.exr import HALF_MAX, read_exr, read_planes, write_exr, write_planes
 
 PLANES = {"depth": np.ones((3, 4)), "top": np.zeros((3, 4))}
 SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -77,10 +77,9 @@ def _textures(folder: Path) -> None:
     size = _WIDTH, _HEIGHT
     flat = np.where(_pixels(3) > 0.5, 1.0, 0.25).astype(np.float32)
     (folder / "runs.hdr").write_bytes(imagecodecs.rgbe_encode(flat, header=True))
-    # Rows of a texel, a repeat of 4, another texel and a repeat of 4.
-    row = bytes([200, 100, 50, 128, 1, 1, 1, 4, 50, 150, 250, 129, 1, 1, 1, 4])
+    row = bytes([200, 100, 50, 128, 50, 150, 250, 129]) * 5
     head = b"#?RADIANCE\nEXPOSURE=2\nCOLORCORR=1 2 1\nFORMAT=32-bit_rle_rgbe\n\n"
-    (folder / "repeats.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
+    (folder / "plain.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
     words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
     blocks = words.tobytes()[: 9 * 16]
     half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]

@@ -11,8 +11,7 @@ from PIL import Image
 import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
-from wlm.formats.exr import read_exr, write_exr
-from wlm.formats.exr_file import write_part
+from wlm.formats.exr import read_exr, write_exr, write_part
 from wlm.lightmap.data import LightmapSet
 from wlm.lightmap.layers.data import LayerArrays, LayeredSet, from_layers
 

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 from wlm import interop
 from wlm.cli.app import app
 from wlm.errors import WlmError
-from wlm.formats.dds import write_dds
-from wlm.formats.dds_reader import read_dds
+from wlm.formats.dds import read_dds, write_dds
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.page import MapDecoder

@@ -17,7 +17,7 @@ from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.volume import load_volume, save_volume
-from wlm.formats.exr_planes import read_planes, write_planes
+from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke.baking import bake
 from wlm.smoke.data import (
     CHECKPOINT,

@@ -23,15 +23,15 @@ _FORMATS = {
     "astc": "ASTC_4x4_SFLOAT_BLOCK",
 }
 _ONE_ABOUT = (
-    "Light of a mesh from its compressed lightmap: call wlm_atlas of the shader with the UVs of set uv_set of mesh.glb. "
+    "Light of a mesh from its compressed lightmap: call wlm_atlas of the shader with UV set uv_set of mesh.glb. "
     "method is tiles (lut holds a rectangle of colour for each tile), cascade (lut holds coordinates of colour) or "
     "plain (colour alone). cr is 1 less the bits of the textures over the lightmap's at 48 per texel."
 )
 _SHARED_ABOUT = (
     "Light of a scene from its compressed lightmaps: call wlm_object of the shader with the UVs of set uv_set, the "
-    "scale_offset and sheet of the object, and the number of a state, which may lie between two states. objects are the "
-    "nodes of mesh.glb that read a sheet; extras.wlm of a node says the same. layer_heights are rows of a layer of the "
-    "texture arrays. cr is 1 less the bits of textures and tables over the lightmaps' at 48 per texel."
+    "scale_offset and sheet of the object, and the number of a state, which may lie between two states. objects are "
+    "the nodes of mesh.glb that read a sheet; extras.wlm of a node says the same. layer_heights are rows of a layer of "
+    "the texture arrays. cr is 1 less the bits of textures and tables over the lightmaps' at 48 per texel."
 )
 
 
@@ -43,8 +43,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         device: "cpu" or "cuda:N", where the reference is decoded.
 
     Returns:
-        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, `tail`, and with shared tiles
-        `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first sheet's
+        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, `tail`, and with shared
+        tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first sheet's
         in the first state.
 
     Raises:

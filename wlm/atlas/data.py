@@ -68,7 +68,7 @@ from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, material_lightmaps, read_listing
 from wlm.atlas.matching import chart_map, choose_mesh, fits_flipped, named, replace_strays
 from wlm.errors import WlmError
-from wlm.formats.encoded import read_encoded
+from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf, reported
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
@@ -243,7 +243,7 @@ def load(
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes that of the list, else 1, where engines and viewers
             look for them, if any primitive has it, else 0. Formats other than glTF have only 0.
         node: With one lightmap, the node that it belongs to, by its name, its mesh's name or its number.
-        encoding: With one lightmap, the meaning of a PNG's bytes, one of `wlm.formats.encoded.ENCODINGS`; None: the
+        encoding: With one lightmap, the meaning of a PNG's bytes, one of `wlm.formats.channels.ENCODINGS`; None: the
             file is no PNG.
         flip: With one lightmap, whether its top row is v = 1 of glTF.
         trust: Whether files may name files outside their folder, and draw more than their bytes account for

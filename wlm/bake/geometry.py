@@ -12,8 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from wlm.bake.settings import LightmapSettings
 from wlm.errors import WlmError, one_line
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf, reported, vertex_normals
-from wlm.formats.gltf_container import local_file
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, local_file, read_gltf, reported, vertex_normals
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES

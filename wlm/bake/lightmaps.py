@@ -13,8 +13,7 @@ from wlm.bake.texels import Texels, place_texels
 from wlm.bake.work import Task, each_hour
 from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
-from wlm.formats.exr import HALF_MAX, write_exr
-from wlm.formats.exr_file import read_part, write_part
+from wlm.formats.exr import HALF_MAX, read_part, write_exr, write_part
 from wlm.formats.folder import claim, compact_json, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.hdr_blocks import need

@@ -7,13 +7,18 @@ sampled apart from the other lights, so that its direct light can be left out.
 Mitsuba's names depend on its variant, which `wlm.bake.backend.start` chooses first.
 """
 
+from __future__ import annotations
+
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
+
+with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, reports a missing package
+    import drjit as dr
+    import mitsuba as mi
 
 SUN_ANGLE = math.radians(0.5358 / 2.0)
 """Radius of the sun's disc in the sky."""

@@ -1,12 +1,13 @@
 """A scene as Mitsuba has it: surfaces, and the lights of an hour."""
 
+from __future__ import annotations
+
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from wlm.bake.daylight import sun_direction
@@ -14,6 +15,10 @@ from wlm.bake.geometry import Geometry, Surface
 from wlm.bake.paths import SUN_ANGLE, Outside, Sun, Tracing
 from wlm.bake.settings import BakeScene, Daylight
 from wlm.errors import WlmError
+
+with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, reports a missing package
+    import drjit as dr
+    import mitsuba as mi
 
 _SKY_ROWS = 128
 _DISC_SAMPLES = 1 << 12

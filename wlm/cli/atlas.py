@@ -172,7 +172,7 @@ def evaluate(
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
-    """Compare with the original lightmap on views of the mesh, beside a smaller lightmap of equal bits."""
+    """Compare with the original lightmap on views of the mesh."""
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
@@ -189,7 +189,6 @@ def evaluate(
 
         evaluate_scene(folder, views, resolution, json_path, device, trust)
         return
-    from benchmarks.rivals.atlas import evaluate_rivals, share_of
     from wlm.atlas.evaluation import evaluate
     from wlm.atlas.exporter import read_folder, read_inputs
     from wlm.interop import check_device
@@ -200,7 +199,6 @@ def evaluate(
     options = {"views": views, "resolution": resolution, "device": device}
     with running("evaluate") as progress:
         report = evaluate(output.model, original, **options, progress=progress, file_bytes=output.model_bytes)
-        ((rival, score),) = evaluate_rivals(output.model, original, **options)
     if not report.views:
         raise WlmError(
             f"{folder}: cannot be scored: neither a camera around the mesh nor a viewer inside sees its charts"
@@ -209,16 +207,14 @@ def evaluate(
         from wlm.view.reports import atlas_report
 
         atlas_report(html_path, output.model, original, report, views)
-    rival_cr = 1.0 - share_of(rival, original)
     if json_path is not None:
-        rest = {"size": list(rival.size), "cr": rival_cr, "seconds": rival.encode_seconds}
         settings = {"cameras": views, "resolution": resolution, "device": device}
-        write_json(json_path, report.to_json() | settings | {rival.name: score.to_json() | rest})
-    rows = table(f"{folder}: {report.views} views", ["", "ours", rival.name])
-    rows.add_row("CR (eq. 9)", f"{report.cr:.2%}", f"{rival_cr:.2%}")
-    rows.add_row("CR on disk", f"{report.cr_disk:.2%}", "–")
+        write_json(json_path, report.to_json() | settings)
+    rows = table(f"{folder}: {report.views} views", ["", "value"])
+    rows.add_row("CR (eq. 9)", f"{report.cr:.2%}")
+    rows.add_row("CR on disk", f"{report.cr_disk:.2%}")
     for label, name, form in _ROWS:
-        rows.add_row(label, *(number(getattr(each, name), form) for each in (report, score)))
+        rows.add_row(label, number(getattr(report, name), form))
     show(rows)
 
 

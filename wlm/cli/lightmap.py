@@ -228,13 +228,6 @@ def evaluate(
     set_path: _Set,
     json_path: ReportFile = None,
     html_path: PageFile = None,
-    baselines: Annotated[
-        bool,
-        typer.Option(
-            "--baselines",
-            help="Add block codecs, temporal PCA and a video codec (extra `baselines`), on CUDA a neural codec too.",
-        ),
-    ] = False,
     views: Annotated[
         int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
     ] = 50,
@@ -267,7 +260,7 @@ def evaluate(
     device = check_device(device)
     model = _model(file)
     if model.SYSTEM == _LAYERED:
-        refuse_layers(html=html_path, baselines=baselines or None, score=score)
+        refuse_layers(html=html_path, score=score)
     lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
     with running("score") as progress:
         size = file.stat().st_size
@@ -281,14 +274,7 @@ def evaluate(
         from wlm.view.reports import lightmap_report
 
         lightmap_report(html_path, model, lightmaps, report)
-    extra, scores = {}, {}
-    if baselines:
-        from benchmarks.rivals.lightmap import RIVALS, evaluate_rivals
-
-        with running("baselines") as progress:
-            rivals = evaluate_rivals(model, lightmaps, views=views, device=device, progress=progress)
-        extra = {"baselines": [rival.to_json() | score.to_json() for rival, score in rivals]}
-        scores = {RIVALS[rival.name].label: score for rival, score in rivals}
+    extra: dict[str, Any] = {}
     contest = None
     if score is not None:
         with running("contest") as progress:
@@ -296,7 +282,7 @@ def evaluate(
         extra[score] = plain(contest)
     if json_path is not None:
         write_json(json_path, report.to_json() | extra)
-    show_report(file, report, scores)
+    show_report(file, report)
     if contest is not None:
         show_contest(contest)
 

@@ -124,8 +124,7 @@ def write_layer(
     import numpy as np
 
     from wlm.formats.channels import read_channels
-    from wlm.formats.exr import HALF_MAX
-    from wlm.formats.exr_file import write_part
+    from wlm.formats.exr import HALF_MAX, write_part
     from wlm.lightmap.exporter import write_8bit
     from wlm.lightmap.layers.sheet import ENCODINGS
 

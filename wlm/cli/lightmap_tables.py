@@ -7,29 +7,20 @@ from typing import TYPE_CHECKING
 from wlm.cli.console import escape, note, number, show, table
 
 if TYPE_CHECKING:
-    from benchmarks.rivals.lightmap import Score
     from wlm.lightmap import Report
     from wlm.lightmap.held import HeldTile
     from wlm.metrics.contest import ContestScore
 
 
-def show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> None:
-    """Shows the scores of a set, beside those of its rivals by their labels, and what they hide."""
-    sizes = ["bytes on disk", "bpp on disk", "bpp in memory"] if rivals else ["bytes", "bpp"]
-    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", *sizes])
+def show_report(file: Path, report: "Report") -> None:
+    """Shows the scores of a set and what their means hide."""
+    rows = table(str(file), ["", "PSNR dB", "SSIM", "FLIP", "bytes", "bpp"])
 
     def add(name: str, psnr: float, ssim: float, flip: float, *sizes: str) -> None:
         rows.add_row(name, number(psnr, ".2f"), number(ssim, ".4f"), number(flip, ".4f"), *sizes)
 
     own = f"wlm {escape(report.profile)}"
-    named: list[tuple[str, Report | Score]] = [(own, report), *rivals.items()]
-    for label, score in named:
-        ours = score is report
-        kept, bits, held = (
-            (score.bytes, score.bpp, score.memory_bpp) if ours else (score.disk_bytes, score.disk_bpp, score.bpp)
-        )
-        memory = [f"{held:.3f}"] if rivals else []
-        add(label, score.psnr, score.ssim, score.flip, f"{kept:,}", f"{bits:.3f}", *memory)
+    add(own, report.psnr, report.ssim, report.flip, f"{report.bytes:,}", f"{report.bpp:.3f}")
     rows.add_section()
     scores = (report.psnr_by_time, report.ssim_by_time, report.flip_by_time)
     for stamp, *values in zip(report.time_values, *scores, strict=True):
@@ -41,7 +32,7 @@ def show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> Non
         if any(value == value for value in values):
             add(f"tile {tile}", *values)
     show(rows)
-    _show_seen(named)
+    _show_seen(own, report)
     if report.worst_tile is not None:
         worst = report.worst_tile
         note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
@@ -71,7 +62,7 @@ def show_report(file: Path, report: "Report", rivals: "dict[str, Score]") -> Non
         note(f"warning: {warning}")
 
 
-def _show_seen(named: "list[tuple[str, Report | Score]]") -> None:
+def _show_seen(own: str, report: "Report") -> None:
     """Shows the scores of `wlm.lightmap.seen`; columns without any number are left out."""
     columns = {
         "texels dB": ("psnr", ".2f", 1.0),
@@ -84,14 +75,13 @@ def _show_seen(named: "list[tuple[str, Report | Score]]") -> None:
         "views FLIP": ("view_flip", ".4f", 1.0),
     }
     found = {
-        title: [number(scale * getattr(score, name), form) for _, score in named]
+        title: number(scale * getattr(report, name), form)
         for title, (name, form, scale) in columns.items()
-        if any(math.isfinite(getattr(score, name)) for _, score in named)
+        if math.isfinite(getattr(report, name))
     }
     if len(found) > 1:
         rows = table("as it is seen", ["", *found])
-        for name, *cells in zip((name for name, _ in named), *found.values(), strict=True):
-            rows.add_row(name, *cells)
+        rows.add_row(own, *found.values())
         show(rows)
 
 

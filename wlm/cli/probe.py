@@ -51,7 +51,6 @@ from wlm.errors import WlmError
 if TYPE_CHECKING:
     import numpy as np
 
-    from benchmarks.rivals.rival import Rival
     from wlm.probe import DayModel, ProbeModel, ProbeSet, Report, Transform
 
 app = typer.Typer(
@@ -72,16 +71,6 @@ _Original = Annotated[
     Path | None,
     typer.Option(metavar="PROBES", help="The probes that were compressed, where a transform's file has no positions."),
 ]
-
-_NAMES = {
-    "global_pca": "PCA",
-    "block_pca": "block PCA",
-    "window_pca": "windowed block PCA",
-    "clustered_pca": "clustered PCA",
-    "clustered_pca_signal": "clustered PCA, by signal",
-    "moving_basis": "moving basis",
-    "unreal": "Unreal's 8 bits",
-}
 
 
 @app.command()
@@ -227,9 +216,6 @@ def evaluate(
     probes_paths: _Hours,
     json_path: ReportFile = None,
     html_path: PageFile = None,
-    baselines: Annotated[
-        bool, typer.Option("--baselines", help="Add the PCA family, a moving basis and 8 bits, at equal bytes.")
-    ] = False,
     volume: Annotated[
         bool, typer.Option("--volume", help="Score what is read through the cascaded volume along a walk.")
     ] = False,
@@ -262,8 +248,8 @@ def evaluate(
     if isinstance(model, DayModel):
         sets = read_hours(probes_paths, model.times, key, convention)
         if time is None:
-            if baselines or volume or views or mesh is not None or html_path is not None:
-                raise WlmError("--time: expected with --baselines, --volume, --views, --mesh and --html")
+            if volume or views or mesh is not None or html_path is not None:
+                raise WlmError("--time: expected with --volume, --views, --mesh and --html")
             evaluate_hours(file, model, sets, json_path, hold_out, device)
             return
         if hold_out:
@@ -284,20 +270,12 @@ def evaluate(
         from wlm.view.reports import probe_report
 
         probe_report(html_path, model, probes, report)
-    rivals = []
-    if baselines:
-        from benchmarks.rivals.probe import evaluate_rivals
-
-        with running("baselines") as progress:
-            rivals = evaluate_rivals(probes, report.bytes, progress=progress, skipped=lambda error: note(str(error)))
     seen = score_seen(model, probes, views, mesh, device) if views or mesh is not None else []
     walked = walk_scores(model, probes, device) if volume else {}
     if json_path is not None:
-        scores = [{"method": rival.name} | rival.to_json() | score.to_json() for rival, score in rivals]
-        content = report.to_json() | ({"baselines": scores} if baselines else {})
-        content |= {"volume": walked} if walked else {}
+        content = report.to_json() | ({"volume": walked} if walked else {})
         write_json(json_path, content | ({"views": [score.to_json() for score in seen]} if seen else {}))
-    _show_report(file, model.profile.name, report, rivals)
+    _show_report(file, model.profile.name, report)
     show_walk_scores(walked)
     show_seen(seen)
 
@@ -435,14 +413,12 @@ def _decoder(
     return model.decoder(device) if given is None else model.decoder(device, position=given)
 
 
-def _show_report(file: Path, profile: str, report: "Report", rivals: "list[tuple[Rival, Report]]") -> None:
+def _show_report(file: Path, profile: str, report: "Report") -> None:
     columns = ["", "PSNR dB", "live dB", "irradiance dB", "bytes", "of float32", "bits a probe"]
     rows = table(str(file), columns)
-    named = [(f"wlm {escape(profile)}", report)]
-    named += [(f"{_NAMES.get(rival.name, rival.name)}, {rival.option}", score) for rival, score in rivals]
-    for name, score in named:
-        psnr = (number(value, ".2f") for value in (score.psnr, score.psnr_live, score.irradiance_psnr))
-        rows.add_row(name, *psnr, f"{score.bytes:,}", f"{score.ratio:.2%}", f"{score.bits_per_probe:.2f}")
+    psnr = (number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
+    sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")
+    rows.add_row(f"wlm {escape(profile)}", *psnr, *sizes)
     if report.psnr_by_band is not None:
         rows.add_section()
         for band, psnr in enumerate(report.psnr_by_band):

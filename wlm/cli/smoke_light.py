@@ -210,7 +210,7 @@ def _each(frames: "Frames") -> "Iterator[tuple[int, DensityVolume]]":
 
 
 def _write_exr(path: Path, made: "Transport") -> None:
-    from wlm.formats.exr_planes import write_planes
+    from wlm.formats.exr import write_planes
 
     orders = made.planes.sum(0).cpu().numpy()
     noise = made.total_noise.cpu().numpy()

@@ -151,7 +151,7 @@ def evaluate(
     html_path: PageFile = None,
     device: Device = "cpu",
 ) -> None:
-    """Measure a network on smoke that it hasn't learned from, beside a coarse march and a flip book.
+    """Measure a network on smoke that it was not trained on.
 
     The smoke is of sequences by which no network was chosen either, at half, once and twice its density, and the
     volumes given. PSNR is of the lightmaps in sRGB; flicker is what changes from frame to frame beside the motion, over
@@ -162,7 +162,6 @@ def evaluate(
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from benchmarks.rivals.smoke import RIVALS
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network, shipped
     from wlm.smoke.evaluation import compare
@@ -172,7 +171,7 @@ def evaluate(
     sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
     settings = model.dataset.model_copy(update=sizes)
     with running("evaluate") as progress:
-        comparisons = compare(model, settings, smoke or (), rivals=RIVALS, device=device, progress=progress)
+        comparisons = compare(model, settings, smoke or (), device=device, progress=progress)
     if json_path is not None:
         facts = {"network": _facts(network, model), "device": device, **sizes}
         write_json(json_path, facts | {"sets": [comparison.to_json() for comparison in comparisons]})

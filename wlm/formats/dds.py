@@ -7,7 +7,13 @@ Slices and layers follow each other, each a 2D grid of blocks (or of texels, row
 import os
 import struct
 
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats import float_texels as texels
 from wlm.formats.atomic import atomic_write
+from wlm.formats.float_texels import Layout, check_picture, decode_texels
+from wlm.formats.reading import open_file, read_file
 
 DXGI_FORMATS = {
     "R32G32B32A32_FLOAT": 2,
@@ -50,7 +56,7 @@ MOST_SIDE = 16384
 """Texels along a side: the limit of a 2D texture in Direct3D 11 and 12."""
 _MAX_DEPTH = 2048
 
-_MAGIC = b"DDS "
+MAGIC = b"DDS "
 # Size, flags, height, width, linear size, depth, mip levels, 11 reserved; pixel format: size, flags, code,
 # bits, 4 masks; caps 1 to 4, reserved. Then DX10: format, dimension, flags, array size, alpha mode.
 _HEADER = struct.Struct("<4s 7I 44x 2I 4s 5I 4I 4x 5I")
@@ -65,6 +71,26 @@ _CAPS_COMPLEX, _CAPS_TEXTURE, _CAPS_MIPS = 0x8, 0x1000, 0x400000
 _MIPS = 0x20000
 _CAPS2_VOLUME = 0x200000
 _DIMENSION_2D, _DIMENSION_3D = 3, 4
+
+# Size, flags, height, width; pixel format: size, flags, code; caps 2. Then the DX10 header.
+_READ_HEADER = struct.Struct("<4s 4I 56x 2I 4s 24x I 12x")
+_DX10 = struct.Struct("<5I")  # format, dimension, flags, array size, alpha mode
+_DEPTH_FIELD, _DEPTH_AT = struct.Struct("<I"), 24
+_MOST_VOLUME_BYTES = 1 << 26
+_CAPS2_CUBE = 0x200
+_FLAG_CUBE = 0x4
+
+_LAYOUTS: dict[int, tuple[str, Layout]] = {
+    2: ("R32G32B32A32_FLOAT", texels.FLOAT_RGBA),
+    6: ("R32G32B32_FLOAT", texels.FLOAT_RGB),
+    10: ("R16G16B16A16_FLOAT", texels.HALF_RGBA),
+    26: ("R11G11B10_FLOAT", texels.PACKED),
+    67: ("R9G9B9E5_SHAREDEXP", texels.SHARED),
+    95: ("BC6H_UF16", texels.BC6H_UNSIGNED),
+    96: ("BC6H_SF16", texels.BC6H_SIGNED),
+}
+_EXPECTED = ", ".join(name for name, _ in _LAYOUTS.values())
+_LEGACY = {113: ("A16B16G16R16F", texels.HALF_RGBA), 116: ("A32B32G32R32F", texels.FLOAT_RGBA)}
 
 
 def write_dds(
@@ -120,7 +146,7 @@ def write_dds(
     if fmt in _TEXEL_BYTES:
         size_flag, size = _PITCH, width * _TEXEL_BYTES[fmt]
     header = _HEADER.pack(
-        _MAGIC,
+        MAGIC,
         _HEADER_SIZE,
         _REQUIRED | size_flag | (_DEPTH if volume else 0) | (_MIPS if mips else 0),
         height,
@@ -146,3 +172,112 @@ def _slice_bytes(fmt: str, width: int, height: int) -> int:
     if fmt in _TEXEL_BYTES:
         return width * height * _TEXEL_BYTES[fmt]
     return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
+
+
+def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads the largest level of a DDS file of light.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pixels, float32 [H, W, 3 or 4], and the channels' names.
+
+    Raises:
+        WlmError: The file is missing, not a DDS, cut short or damaged, of another format, an array, a cube or a volume,
+            or the package that decodes it is missing.
+    """
+    with open_file(path, "the DDS file") as file:
+        held = os.fstat(file.fileno()).st_size
+        head = file.read(_READ_HEADER.size)
+        if not head.startswith(MAGIC):
+            raise WlmError(f"{path}: expected a DDS file, found other content")
+        if len(head) < _READ_HEADER.size:
+            raise WlmError(f"{path}: the file is cut short: expected {_READ_HEADER.size} bytes, found {len(head)}")
+        _, size, _, height, width, pixel_size, pixel_flags, code, caps2 = _READ_HEADER.unpack(head)
+        for field, found, expected in (
+            ("header size", size, _HEADER_SIZE),
+            ("pixel format size", pixel_size, _PIXEL_FORMAT_SIZE),
+        ):
+            if found != expected:
+                raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+        if caps2 & (_CAPS2_CUBE | _CAPS2_VOLUME):
+            kind = "cube" if caps2 & _CAPS2_CUBE else "volume"
+            raise WlmError(f"{path}: expected a 2D texture, found a {kind}")
+        if pixel_flags & _FOUR_CC and code == b"DX10":
+            name, layout = _of_dx10(path, file.read(_DX10.size))
+        else:
+            name, layout = _of_code(path, pixel_flags, code)
+        check_picture(path, held, width, height, layout.unpacked)
+        expected = layout.bytes_of(width, height)
+        start = file.tell()
+        if start + expected > held:
+            claimed = f"{start + expected} bytes, of {width} x {height} {name}"
+            raise WlmError(f"{path}: the file is cut short: expected {claimed}, found {held}")
+        data = file.read(expected)
+    if len(data) != expected:
+        raise WlmError(f"{path}: expected {expected} bytes of texels, found another number: does it change?")
+    return decode_texels(path, layout, data, width, height), layout.names
+
+
+def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, int, int]) -> np.ndarray:
+    """Reads a volume texture of four bytes a texel.
+
+    Args:
+        path: The file.
+        fmt: A key of `wlm.formats.dds.DXGI_FORMATS`.
+        size: Width, height and depth.
+
+    Returns:
+        uint32 [depth, height, width], little-endian, the first channel in the lowest bits.
+
+    Raises:
+        WlmError: The file can't be read, is another kind of texture or of another size, or is cut short.
+    """
+    width, height, depth = size
+    head = _READ_HEADER.size + _DX10.size
+    data = read_file(path, _MOST_VOLUME_BYTES, "the texture")
+    if len(data) < head or not data.startswith(MAGIC):
+        raise WlmError(f"{path}: expected a DDS file of {width} x {height} x {depth} texels, found other content")
+    _, _, _, rows, columns, _, _, code, caps2 = _READ_HEADER.unpack_from(data)
+    number, dimension, *_ = _DX10.unpack_from(data, _READ_HEADER.size)
+    expected = (b"DX10", DXGI_FORMATS[fmt], _DIMENSION_3D)
+    if (code, number, dimension) != expected or not caps2 & _CAPS2_VOLUME:
+        raise WlmError(f"{path}: expected a volume texture of {fmt}, found another kind")
+    found = (columns, rows, *_DEPTH_FIELD.unpack_from(data, _DEPTH_AT))
+    if found != size or len(data) != head + 4 * width * height * depth:
+        raise WlmError(
+            f"{path}: expected {width} x {height} x {depth} texels, found {' x '.join(map(str, found))} "
+            f"in {len(data) - head} bytes"
+        )
+    return np.frombuffer(data, "<u4", offset=head).reshape(depth, height, width)
+
+
+def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:
+    """The format that the DX10 header states."""
+    if len(data) < _DX10.size:
+        raise WlmError(f"{path}: the file is cut short within its DX10 header")
+    number, dimension, flags, layers, _ = _DX10.unpack(data)
+    if number not in _LAYOUTS:
+        name = next((name for name, written in DXGI_FORMATS.items() if written == number), None)
+        found = f"{number} ({name})" if name else number
+        raise WlmError(f"{path}: DXGI format: expected {_EXPECTED}, found {found}")
+    for field, found, fits, expected in (
+        ("dimension", dimension, dimension == _DIMENSION_2D, f"{_DIMENSION_2D} (2D)"),
+        ("DX10 flags", hex(flags), not flags & _FLAG_CUBE, "no cube"),
+        ("array size", layers, layers <= 1, "1 (no array)"),
+    ):
+        if not fits:
+            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+    return _LAYOUTS[number]
+
+
+def _of_code(path: str | os.PathLike[str], flags: int, code: bytes) -> tuple[str, Layout]:
+    """The format of a file without the DX10 header."""
+    number = int.from_bytes(code, "little")
+    if flags & _FOUR_CC and number in _LEGACY:
+        return _LEGACY[number]
+    text = code.decode("latin-1") if code.isalnum() else str(number)
+    found = f"FourCC {text}" if flags & _FOUR_CC else "bit masks of integers"
+    known = " or ".join(f"{number} ({name})" for number, (name, _) in _LEGACY.items())
+    raise WlmError(f"{path}: pixel format: expected DX10, or FourCC {known}, found {found}")

@@ -14,8 +14,18 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.formats.gltf import COMPONENTS, TRIANGLES, GltfDocument, GltfPrimitive, elements, reported
-from wlm.formats.gltf_container import BINARY_CHUNK, JSON_CHUNK, MAGIC, local_file
+from wlm.formats.gltf import (
+    BINARY_CHUNK,
+    COMPONENTS,
+    JSON_CHUNK,
+    MAGIC,
+    TRIANGLES,
+    GltfDocument,
+    GltfPrimitive,
+    elements,
+    local_file,
+    reported,
+)
 from wlm.formats.limits import MESH_BYTES
 from wlm.formats.reading import read_file
 

@@ -32,15 +32,16 @@ _ENGINE = 4
 _FORMATS = (4, 5, 6)
 _HAS_UIDS, _IS_DOUBLE, _HAS_SCRIPT_CLASS = 2, 4, 8
 _RESERVED = 11
+_WRITTEN_FORMAT, _NAMED_IDS = 4, 1  # every Godot 4 reads it
 
 # Compressed files: Zstandard in blocks of 4096 bytes. The limit keeps a damaged size from filling the memory.
 _ZSTD = 2
 _LARGEST_BLOCK = 1 << 20
 
 # Types of values. A real has 4 bytes, or 8 in a file of a double-precision build.
-_BOOL, _INT, _RECTANGLE, _LONG = 2, 3, 11, 40
+_BOOL, _INT, _FLOAT, _RECTANGLE, _AABB, _LONG = 2, 3, 4, 11, 15, 40
 _STRING, _STRING_NAME, _NODE_PATH, _OBJECT, _DICTIONARY, _ARRAY = 5, 44, 22, 24, 26, 30
-_BYTES, _STRINGS, _VECTOR3S, _COLOURS = 31, 34, 35, 36
+_BYTES, _INTS, _STRINGS, _VECTOR3S, _COLOURS = 31, 32, 34, 35, 36
 # Those of a fixed size: reals, and bytes.
 _FIXED = {
     1: (0, 0),  # nil
@@ -72,7 +73,7 @@ _FIXED = {
 # Packed arrays: reals and bytes of one element.
 _PACKED = {
     _BYTES: (0, 1),
-    32: (0, 4),  # 32-bit ints
+    _INTS: (0, 4),  # of 32 bits
     33: (0, 4),  # floats
     _VECTOR3S: (3, 0),
     _COLOURS: (0, 16),
@@ -451,3 +452,53 @@ def _decompress(reader: _Reader) -> bytes:
             raise WlmError(f"{path}: compressed block {i}: expected {expected} bytes, found {len(piece)}")
         pieces.append(piece)
     return b"".join(pieces)
+
+
+def lmbake_bytes(
+    points: np.ndarray, sh: np.ndarray, tetrahedra: np.ndarray, planes: np.ndarray, children: np.ndarray
+) -> bytes:
+    """What a new bake holds.
+
+    Args:
+        points: [N, 3], metres.
+        sh: [N, 9, 3], the numbers that the module's description defines.
+        tetrahedra: int [T, 4], between points.
+        planes, children: [M, 4] and int [M, 2], a tree of planes n x = d: where n x > d the first child is next, else
+            the second; a child is a node from 0, or -1 - t for the tetrahedron t.
+    """
+    low, high = points.min(0), points.max(0)
+    node = np.zeros((len(planes), 6), "<u4")
+    node[:, :4] = planes.astype("<f4").view("<u4")
+    node[:, 4:] = children.astype("<i4").view("<u4")
+    data = {
+        "bounds": _u32(_AABB) + np.concatenate([low, high - low]).astype("<f4").tobytes(),
+        "points": _u32(_VECTOR3S, len(points)) + points.astype("<f4").tobytes(),
+        "tetrahedra": _u32(_INTS, tetrahedra.size) + tetrahedra.astype("<i4").tobytes(),
+        "bsp": _u32(_INTS, node.size) + node.tobytes(),
+        "sh": _u32(_COLOURS, COEFFICIENTS * len(points)) + _colours(sh),
+        "interior": _u32(_BOOL, 0),
+        "baked_exposure": _u32(_FLOAT) + struct.pack("<f", 1.0),
+    }
+    content = _u32(_DICTIONARY, len(data)) + b"".join(_u32(_STRING) + _text(key) + each for key, each in data.items())
+    head = b"RSRC" + _u32(0, 0, _ENGINE, 0, _WRITTEN_FORMAT) + _text(_TYPE)
+    # No import metadata, no UID of its own, no name of a script's class.
+    head += struct.pack("<QIQ", 0, _NAMED_IDS, 0) + _u32(*[0] * _RESERVED)
+    head += _u32(1) + _text(_PROPERTY) + _u32(0)  # names; resources elsewhere
+    head += _u32(1) + _text("local://1")
+    body = _text(_TYPE) + _u32(1) + _u32(0) + content
+    return head + struct.pack("<Q", len(head) + 8) + body + b"RSRC"
+
+
+def _colours(sh: np.ndarray) -> bytes:
+    colours = np.zeros((len(sh), COEFFICIENTS, 4), "<f4")
+    colours[..., :3] = sh
+    return colours.tobytes()
+
+
+def _u32(*values: int) -> bytes:
+    return struct.pack(f"<{len(values)}I", *values)
+
+
+def _text(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return _u32(len(data)) + data

@@ -8,12 +8,17 @@ basic descriptor block.
 import math
 import os
 import struct
+from typing import BinaryIO
 
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats import float_texels as texels
 from wlm.formats.atomic import atomic_write
-from wlm.formats.reading import read_file
+from wlm.formats.deflate import inflate
+from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
+from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.reading import open_file, read_file
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
@@ -29,7 +34,7 @@ VK_FORMATS = {
 """The formats that can be written and their Vulkan numbers: 16 or 32 bits a channel, RGB9E5, or 16 bytes a block of 4 x
 4."""
 
-_IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
+MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
 # length of the descriptor and of the key/value data; of the supercompression's data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
@@ -55,6 +60,29 @@ _FLOAT, _SIGNED, _EXPONENT = 0x80, 0x40, 0x20  # a sample's qualifiers
 _SHARED = "E5B9G9R9_UFLOAT_PACK32"
 # Its mantissa that stands for 1 at the exponent's middle, and the exponent's middle and most (section 5.21).
 _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
+
+# The header and the first entry of the level index, which describes the largest level.
+_READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
+_PAIRS_BYTES = 1 << 20  # of the key/value data
+_DESCRIPTOR_BYTES = 20  # of the descriptor, up to its colours
+_TRANSFERS = (0, 1)  # unspecified, linear
+
+_LAYOUTS: dict[int, tuple[str, Layout]] = {
+    90: ("R16G16B16_SFLOAT", texels.HALF_RGB),
+    97: ("R16G16B16A16_SFLOAT", texels.HALF_RGBA),
+    106: ("R32G32B32_SFLOAT", texels.FLOAT_RGB),
+    109: ("R32G32B32A32_SFLOAT", texels.FLOAT_RGBA),
+    122: ("B10G11R11_UFLOAT_PACK32", texels.PACKED),
+    123: ("E5B9G9R9_UFLOAT_PACK32", texels.SHARED),
+    143: ("BC6H_UFLOAT_BLOCK", texels.BC6H_UNSIGNED),
+    144: ("BC6H_SFLOAT_BLOCK", texels.BC6H_SIGNED),
+    **{
+        1000066000 + i: (f"ASTC_{block[0]}x{block[1]}_SFLOAT_BLOCK", texels.ASTC[block])
+        for i, block in enumerate(ASTC_BLOCKS)
+    },
+}
+_EXPECTED = "16 or 32-bit SFLOAT of RGB or RGBA, B10G11R11, E5B9G9R9, BC6H or ASTC SFLOAT"
+_NONE, _ZSTD, _ZLIB = 0, 2, 3
 
 
 def write_ktx2(
@@ -108,7 +136,7 @@ def write_ktx2(
         pieces += [gap, data[first : first + sizes[level]]]
         place += len(gap) + sizes[level]
     header = _HEADER.pack(
-        _IDENTIFIER,
+        MAGIC,
         VK_FORMATS[fmt],
         4 if fmt == _SHARED else _channel_bytes(fmt) if fmt in _CHANNELS else 1,
         width,
@@ -138,7 +166,7 @@ def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
     head = _HEADER.size + _LEVEL.size
     largest = head + _MOST_TEXELS * 8 + _MOST_PAIRS
     data = read_file(path, largest, "the texture")
-    if len(data) < head or data[: len(_IDENTIFIER)] != _IDENTIFIER:
+    if len(data) < head or data[: len(MAGIC)] != MAGIC:
         raise WlmError(f"{path}: expected a KTX2 texture")
     fields = _HEADER.unpack_from(data)
     fmt, _, width, height, depth, layers, faces, levels, packing = fields[1:10]
@@ -208,3 +236,111 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
     head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, texel_bytes)
     block = struct.pack("<I 2H 4B 4B B7x", *head) + b"".join(samples)
     return struct.pack("<I", 4 + size) + block
+
+
+def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads the largest level of a KTX2 file of light, plain or under zstd or zlib.
+
+    `KTXorientation` is honoured: the pixels' first row is the top one.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pixels, float32 [H, W, 3 or 4], and the channels' names. Of ASTC the alpha is left out.
+
+    Raises:
+        WlmError: The file is missing, not a KTX2, cut short or damaged, of another format, an array, a cube or a
+            volume, its channels are exchanged or not linear, or the package that unpacks it is missing.
+    """
+    with open_file(path, "the KTX2 file") as file:
+        held = os.fstat(file.fileno()).st_size
+        head = file.read(_READ_HEADER.size)
+        if not head.startswith(MAGIC):
+            raise WlmError(f"{path}: expected a KTX2 file, found other content")
+        if len(head) < _READ_HEADER.size:
+            raise WlmError(f"{path}: the file is cut short: expected {_READ_HEADER.size} bytes, found {len(head)}")
+        fields = _READ_HEADER.unpack(head)
+        number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
+        descriptor, pairs = fields[10:12], fields[12:14]
+        start, stored, size = fields[16:19]
+        if number not in _LAYOUTS:
+            name = next((name for name, written in VK_FORMATS.items() if written == number), None)
+            found = f"{number} ({name})" if name else number
+            raise WlmError(f"{path}: vkFormat: expected {_EXPECTED}, found {found}")
+        name, layout = _LAYOUTS[number]
+        for field, found, fits, expected in (
+            ("pixelHeight", height, height > 0, "at least 1 (2D)"),
+            ("pixelDepth", depth, depth <= 1, "0 (no volume)"),
+            ("layerCount", layers, layers <= 1, "0 (no array)"),
+            ("faceCount", faces, faces == 1, "1 (no cube)"),
+            ("supercompressionScheme", scheme, scheme in (_NONE, _ZSTD, _ZLIB), "none (0), zstd (2) or zlib (3)"),
+        ):
+            if not fits:
+                raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+        check_picture(path, held, width, height, layout.unpacked)
+        expected = layout.bytes_of(width, height)
+        for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
+            if found != expected:
+                raise WlmError(
+                    f"{path}: {field} of level 0: expected {expected}, of {width} x {height} {name}, found {found}"
+                )
+        if stored > 2 * expected + 1024:  # no packer makes it longer than that
+            raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
+        _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
+        words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
+        right, down = _orientation(path, words, layout.channels)
+        data = _part(path, file, held, start, stored, "level 0", stored)
+    if scheme == _ZSTD:
+        data = unpack_zstd(path, data, expected)
+    elif scheme == _ZLIB:
+        try:
+            data = inflate(data, expected, f"{path}: level 0", f"{expected} bytes once unpacked")
+        except ValueError as error:
+            raise WlmError(str(error)) from error
+    if len(data) != expected:
+        raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
+    pixels = decode_texels(path, layout, data, width, height)
+    return np.ascontiguousarray(pixels[:: 1 if down else -1, :: 1 if right else -1]), layout.names
+
+
+def _part(
+    path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
+) -> bytes:
+    """Reads a part of the file, its first bytes alone where it has more than `most`."""
+    if start + size > held:
+        raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
+    file.seek(start)
+    data = file.read(min(size, most))
+    if len(data) != min(size, most):
+        raise WlmError(f"{path}: {what}: expected {min(size, most)} bytes, found another number: does it change?")
+    return data
+
+
+def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
+    """Checks that the light is linear: its size, a block's kind and size, then model, primaries and transfer."""
+    if len(data) < _DESCRIPTOR_BYTES:
+        raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
+    transfer = data[14]
+    if transfer not in _TRANSFERS:
+        raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+
+
+def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
+    """Whether columns go to the right and rows down, as they do without a word; checks the order of channels."""
+    found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        key, _, value = data[at + 4 : at + 4 + size].partition(b"\0")
+        if not 0 < size <= len(data) - at - 4:
+            raise WlmError(f"{path}: the key/value data is damaged, or longer than {_PAIRS_BYTES} bytes")
+        if key in found:
+            found[key] = value.rstrip(b"\0")
+        at += 4 + size + -size % 4
+    orientation, swizzle = found.values()
+    if orientation not in (b"rd", b"ru", b"ld", b"lu"):
+        raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]}")
+    if swizzle[:channels] != b"rgba"[:channels]:
+        raise WlmError(f"{path}: KTXswizzle: expected rgba, found {swizzle[:20]}")
+    return orientation[:1] == b"r", orientation[1:] == b"d"

@@ -5,9 +5,9 @@ import os
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import dds_reader, ktx2_reader, radiance
+from wlm.formats import dds, ktx2, radiance
+from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.exr import read_exr
-from wlm.formats.exr_file import MAGIC as EXR_MAGIC
 from wlm.formats.reading import open_file
 
 SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds")
@@ -19,8 +19,8 @@ EXPECTED = "EXR, Radiance (.hdr), KTX2 or DDS"
 _READERS = {
     EXR_MAGIC: read_exr,
     radiance.MAGIC: radiance.read_radiance,
-    ktx2_reader.MAGIC: ktx2_reader.read_ktx2,
-    dds_reader.MAGIC: dds_reader.read_dds,
+    ktx2.MAGIC: ktx2.read_ktx2,
+    dds.MAGIC: dds.read_dds,
 }
 # Of others that are taken for light, for the message.
 _OTHERS = {

@@ -1,8 +1,10 @@
-"""Reading Radiance pictures, `.hdr`: RGB with one exponent, plain or under either of its run-length codes.
+"""Reading Radiance pictures, `.hdr`: RGB with a shared exponent, plain or under the run-length code of 1991.
 
-Format: "Radiance File Formats", section "Picture File Format", of the Radiance documentation, and its `color.c`. A
-mantissa m under the exponent e is m 2^(e - 136), as `rgbe.c` and the readers of engines have it; Radiance itself takes
-m + 1/2, which makes black red, green or blue glow.
+The header is parsed and bounded here; imagecodecs decodes the texels. The run-length code of before 1991 is refused.
+
+Format: "Radiance File Formats", section "Picture File Format", of the Radiance documentation. A mantissa m with the
+exponent e is m 2^(e - 136), as in `rgbe.c` and in the readers of engines; Radiance itself uses m + 1/2, which makes
+black texels glow.
 """
 
 import math
@@ -12,7 +14,8 @@ import re
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.float_texels import check_picture
+from wlm.formats.float_texels import EXTRA, check_picture
+from wlm.formats.hdr_blocks import need
 from wlm.formats.reading import open_file
 
 MAGIC = b"#?"
@@ -20,17 +23,14 @@ MAGIC = b"#?"
 _HEADER_BYTES = 64 << 10
 _FORMAT = "32-bit_rle_rgbe"
 _SIZE = re.compile(rb"([+-])([XY]) +([0-9]{1,9}) +([+-])([XY]) +([0-9]{1,9})")
-_LEAST, _MOST = 8, 0x7FFF  # texels of a row that the newer run-length code is for
 _TEXEL = 4  # bytes: red, green, blue, exponent
-_UNPACKED = 6  # the same as half floats
-_SCALE = np.ldexp(np.float32(1), np.arange(256) - 136)
-_SCALE[0] = 0.0  # black, whatever the mantissas
+_UNPACKED = 6  # bytes of a texel as half floats
 
 
 def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads a Radiance picture of RGB.
 
-    Values are divided by all `EXPOSURE` and `COLORCORR` of the header, which say what they were multiplied by;
+    Values are divided by every `EXPOSURE` and `COLORCORR` of the header, which are factors that were applied to them;
     `PRIMARIES` are ignored.
 
     Args:
@@ -40,7 +40,8 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
         The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the channels' names.
 
     Raises:
-        WlmError: The file is missing, not a Radiance picture, cut short or damaged, holds XYZ or is gamma-corrected.
+        WlmError: The file is missing, is not a Radiance picture, is cut short or damaged, contains XYZ or
+            gamma-corrected values, or the package imagecodecs is missing.
     """
     with open_file(path, "the Radiance picture") as file:
         held = os.fstat(file.fileno()).st_size
@@ -56,7 +57,7 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
         upright = axes[2] == b"Y"
         check_picture(path, held, *((columns, rows) if upright else (rows, columns)), _UNPACKED)
         file.seek(start)
-        # The worst code has two bytes for each of a texel's, and four for a row. What follows is not of the picture.
+        # The longest run-length code has two bytes for each byte of a texel and four bytes for a row.
         data = file.read(rows * (2 * _TEXEL * columns + _TEXEL))
     pixels = _decode(path, data, rows, columns)
     if not upright:
@@ -71,7 +72,7 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
 
 
 def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int]:
-    """The lines of the header, that of the size last, and where the texels begin."""
+    """Returns the header's lines, the last of which states the size, and the offset of the first texel."""
     blank = head.find(b"\n\n")
     end = head.find(b"\n", blank + 2)
     if blank < 0 or end < 0:
@@ -82,7 +83,7 @@ def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int
 
 
 def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, float, float]:
-    """What red, green and blue were multiplied by; checks what else the header says."""
+    """Returns the factors of red, green and blue, and checks the header's other fields."""
     product = [1.0, 1.0, 1.0]
     for line in lines:
         name, equals, value = line.decode("latin-1").partition("=")
@@ -112,70 +113,16 @@ def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, fl
 
 def _decode(path: str | os.PathLike[str], data: bytes, rows: int, columns: int) -> np.ndarray:
     """Decodes all rows of a file, float32 [rows, columns, 3]."""
-    pixels = np.empty((rows, columns, 3), np.float32)
-    marker = bytes([2, 2, columns >> 8, columns & 0xFF]) if _LEAST <= columns <= _MOST else None
-    at = 0
-    for row in range(rows):
-        where = f"{path}: row {row} of {rows}"
-        if marker is not None and data[at : at + 2] == marker[:2] and data[at + 2 : at + 3] < b"\x80":
-            if data[at : at + _TEXEL] != marker:
-                raise WlmError(f"{where}: expected a row of {columns} texels, found another length")
-            texels, at = _runs(where, data, at + _TEXEL, columns)
-        else:
-            texels, at = _repeats(where, data, at, columns)
-        np.multiply(texels[:, :3], _SCALE[texels[:, 3], None], out=pixels[row], dtype=np.float32)
-    return pixels
-
-
-def _runs(where: str, data: bytes, at: int, columns: int) -> tuple[np.ndarray, int]:
-    """Decodes a row of the newer code: the four components one after another, in runs and literals of bytes."""
-    row, filled, end = bytearray(_TEXEL * columns), 0, 0
+    codecs = need("imagecodecs", EXTRA)
+    pixels = np.zeros((rows, columns, 3), np.float32)
+    texels = np.frombuffer(data, np.uint8, min(len(data) // _TEXEL, rows * columns) * _TEXEL).reshape(-1, _TEXEL)
     try:
-        for _ in range(_TEXEL):
-            end += columns
-            while filled < end:
-                code = data[at]
-                count = code - 128 if code > 128 else code
-                if not 0 < count <= end - filled:
-                    raise WlmError(f"{where}: the run-length code is damaged: a run of {count} texels")
-                if code > 128:
-                    row[filled : filled + count] = data[at + 1 : at + 2] * count
-                    at += 2
-                else:
-                    row[filled : filled + count] = data[at + 1 : at + 1 + count]
-                    at += 1 + count
-                filled += count
-    except IndexError:
-        at = len(data) + 1
-    # Past the end: a slice beyond it is short, and so is the row then.
-    if at > len(data) or len(row) != _TEXEL * columns:
-        raise WlmError(f"{where}: the file is cut short")
-    return np.frombuffer(row, np.uint8).reshape(_TEXEL, columns).T, at
-
-
-def _repeats(where: str, data: bytes, at: int, columns: int) -> tuple[np.ndarray, int]:
-    """Decodes a row of plain texels, or of the older code: 1, 1, 1, n repeats the texel before n times.
-
-    Of several in a row the second counts by 256, the third by 65,536.
-    """
-    count = min(columns, (len(data) - at) // _TEXEL)
-    texels = np.frombuffer(data, np.uint8, _TEXEL * count, at).reshape(-1, _TEXEL)
-    repeat = (texels[:, :3] == 1).all(axis=1)
-    if not repeat.any():
-        if count < columns:
-            raise WlmError(f"{where}: the file is cut short")
-        return texels, at + _TEXEL * columns
-    place = np.arange(count)
-    real = np.maximum.accumulate(np.where(repeat, -1, place))  # the texel that is repeated
-    # The number of repeats before this one; more than three would be longer than any row.
-    power = np.clip(place - real - 1, 0, 3)
-    length = np.where(repeat, texels[:, 3].astype(np.int64) << (8 * power), 1)
-    ends = np.cumsum(length)
-    used = int(np.searchsorted(ends, columns)) + 1
-    if used > count:
-        raise WlmError(f"{where}: the file is cut short")
-    if real[0] < 0 or ends[used - 1] != columns:
-        raise WlmError(
-            f"{where}: the run-length code is damaged: a repeat before the row's first texel or past its last"
-        )
-    return texels[np.repeat(real[:used], length[:used])], at + _TEXEL * used
+        # The old code repeats a texel by a texel of mantissas 1, 1, 1, which the decoder would take for a colour.
+        if data[:2] != b"\2\2" and (texels[:, :3] == 1).all(axis=1).any():
+            raise ValueError("found a repeat of the run-length code of before 1991")
+        # The decoder knows one orientation; the caller turns the picture.
+        canonical = b"#?RADIANCE\nFORMAT=%s\n\n-Y %d +X %d\n" % (_FORMAT.encode(), rows, columns)
+        codecs.rgbe_decode(canonical + data, out=pixels)
+    except (RuntimeError, ValueError) as error:
+        raise WlmError(f"{path}: the file is cut short or damaged, or of another run-length code: {error}") from error
+    return pixels

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import dds_reader, ktx2_reader, radiance
+from wlm.formats import dds, ktx2, radiance
 from wlm.formats.channels import read_channels
-from wlm.formats.exr import HALF_MAX
-from wlm.formats.exr_file import MAGIC as EXR_MAGIC
-from wlm.formats.exr_file import read_header
+from wlm.formats.exr import HALF_MAX, read_header
+from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.light import read_light
 from wlm.formats.limits import check_sides
 from wlm.formats.reading import open_file
@@ -77,8 +76,8 @@ def picture_of(path: Path) -> Picture | None:
     if head.startswith(radiance.MAGIC):
         return Picture("Radiance")
     for kind, magic, form, at in (
-        ("KTX2", ktx2_reader.MAGIC, "<2I", 20),
-        ("DDS", dds_reader.MAGIC, "<2I", 12),
+        ("KTX2", ktx2.MAGIC, "<2I", 20),
+        ("DDS", dds.MAGIC, "<2I", 12),
         ("PNG", PNG_MAGIC, ">2I", 16),
     ):
         if head.startswith(magic) and len(head) >= at + 8:

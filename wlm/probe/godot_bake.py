@@ -15,8 +15,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.folder import made_parents, staged, write_index
-from wlm.formats.godot import relit
-from wlm.formats.godot_writer import lmbake_bytes
+from wlm.formats.godot import lmbake_bytes, relit
 from wlm.probe.conventions import from_canonical
 from wlm.probe.data import load_positions
 from wlm.probe.lattice import CELLS, NUMBERS, lattice_of
@@ -119,7 +118,7 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
         low, size, count: Of the `Lattice`.
 
     Returns:
-        Planes, float64 [M, 4], and children, int32 [M, 2], as `wlm.formats.godot_writer` takes them.
+        Planes, float64 [M, 4], and children, int32 [M, 2], as `wlm.formats.godot` takes them.
     """
     cells = int(np.prod(count))
     inner = cells - 1  # nodes above the cells', which are five each and follow in the cells' order

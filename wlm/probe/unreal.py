@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.dds import write_dds
-from wlm.formats.dds_reader import read_word_volume
+from wlm.formats.dds import read_word_volume, write_dds
 from wlm.formats.folder import made_parents, staged, write_index
 from wlm.formats.reading import named_file
 from wlm.probe.conventions import UNREAL_LIGHT as FORMAT

@@ -23,8 +23,7 @@ from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import SUFFIXES, DensityVolume, load_volume
 from wlm.formats.atomic import atomic_write
-from wlm.formats.exr_file import read_part
-from wlm.formats.exr_planes import read_planes, write_planes
+from wlm.formats.exr import read_part, read_planes, write_planes
 from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
