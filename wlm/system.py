@@ -33,7 +33,6 @@ _PACKAGES = {
     "lightmap": "wlm.lightmap",
     "lightmap-layers": "wlm.lightmap.layers",
     "atlas": "wlm.atlas",
-    "atlas-scene": "wlm.atlas.scene",
     "probe": "wlm.probe",
     "smoke-network": "wlm.smoke",
 }

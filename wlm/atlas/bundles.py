@@ -44,8 +44,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
     Returns:
         A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, `tail`, and with shared
-        tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first sheet's
-        in the first state.
+        tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first
+        sheet's in the first state.
 
     Raises:
         WlmError: A texture has more texels along a side than GPUs take, there is no such device, or the stored

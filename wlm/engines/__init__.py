@@ -6,7 +6,6 @@ _PLACES = {
     "ENGINES": "wlm.engines.kit",
     "export_atlas": "wlm.engines.atlas",
     "export_lightmap": "wlm.engines.lightmap",
-    "export_scene": "wlm.engines.scene",
     "export_smoke": "wlm.engines.smoke",
 }
 

@@ -1,21 +1,23 @@
-"""A compressed lightmap for an engine: a material that reads it, and its textures."""
+"""Compressed lightmaps for an engine: a material that reads them, and their textures."""
 
-import dataclasses
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from wlm.atlas.exporter import MESH_FILE, Output
+from wlm.atlas.bundles import MESH_FILE, bundle
 from wlm.atlas.model import BLOCK_SIDE, AtlasModel
-from wlm.atlas.shader import atlas_glsl
+from wlm.atlas.shader import glsl
+from wlm.bundle import Texture
 from wlm.engines import unreal
 from wlm.engines.kit import ENGINES, README_FILE, filled, godot_uniforms
+from wlm.engines.scene import export_scene
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
+from wlm.formats.exr import write_exr
 from wlm.formats.folder import made_parents, staged, write_index
+from wlm.formats.ktx2 import write_ktx2
 from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-atlas-engine"
@@ -24,51 +26,49 @@ INFO_FILE = "atlas.json"
 
 
 def export_atlas(
-    output: Output, directory: str | os.PathLike[str], engine: str, *, shader: str = "glsl", exact: bool = False
+    model: AtlasModel, directory: str | os.PathLike[str], engine: str, *, shader: str = "glsl", exact: bool = False
 ) -> list[Path]:
-    """Writes what `wlm atlas compress` left for an engine: textures, the mesh, a material, and a page about it.
+    """Writes a model for an engine: textures, the mesh, a material, and a page about it.
 
     Engines' materials read the tiles alone: the mips of a model that has some are in "raw" only.
 
     Args:
-        output: The folder of the compression.
-        directory: Another folder; made if it isn't there. A new export replaces an earlier one.
+        model: The model.
+        directory: The folder; made if it isn't there. A new export replaces an earlier one.
         engine: One of `wlm.engines.ENGINES`, or "raw": the shader alone beside textures and mesh.
-        shader: Of "raw", its language, one of `wlm.shading.LANGUAGES`.
-        exact: Of "raw", texels are fetched and mixed in floats rather than filtered.
+        shader: For "raw", its language, one of `wlm.shading.LANGUAGES`.
+        exact: For "raw", whether texels are fetched and mixed in floats rather than filtered.
 
     Returns:
-        The files written, `atlas.json` last.
+        The files written, the index last.
 
     Raises:
         WlmError: No such engine or language, a colour texture in ASTC for an engine that has no such textures, the
-            folder holds something else, or a file is missing or can't be written.
+            folder holds something else, or a file can't be written.
     """
     if engine not in (*ENGINES, "raw"):
         raise WlmError(f"engine: expected one of raw, {', '.join(ENGINES)}, got {engine!r}")
     check_language(shader)
-    model, ending = output.model, ".exr" if engine in ("godot", "unreal") else ".dds"
+    if model.method == "shared":
+        return export_scene(model, directory, engine, shader=shader)
+    ending = ".exr" if engine in ("godot", "unreal") else ".dds"
     if model.colour == "astc" and engine == "raw":
         ending = ".ktx2"
     if model.colour == "astc" and ending == ".dds":
-        raise WlmError(f"{output.folder}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
+        raise WlmError(f"{model.name}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
     if engine != "raw":
-        model = dataclasses.replace(model, tail=model.tail[:0])
-    has = {"lut": model.method != "plain", "blocks": model.colour == "mixed", "tail": len(model.tail) > 0}
-    names = ["colour", *(name for name, given in has.items() if given)]
-    sizes = {name: made.shape[1::-1] for name, made in _made(model).items()}
+        model = model.without_mips()
+    made = bundle(model)
     texts = _raw(model, shader, exact) if engine == "raw" else _TEXTS[engine](model)
-    files = {name: name + (".bytes" if engine == "unity" else ending) for name in names}
+    files = {name: name + (".bytes" if engine == "unity" else ending) for name in made.textures}
     folder = Path(directory)
-    if folder.resolve() == output.folder.resolve():
-        raise WlmError(f"{folder}: expected another folder than that of the compression")
     with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
         for name, file in files.items():
+            texture = made.textures[name]
             if name == "colour" and engine != "raw" and ending == ".dds" and _odd_blocks(model):
-                _write_halves(staging / file, model.texels)
-            else:
-                _copy(output.folder / (name + ending), staging / file)
-        _copy(output.folder / MESH_FILE, staging / MESH_FILE)
+                texture = _halves(model.texels[0])
+            _write(texture, staging / file, ending)
+        (staging / MESH_FILE).write_bytes(made.files[MESH_FILE])
         for name, text in texts.items():
             (staging / name).write_bytes(text.encode())
         info = {
@@ -79,48 +79,46 @@ def export_atlas(
             "method": model.method,
             "colour": model.colour,
             "textures": files,
-            "sizes": {name: list(sizes[name]) for name in names},
+            "sizes": {name: [each.width, each.height] for name, each in made.textures.items()},
             "shader": next(iter(texts)),
-            "uv_set": output.report.get("new_uv_set") if len(model.uv) else output.report.get("uv_set"),
+            "uv_set": made.document["uv_set"],
         }
         write_index(staging / INFO_FILE, info)
     return [folder / name for name in (*texts, *files.values(), MESH_FILE, INFO_FILE)]
 
 
-def _made(model: AtlasModel) -> dict[str, np.ndarray]:
-    """The model's textures by name."""
-    return {"colour": model.texels, "lut": model.lut, "blocks": model.block_texels, "tail": model.tail}
-
-
 def _odd_blocks(model: AtlasModel) -> bool:
     """Whether the colours are blocks that don't fill their texture, which Direct3D and browsers refuse."""
-    return model.colour == "bc6h" and any(side % BLOCK_SIDE for side in model.texels.shape[:2])
+    return model.colour == "bc6h" and any(side % BLOCK_SIDE for side in model.texels.shape[1:3])
 
 
-def _write_halves(path: Path, texels: np.ndarray) -> None:
-    height, width = texels.shape[:2]
-    whole = np.concatenate([texels.astype("<f2"), np.ones((height, width, 1), "<f2")], 2)
-    # Under another ending in Unity's folder.
-    made = path.with_suffix(".dds")
-    write_dds(made, whole.tobytes(), width, height, fmt="R16G16B16A16_FLOAT")
+def _halves(texels: np.ndarray) -> Texture:
+    whole = np.concatenate([texels.astype("<f2"), np.ones((*texels.shape[:2], 1), "<f2")], 2)
+    return Texture(whole, "R16G16B16A16_FLOAT", *texels.shape[1::-1])
+
+
+def _write(texture: Texture, path: Path, ending: str) -> None:
+    """Writes a texture in the format of an ending, under a path that may have another ending."""
+    if ending == ".exr":
+        write_exr(path, texture.image[..., :3], half=not texture.fmt.endswith(("UINT", "UNORM")))
+        return
+    size, made = (texture.width, texture.height), path.with_suffix(ending)
+    data = np.ascontiguousarray(texture.data).tobytes()
+    if ending == ".dds":
+        write_dds(made, data, *size, fmt=texture.fmt, mips=texture.mips)
+    else:
+        write_ktx2(made, data, *size, texture.fmt, mips=texture.mips)
     made.rename(path)
 
 
-def _copy(source: Path, target: Path) -> None:
-    try:
-        shutil.copyfile(source, target)
-    except FileNotFoundError as error:
-        raise WlmError(f"{source}: no such file; compress again") from error
-
-
 def _raw(model: AtlasModel, language: str, exact: bool) -> dict[str, str]:
-    text = translate(atlas_glsl(model), language, ["WLM_ATLAS_EXACT"] if exact else [])
+    text = translate(glsl(model), language, ["WLM_ATLAS_EXACT"] if exact else [])
     return {"atlas" + ENDINGS[language]: text}
 
 
 def _three(model: AtlasModel) -> dict[str, str]:
     return {
-        "atlas.glsl": atlas_glsl(model),
+        "atlas.glsl": glsl(model),
         "atlas.js": filled("three_atlas.js", DDS=filled("three_dds.js")),
         README_FILE: filled("three_atlas.md", NAME=model.name),
     }
@@ -128,14 +126,14 @@ def _three(model: AtlasModel) -> dict[str, str]:
 
 def _godot(model: AtlasModel) -> dict[str, str]:
     return {
-        "atlas.gdshader": filled("godot_atlas.gdshader", SHADER=godot_uniforms(atlas_glsl(model))),
+        "atlas.gdshader": filled("godot_atlas.gdshader", SHADER=godot_uniforms(glsl(model))),
         README_FILE: filled("godot_atlas.md", NAME=model.name),
     }
 
 
 def _unity(model: AtlasModel) -> dict[str, str]:
     return {
-        "WlmAtlas.hlsl": translate(atlas_glsl(model), "hlsl"),
+        "WlmAtlas.hlsl": translate(glsl(model), "hlsl"),
         "WlmAtlas.shader": filled("unity_atlas.shader"),
         "WlmAtlas.cs": filled("unity_atlas.cs", DDS=filled("unity_dds.cs")),
         README_FILE: filled("unity_atlas.md", NAME=model.name),

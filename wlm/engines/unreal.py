@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from wlm.atlas.model import AtlasModel
-from wlm.atlas.shader import atlas_glsl
+from wlm.atlas.shader import glsl
 from wlm.engines.kit import README_FILE, check_sides, filled
 from wlm.formats.bc7 import blocks_image
 from wlm.formats.bc7_modes import decode_blocks
@@ -31,7 +31,7 @@ ivec2 wlm_lightmap_place(int i, float hour)
 
 def atlas_texts(model: AtlasModel) -> dict[str, str]:
     """The script and the page of an atlas."""
-    code, _ = custom_node(atlas_glsl(model), "wlm_atlas", "UV")
+    code, _ = custom_node(glsl(model), "wlm_atlas", "UV")
     place = asset_name(model.name)
     return {
         "wlm_atlas.py": filled("unreal_atlas.py.in", NAME=place, CODE=code, KIT=filled("unreal_kit.py.in")),

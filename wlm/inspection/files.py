@@ -26,8 +26,6 @@ _MAGIC = 16
 _VDB = b" BDV\0\0\0\0"
 BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
 """What is said of the folder of a bake."""
-ATLAS = "a compressed lightmap of a mesh"
-"""What is said of the folder of an atlas."""
 
 # Exports that can be read back.
 _PROBE_EXPORTS = {
@@ -37,12 +35,10 @@ _PROBE_EXPORTS = {
 }
 # What says of itself in JSON that it is ours, and what to do with it.
 _EXPORTS = _PROBE_EXPORTS | {
-    "wlm-atlas": ATLAS,
     "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",
     "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
-    "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
     "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
     "wlm-smoke-engine": "six-way smoke for one engine: a flip book of it and its shader",
     "wlm-lightmap-layers-engine": "layered lightmaps over time for one engine: a folder for each sheet of light",
@@ -134,7 +130,7 @@ def _lmbake(path: Path) -> Finding:
         return found
     textures = ", ".join(each.rsplit("/", 1)[-1] for each in bake.textures[:8])
     count = f"{len(bake.users)} mesh{'es' if len(bake.users) > 1 else ''}"
-    scene = f"wlm atlas compress SCENE.glb {quoted(path)} -o DIR takes it with its scene"
+    scene = f"wlm atlas compress SCENE.glb {quoted(path)} -o OUT.wlm takes it with its scene"
     return replace(found, what=f"{found.what}; {count} with rectangles in {textures}: {scene}")
 
 
@@ -181,7 +177,7 @@ def _mesh(path: Path) -> Finding:
         elif area > 1.0:
             cause = "each mesh may have a lightmap of its own" if parts > 1 else "not of a lightmap?"
             problems.append(f"its triangles have {area:.1f} times the UVs' square: they overlap; {cause}")
-    command = f"wlm atlas compress {quoted(path)} LIGHTMAP -o DIR" if uvs and not problems else ""
+    command = f"wlm atlas compress {quoted(path)} LIGHTMAP -o OUT.wlm" if uvs and not problems else ""
     return Finding(path, what, command, tuple(problems))
 
 
@@ -199,11 +195,10 @@ def _model(path: Path) -> Finding:
     kind = {
         "lightmap": "lightmaps over time",
         "lightmap-layers": "layered lightmaps over time",
-        "atlas": "a mesh's lightmap",
-        "atlas-scene": "the lightmaps of a scene",
+        "atlas": "the lightmaps of a scene",
         "probe": "light probes",
     }[model.SYSTEM]
-    command = "" if model.SYSTEM.startswith("atlas") else f"wlm web {quoted(path)} -o PAGE.html"
+    command = f"wlm web {quoted(path)} -o PAGE.html"
     return Finding(path, f"{kind}, compressed: {model.name}", command)
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import ATLAS, BAKED, document_of, inspect_file
+from wlm.inspection.files import BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
@@ -111,8 +111,6 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _next(folder: Path, stated: str) -> str:
-    if stated == ATLAS:
-        return f"wlm web {quoted(folder)} -o PAGE.html"
     return f"wlm smoke bake {quoted(folder)} -o DIR" if "frames of smoke" in stated else ""
 
 
@@ -248,7 +246,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     problems, alike = together(pictures, [heads[file] for file in pictures])
     if not alike:
         what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
-        command = f"wlm atlas compress MESH.glb {quoted(folder)} -o DIR"
+        command = f"wlm atlas compress MESH.glb {quoted(folder)} -o OUT.wlm"
         meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
         if len(meshes) == 1:
             # The charts tell which lightmap is whose.

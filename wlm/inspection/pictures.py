@@ -111,7 +111,7 @@ def inspect_picture(path: Path, picture: Picture) -> Finding:
     pixels, names = read_light(path)
     height, width = pixels.shape[:2]
     what = f"a picture of light, {picture.kind}, {width}x{height}, {''.join(names)}"
-    return Finding(path, what, f"wlm atlas compress MESH.glb {quoted(path)} -o DIR", problems_of(pixels))
+    return Finding(path, what, f"wlm atlas compress MESH.glb {quoted(path)} -o OUT.wlm", problems_of(pixels))
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:

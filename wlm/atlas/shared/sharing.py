@@ -23,6 +23,7 @@ from wlm.atlas.model import (
     LUT_BITS,
     SHEET_BITS,
     SHORT_ENTRY,
+    SOURCE_BITS,
     TAIL_OCTAVES,
     TEXELS,
     Profile,
@@ -168,7 +169,7 @@ def fitted(
         WlmError: The budget is less than the smallest tiles take.
     """
     device, states, sheets = stages.device, len(scene.states), len(scene.sheets)
-    bits = profile.budget * scene.source_bits
+    bits = profile.budget * scene.texels * SOURCE_BITS
     layout = _laid_out(planes, profile.tile)
     # One state has one component.
     numbers = ENTRY if states > 1 else SHORT_ENTRY
