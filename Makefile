@@ -43,11 +43,13 @@ docs: $(STAMP)
 
 bench: $(STAMP)
 	mkdir -p out
-	$(BIN)/python -m benchmarks lightmap --quick --json out/bench.json --plot out/bench.png
-	$(BIN)/python -m benchmarks probe --quick --json out/bench.json --plot out/bench-probe.png
-	$(BIN)/python -m benchmarks atlas --quick --json out/bench.json --plot out/bench-atlas.png
-	$(BIN)/python -m benchmarks smoke --quick --json out/bench.json --plot out/bench-smoke.png
-	$(BIN)/python -m benchmarks smoke-network --quick --profile 16 --json out/bench.json --plot out/bench-smoke-network.png
+	$(BIN)/python -m benchmarks lightmap --quick --json out/bench.json
+	$(BIN)/python -m benchmarks probe --quick --json out/bench.json
+	$(BIN)/python -m benchmarks atlas --quick --json out/bench.json
+	$(BIN)/python -m benchmarks smoke --quick --json out/bench.json
+	$(BIN)/python -m benchmarks smoke-network --quick --profile 16 --json out/bench.json
+	for system in lightmap probe atlas smoke smoke-network; do \
+		$(BIN)/python -m benchmarks plot out/bench.json --system $$system -o out/bench-$$system.png; done
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -1,4 +1,4 @@
-"""Results beside older ones: what has become worse."""
+"""Comparison of results with older ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +17,10 @@ class Change:
 
     Attributes:
         row: The new row.
-        name: The figure's, as in `benchmarks.figures`.
+        name: Name of the figure in `benchmarks.figures`.
         old, new: Its values.
-        worse: Whether it lost more than 0.05 dB, or takes more than 5% longer and more than the samples' own spread.
+        worse: Whether the figure lost more than 0.05 dB,
+            or takes over 5% longer and longer than the spread of the samples.
     """
 
     row: Row
@@ -29,21 +30,19 @@ class Change:
     worse: bool
 
 
-def compare(rows: Sequence[Row], runs: Sequence[Run], device_name: object) -> list[Change]:
-    """Compares rows with those of an older result file.
+def compare(new: Run, runs: Sequence[Run]) -> list[Change]:
+    """Compares a run with an older result file.
 
     Args:
-        rows: The new results.
-        runs: The older file's.
-        device_name: Of the machine that the new rows are from, as `describe_environment` gives it. Times of another
-            one are not compared.
+        new: The new run. Times are compared only with rows that the same machine measured.
+        runs: The runs of the older file.
 
     Returns:
         All figures in decibels and all times that two rows both have, in the order of the new rows.
     """
     older = {_key(row): (row, run.environment.get("device_name")) for run in runs for row in run.rows}
     changes = []
-    for row in rows:
+    for row in new.rows:
         old, machine = older.get(_key(row), (None, None))
         for name in row.figures if old is not None else ():
             before, unit = old.get(name), FIGURES[name].unit
@@ -51,7 +50,7 @@ def compare(rows: Sequence[Row], runs: Sequence[Run], device_name: object) -> li
                 continue
             if unit == "dB":
                 changes.append(Change(row, name, before, row[name], row[name] < before - _LEAST_DB))
-            elif unit in ("ms", "s") and machine == device_name:
+            elif unit in ("ms", "s") and machine == new.environment.get("device_name"):
                 # Half of each spread: a median may lie there by chance.
                 chance = sum(each.get(name + _SPREAD) or 0.0 for each in (row, old)) / 2
                 least = max(_LEAST_TIME * before, chance)

@@ -24,7 +24,7 @@ from playwright.sync_api import sync_playwright
 
 import wlm
 from benchmarks import describe_environment
-from wlm.engines import ENGINES, export_lightmap
+from wlm.export import ENGINES, export
 from wlm.formats.atomic import atomic_write
 from wlm.lightmap.data import from_arrays
 
@@ -39,7 +39,7 @@ import { loadLightmap } from './lightmap.js';
 const renderer = new THREE.WebGLRenderer(), gl = renderer.getContext(), pixel = new Uint8Array(4);
 const done = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
 let start = performance.now();
-const light = await loadLightmap(new URL('weights.json', import.meta.url), renderer, THREE);
+const light = await loadLightmap(new URL('bundle.json', import.meta.url), renderer, THREE);
 const load = performance.now() - start;
 done();
 const drawn = performance.now() - start;
@@ -88,7 +88,7 @@ def main(target: Path) -> None:
     environment = describe_environment("cpu", "python benchmarks/engine_loads.py benchmarks/engine-loads.json")
     with tempfile.TemporaryDirectory() as name:
         for engine in ENGINES:
-            paths = export_lightmap(model, Path(name) / engine, engine)
+            paths = export(model, Path(name) / engine, engine)
             methods[engine] = {"files": len(paths), "megabytes": sum(path.stat().st_size for path in paths) / 1e6}
         folder = Path(name) / "three"
         (folder / "index.html").write_text(PAGE)

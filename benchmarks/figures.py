@@ -1,9 +1,9 @@
-"""The figures of all benchmarks: the heading, unit and number format of each, by the name that a `Row` has it under.
+"""The figures of all benchmarks: the heading, unit and number format of each, by its name in a `Row`.
 
-`TABLES` is in the order of the columns, and says in which table a figure stands where one would be too wide.
+`TABLES` is in the order of columns, and groups the figures for where one table would be too wide.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -11,9 +11,9 @@ class Figure:
     """How one figure is shown.
 
     Attributes:
-        title: What it is, in a word or two.
-        unit: Its unit; `"%"` for a share, which rows hold as a number around 1. Empty for a pure number.
-        form: Format specification; empty: three digits, and from 100 on the whole part.
+        title: The quantity, in a word or two.
+        unit: Its unit; `"%"` for a ratio, which rows store as a number around 1. Empty for a pure number.
+        form: Format specification; empty: three digits, or no decimals from 100 on.
     """
 
     title: str
@@ -40,7 +40,7 @@ class Figure:
 
 _WHOLE = ",.0f"
 
-TABLES: dict[str, dict[str, Figure]] = {
+_TABLES: dict[str, dict[str, Figure]] = {
     "Size and error": {
         "bytes": Figure("size", "bytes", _WHOLE),
         "bpp": Figure("size", "bpp", ".3f"),  # bits for each texel and time, or for each probe
@@ -49,17 +49,10 @@ TABLES: dict[str, dict[str, Figure]] = {
         "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade
         "share_of_float32": Figure("of float32", "%", ".2f"),
         "psnr": Figure("PSNR", "dB", ".2f"),
-        "psnr_min": Figure("least", "dB", ".2f"),
-        "psnr_max": Figure("most", "dB", ".2f"),
         "gain": Figure("gain", "dB", "+.3f"),  # of a PSNR over another method's
-        "gain_min": Figure("least gain", "dB", "+.3f"),
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
-        "texel_psnr_min": Figure("least", "dB", ".2f"),
-        "texel_psnr_max": Figure("most", "dB", ".2f"),
         "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.display`
-        "tone_psnr_min": Figure("least", "dB", ".2f"),
-        "tone_psnr_max": Figure("most", "dB", ".2f"),
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
         "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next two
         "distance_psnr": Figure("by distance", "dB", ".2f"),
@@ -82,20 +75,12 @@ TABLES: dict[str, dict[str, Figure]] = {
         "view_flip": Figure("FLIP of views", form=".4f"),
         "ssim": Figure("SSIM", form=".4f"),
         "one_minus_ssim": Figure("1 − SSIM", form=".2g"),
-        "one_minus_ssim_min": Figure("least", form=".2g"),
-        "one_minus_ssim_max": Figure("most", form=".2g"),
         "flip": Figure("FLIP", form=".4f"),
-        "flip_min": Figure("least", form=".4f"),
-        "flip_max": Figure("most", form=".4f"),
         "seam_ratio": Figure("seams", form=".2f"),  # error at charts' borders over that elsewhere
-        "seam_ratio_min": Figure("least", form=".2f"),
-        "seam_ratio_max": Figure("most", form=".2f"),
         "light_rms": Figure("light RMS", "%", ".3g"),
         "still_light_rms": Figure("without jitter", "%", ".3g"),
         "transparency_rms": Figure("transparency RMS", form=".3g"),
         "bias": Figure("bias", "%", "+.1f"),
-        "bias_min": Figure("least", "%", "+.1f"),
-        "bias_max": Figure("most", "%", "+.1f"),
         "rms": Figure("RMS", "%", ".3g"),  # of a difference, over that of the exact values
         "worst_rms": Figure("worst light's RMS", "%", ".3g"),
         "halving_rms": Figure("RMS by halving", "%", ".3g"),
@@ -111,9 +96,7 @@ TABLES: dict[str, dict[str, Figure]] = {
     "Time": {
         "encode_seconds": Figure("encode", "s", ".3g"),
         "decode_ms": Figure("decode time", "ms", ".3g"),
-        "decode_ms_spread": Figure("p90−p10", "ms", ".2g"),
         "time_ms": Figure("time", "ms", ".3g"),
-        "time_ms_spread": Figure("p90−p10", "ms", ".2g"),
         "replay_ms": Figure("replayed", "ms", ".3g"),
         "call_ms": Figure("as calls", "ms", ".3g"),
         "step_ms": Figure("a step", "ms", ".3g"),
@@ -153,13 +136,9 @@ TABLES: dict[str, dict[str, Figure]] = {
         "first_light": Figure("light's RMS", form=".3g"),
         "first_ms": Figure("first frame", "ms", ".3g"),
         "update_ms": Figure("update", "ms", ".3g"),
-        "update_ms_p95": Figure("95%", "ms", ".3g"),
         "update_decode_ms": Figure("of it decode", "ms", ".3g"),
-        "update_decode_ms_p95": Figure("95%", "ms", ".3g"),
         "blocks": Figure("blocks", form=".3g"),
-        "blocks_p95": Figure("95%", form=".3g"),
         "probes_decoded": Figure("probes decoded", form=".3g"),
-        "probes_decoded_p95": Figure("95%", form=".3g"),
         "memory": Figure("memory", "MiB", ".1f"),
     },
     "Settings": {
@@ -193,7 +172,17 @@ TABLES: dict[str, dict[str, Figure]] = {
         "file_size": Figure("file", "MB", ".2f"),
     },
 }
-"""By the table's title, then by name."""
+_VARIANTS = {"": "", "_spread": "p90−p10", "_p95": "95%", "_min": "least", "_max": "most"}
+
+TABLES: dict[str, dict[str, Figure]] = {
+    title: {
+        name + suffix: replace(figure, title=heading or figure.title)
+        for name, figure in table.items()
+        for suffix, heading in _VARIANTS.items()
+    }
+    for title, table in _TABLES.items()
+}
+"""The figures by their table's title, then by name. A suffix of a name stands for a statistic of several values."""
 
 FIGURES: dict[str, Figure] = {name: figure for table in TABLES.values() for name, figure in table.items()}
-"""All of them by name."""
+"""Every figure by its name, with the variants of each."""

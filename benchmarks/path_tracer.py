@@ -18,8 +18,8 @@ import torch
 from wlm.errors import WlmError, one_line
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import VECTORS, Camera
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm.smoke.synthetic import make_plume
 
 GPU = "cuda_ad_rgb"
 """Mitsuba's variant for a GPU."""

@@ -28,12 +28,12 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import Score, of_network, score
-from wlm.smoke.learn.dataset import make_pool, make_validation
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import Profile, SixWayNetwork, parameter_count
-from wlm.smoke.planes import PLANES
+from wlm.smoke.network.dataset import make_pool, make_validation
+from wlm.smoke.network.planes import PLANES
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import DatasetSettings, Profile
+from wlm.smoke.network.trainer import Trainer, plan_round
+from wlm.smoke.network.unet import SixWayNetwork, parameter_count
 
 METHOD = "ablation"
 """The table of these rows."""

@@ -13,8 +13,8 @@ from benchmarks.smoke_setup import SmokeBench
 from wlm.fluid.lattice import Lattice
 from wlm.interop import stream, to_warp
 from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
-from wlm_kernels.fluid.lattice_solids import voxelise_sphere
 
 _SPEED = 0.1  # of the inlet, cells a step
 _VISCOSITY = 1e-6

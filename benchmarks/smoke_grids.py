@@ -17,11 +17,10 @@ from benchmarks.smoke_light import make_cloud
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import make_inputs, orders_march
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.learning import psnr
-from wlm.smoke.transport.orders import OrdersModel, load_orders
+from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march
 from wlm.smoke.transport.tracing import trace
 
 METHOD = "gain by grid"

@@ -13,18 +13,18 @@ from benchmarks.rows import Row
 from benchmarks.smoke_setup import SmokeBench
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import RULES, Camera
-from wlm.smoke.guiding import Guide, guide
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import Guide, guide
+from wlm.smoke.march.fine import bake, lit
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, obstacle_visibility
 from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import AllOrders, SixWays
 from wlm_kernels.smoke.settings import March
 

@@ -43,11 +43,11 @@ from benchmarks.smoke_network_setup import (
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import march
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, render_guide
+from wlm.smoke.march.coarse import bake_coarse
+from wlm.smoke.march.fine import bake
+from wlm.smoke.network.planes import EMISSION_PLANE, OPACITY_PLANE, decode_lightmaps, encode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
 PANELS = (Panel("time_ms", "psnr"),)
@@ -170,7 +170,7 @@ def _six(step: float) -> _Method:
 
 
 def _coarse(step: float, spacing: float) -> _Method:
-    return lambda volume, camera, seed: march(volume, camera, March(step, spacing, seed=seed))
+    return lambda volume, camera, seed: bake_coarse(volume, camera, March(step, spacing, seed=seed))
 
 
 def _network(pipeline: Pipeline) -> _Method:

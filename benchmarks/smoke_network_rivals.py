@@ -12,10 +12,10 @@ from benchmarks.rows import Row
 from benchmarks.smoke_network_setup import EXACT, NetworkBench, Pipeline, score
 from benchmarks.timing import time_together
 from wlm.errors import one_line
-from wlm.smoke.baking import bake
-from wlm.smoke.coarse import march
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import encode_lightmaps, to_srgb
+from wlm.smoke.march.coarse import bake_coarse
+from wlm.smoke.march.fine import bake
+from wlm.smoke.network.planes import encode_lightmaps, to_srgb
 from wlm_kernels.smoke.settings import March
 
 _DENOISED = "denoised"
@@ -38,7 +38,7 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
         def turned(camera=camera) -> list[SixWay]:
             return [billboard(six, bench.camera, camera, at) for six, at in zip(baked, pivots, strict=True)]
 
-        marched = [march(frame.later, camera, March(step, seed=frame.seed + 1)) for frame in frames]
+        marched = [bake_coarse(frame.later, camera, March(step, seed=frame.seed + 1)) for frame in frames]
         figures = score([encode_lightmaps(six) for six in turned()], references)
         figures["coarse_psnr"] = score([encode_lightmaps(six) for six in marched], references)["psnr"]
         notes = f"coarse march of h {step:g}"

@@ -13,15 +13,16 @@ from wlm.fluid.solver import Solver
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network
-from wlm.smoke.learn.motion import motion
-from wlm.smoke.learn.scenes import draw_scene
-from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.model import Profile, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import decode_lightmaps, encode_lightmaps, render_guide
+from wlm.smoke.march.fine import bake
+from wlm.smoke.march.motion import motion
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import decode_lightmaps, encode_lightmaps, render_guide
+from wlm.smoke.network.scenes import draw_scene
+from wlm.smoke.network.settings import DatasetSettings, Profile
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
 from wlm.smoke.simulation import make_solver, volume_of
 

@@ -44,17 +44,15 @@ from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.metrics.flip import flip_display
 from wlm.smoke.camera import Camera, unit
-from wlm.smoke.learn.losses import warp
-from wlm.smoke.learn.motion import motion
-from wlm.smoke.planes import to_srgb
+from wlm.smoke.march.motion import motion
+from wlm.smoke.network.losses import warp
+from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.transport.features import orders_march
-from wlm.smoke.transport.learning import FAINT, psnr
+from wlm.smoke.transport.learning import FAINT, draw_view, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.orders import scatter
-from wlm.smoke.transport.samples import draw_view
+from wlm.smoke.transport.orders import orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 
 METHOD = "all orders"

@@ -20,13 +20,11 @@ from benchmarks.runner import Bench
 from benchmarks.smoke_light import make_cloud
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import orders_march
-from wlm.smoke.transport.learning import psnr
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.learning import draw_view, psnr
 from wlm.smoke.transport.lights import PointLight
-from wlm.smoke.transport.orders import scatter
-from wlm.smoke.transport.samples import draw_view
+from wlm.smoke.transport.orders import orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 
 PHASES, INSIDE = "phase functions", "light in smoke"

@@ -22,7 +22,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.lightmap import LightmapSet
-from wlm.view.sheet import before_after_error
+from wlm.view.pictures import before_after_error
 
 HERE = Path(__file__).resolve().parent
 ROOM, DATA = HERE / "cornell" / "room.yaml", HERE / "data" / "cornell"

@@ -23,7 +23,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_exr, write_exr
 from wlm.interop import check_device
 from wlm.lightmap import LightmapSet, Report
-from wlm.view.sheet import before_after_error
+from wlm.view.pictures import before_after_error
 
 HERE = Path(__file__).resolve().parent
 STEPS, SAMPLES = 1500, 2048

@@ -23,7 +23,7 @@ from wlm import ops, smoke
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.view.smoke import contact_sheet, to_bytes
+from wlm.view.pictures import contact_sheet, to_bytes
 
 HERE = Path(__file__).resolve().parent
 VIEWS, HELD_OUT = (0.0, 60.0, 120.0), 90.0  # degrees round the plume

@@ -21,10 +21,12 @@ from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.probe.light import light_of
 from wlm.probe.walk import camera_path, settle, summary, walk
-from wlm.view.spheres import render_probes
+from wlm.view.opening import open_scene
+from wlm.view.window import Window
 
 HERE = Path(__file__).resolve().parent
 STEPS = 5000
+KEY = "12.00"
 FRAMES = 200
 
 # Seed 0 gives 7,519 bytes; seeds 0 to 3 gave 41.8 to 42.0 dB, and 36.7 to 37.1 dB of the irradiance on the CPU.
@@ -46,7 +48,8 @@ def run(out: Path, device: str) -> dict[str, float]:
         nonlocal clock
         seconds[name], clock = time.perf_counter() - clock, time.perf_counter()
 
-    probes = wlm.probe.load(HERE / "data" / "probes" / "street.npz", key="12.00")
+    source = HERE / "data" / "probes" / "street.npz"
+    probes = wlm.probe.load(source, key=KEY)
     lap("load")
     path = out / "street.wlm"
     size = wlm.probe.compress(probes, "small", seed=0, device=device, steps=STEPS).save(path)
@@ -74,7 +77,10 @@ def run(out: Path, device: str) -> dict[str, float]:
     content = {"report": report.to_json(), "walk": figures}
     atomic_write(out / "street_report.json", (json.dumps(content, indent=1) + "\n").encode())
     try:
-        render_probes(out / "street.png", probes.position[live], probes.values[live], decoded[live])
+        scene = open_scene([out / "street.wlm"], original=source, key=KEY)
+        window = Window(scene, size=(1800, 640))
+        window.screenshot(out / "street.png")
+        window.close()
     except WlmError as error:
         # A picture needs pyvista and an OpenGL library; all else here does not.
         print(error)

@@ -23,19 +23,20 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume, save_volume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import DIRECTIONS, Camera, axis_faults
 from wlm.smoke.data import load_frames, open_frames, write_six_way
-from wlm.smoke.exporter import brightest_gain, read_flipbook, write_flipbook
-from wlm.smoke.guiding import guide
-from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.flipbook.shots import FramesToBake
+from wlm.smoke.flipbook.textures import brightest_gain, read_flipbook, write_flipbook
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake, lit
 from wlm.smoke.scene import CameraSettings, Grid, Scene, load_scene
 from wlm.smoke.shading import Light
-from wlm.smoke.shots import FramesToBake
 from wlm.smoke.simulation import simulate
+from wlm.smoke.synthetic import make_plume
 from wlm.system import Progress
-from wlm.view.smoke import contact_sheet, guide_pictures, picture, six_pictures, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.smoke import guide_pictures, picture, six_pictures
 from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent

@@ -20,11 +20,11 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import load_orders, scatter, trace
 from wlm.smoke.transport.learning import psnr
-from wlm.view.smoke import contact_sheet, to_bytes
+from wlm.view.pictures import contact_sheet, to_bytes
 
 HERE = Path(__file__).resolve().parent
 PIXELS, SAMPLES = 96, 64

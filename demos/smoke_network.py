@@ -28,20 +28,21 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import march
 from wlm.smoke.codec import open_network
 from wlm.smoke.data import load_frames, open_frames
 from wlm.smoke.fit import train
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.model import Profile, SmokeModel
-from wlm.smoke.planes import EMISSION_PLANE, encode_lightmaps
-from wlm.smoke.prediction import SmokePredictor
+from wlm.smoke.march.coarse import bake_coarse, guide
+from wlm.smoke.march.fine import bake
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import EMISSION_PLANE, encode_lightmaps
+from wlm.smoke.network.prediction import SmokePredictor
+from wlm.smoke.network.settings import Profile
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.simulation import simulate
-from wlm.view.smoke import contact_sheet, picture, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
@@ -83,7 +84,7 @@ def render(
     return {
         "reference": bake(volume, camera, step=STEP, estimate=False),
         "network": predictor(volume, camera, seed),
-        "coarse march": march(volume, camera, model.dataset.look(volume.shape, seed)),
+        "coarse march": bake_coarse(volume, camera, model.dataset.look(volume.shape, seed)),
     }
 
 

@@ -13,7 +13,7 @@ FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.bake", "wlm.engines", "wlm.inspection", "wlm.view", "wlm.web"],
+    ["wlm.bake", "wlm.export", "wlm.inspection", "wlm.view"],
     ["wlm.cli"],
     ["wlm.__main__"],
     ["benchmarks"],

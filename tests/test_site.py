@@ -63,7 +63,7 @@ def test_a_name_of_another_package_is_a_link_to_its_page(pages):
 
 
 def test_links_out_of_the_documents_become_text(pages):
-    text = "[a](../demos/x.md#b) [b](LICENSE) [c](lightmap.md) [d](results/atlas.md) [e](../../wlm/web/assets)"
+    text = "[a](../demos/x.md#b) [b](LICENSE) [c](lightmap.md) [d](results/atlas.md) [e](../../wlm/export/page/assets)"
     assert pages.on_page_markdown(text) == "a b [c](lightmap.md) [d](results/atlas.md) e"
 
 

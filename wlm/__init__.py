@@ -8,15 +8,16 @@
     frame = wlm.load("city.wlm").decoder("cpu").frame(18.5)
 
 `wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same verbs; `wlm.fluid` simulates what smoke
-is seen of; `wlm.ops` has the kernels as differentiable torch operations; `wlm.web` makes pages for a browser,
-`wlm.inspection` says what a file holds, `wlm.bake` makes inputs. `load` reads any file of theirs.
+is seen of; `wlm.ops` has the kernels as differentiable torch operations; `wlm.export` writes raw folders, kits for
+engines and HTML pages; `wlm.inspection` says what a file holds, `wlm.bake` makes inputs. `load` reads any file of
+theirs.
 """
 
 from wlm._facade import facade
 
 __version__ = "0.1.0"
 
-_PACKAGES = ("atlas", "bake", "fluid", "inspection", "lightmap", "ops", "probe", "smoke", "web")
+_PACKAGES = ("atlas", "bake", "export", "fluid", "inspection", "lightmap", "ops", "probe", "smoke")
 _PLACES = {name: f"wlm.{name}" for name in _PACKAGES} | {"WlmError": "wlm.errors", "load": "wlm.system"}
 
 __all__ = sorted([*_PLACES, "__version__"])

@@ -1,14 +1,55 @@
 """`Bundle`: the textures, buffers and shader that a model puts on a GPU.
 
-Every system has a function `bundle(model, ...)` that makes one. Everything that leaves a model consumes it: the raw
-folder and the engine kits of `wlm.export`, the web page, the viewer and `wlm inspect`.
+Every system has a function `bundle(model, ...)` that makes one, and its model has a method of that name. Everything
+that leaves a model consumes it: the raw folder and the engine kits of `wlm.export`, the HTML page, the viewer and
+`wlm inspect`. They rely on these names:
+
+    system    textures                               buffers                       reference           files
+    lightmap  uv, uvt, planes, frames, valid         networks, hours               frame
+    atlas     colour, blocks, lut, tail, sheets,                           lightmap            mesh.glb
+              factors
+    probe                                            gaussians, network,           position, values
+                                                     positions
+    smoke     first, second, motion, depth
+
+`valid` is R8_UNORM and 255 inside charts. The textures of smoke are R8G8B8A8_UNORM. A texture or buffer that a model
+has no use for is left out. Of the documents they read these keys, among others:
+
+    lightmap  width, height, times, period, interpolation, time_axis, tau, slices, record, hour_fours, tile_columns,
+              tile_size, hidden, gamma, tiles; images: by texture name the size [width, height] of one tile's image and
+              the number of images across; values (of a part that is not light): what 0 and 1 stand for
+    atlas     uv_set, states, sheets, objects (label, node, sheet, scale_offset)
+    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, motion_scale,
+              clipped (numbers above the range of 8 bits)
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+
+INDEX_FILE = "bundle.json"
+"""Name of the index of every folder that `wlm.export` writes."""
+
+FORMAT = "wlm-bundle"
+"""`format` of these indexes."""
+
+RESERVED = frozenset(
+    ("format", "version", "system", "name", "engine", "shader", "textures", "buffers", "reference", "files", "parts")
+)
+"""Keys of an exported index that `wlm.export` fills in; a document must not have them."""
+
+_SAMPLER = """\
+#ifndef {macro}
+#ifndef {macro}_BINDING
+uniform {kind} {name};
+#else
+layout(binding = {macro}_BINDING) uniform {kind} {name};
+#endif
+#define {macro} {name}
+#endif
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,13 +57,15 @@ class Texture:
     """A texture in the layout that graphics interfaces upload.
 
     Attributes:
-        data: Texels or blocks, row by row from the top left; of an array layer after layer; mip levels follow their
-            layer's largest level, each half the size of the one before.
-        fmt: Pixel format, a key of `wlm.formats.dds.DXGI_FORMATS` or of `wlm.formats.ktx2.VK_FORMATS`.
+        data: Texels or blocks, row by row from the top left; of an array layer after layer; mip levels follow the
+            largest level, each half the size of the one before.
+        fmt: Pixel format, a key of `wlm.formats.dds.DXGI_FORMATS`; for ASTC, which DDS does not have, a key of
+            `wlm.formats.ktx2.VK_FORMATS`.
         width, height: Size in texels.
         layers: Number of layers of a texture array; 0 for a plain texture.
         mips: Number of mip levels below the largest.
-        image: Optional float32 [H, W, 3], the decoded content, for formats that picture viewers can not show.
+        image: float32 [H, W, 3], or [L, H, W, 3] of an array: the decoded texels of BC6H and ASTC, for engines that
+            do not load these formats. None for all other formats.
     """
 
     data: np.ndarray
@@ -32,6 +75,19 @@ class Texture:
     layers: int = 0
     mips: int = 0
     image: np.ndarray | None = None
+
+    @classmethod
+    def from_texels(cls, texels: np.ndarray, fmt: str, *, layered: bool = False) -> Self:
+        """Makes a texture of an uncompressed format.
+
+        Args:
+            texels: [H, W] or [H, W, C], or with `layered` [L, H, W] or [L, H, W, C]; little-endian numbers of the
+                format's own type.
+            fmt: As `fmt` of the class.
+            layered: Whether the first axis counts the layers of a texture array.
+        """
+        height, width = texels.shape[layered : layered + 2]
+        return cls(np.ascontiguousarray(texels), fmt, width, height, len(texels) if layered else 0)
 
     @property
     def nbytes(self) -> int:
@@ -46,15 +102,19 @@ class Bundle:
     Attributes:
         system: Name of the system, "lightmap" for example.
         name: Name of the model, shown in reports and used for an engine's assets.
+        shader: GLSL source that reads the textures and buffers; empty for a collection whose parts have their own.
+        document: Description of all of it as JSON values, without the keys in `RESERVED`. Its entry "about" explains
+            the others in sentences. The key "values" marks a part whose texels are not light.
         textures: Textures by name.
-        buffers: Arrays of numbers by name, in the layout that the shader reads.
-        shader: GLSL source that reads the textures and buffers.
-        document: Description of all of it as JSON values. Its entry "about" explains the others in sentences.
+        buffers: Little-endian arrays of numbers by name, in the layout that the shader reads.
         reference: Arrays that a reader of the bundle should reproduce, by name: for a lightmap `frame`, float32
             [H, W, 3] linear RGB at the first stored time.
         files: Further files by name, such as the mesh of an atlas.
         parts: Bundles of the members of a collection that are read by themselves, by name: sheets of a lightmap.
             Empty for a single item.
+        exact: Name of the macro with which the shader fetches texels and mixes them in floats, where it otherwise
+            uses the texture filter; empty if it has no such variant.
+        model: The model itself, for kits that sample it at other places than it stores: grids of probes.
     """
 
     system: str
@@ -66,9 +126,24 @@ class Bundle:
     reference: Mapping[str, np.ndarray] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     parts: Mapping[str, "Bundle"] = field(default_factory=dict)
+    exact: str = ""
+    model: Any = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that the textures and buffers take in GPU memory, those of the parts included."""
         own = sum(item.nbytes for item in (*self.textures.values(), *self.buffers.values()))
         return own + sum(part.nbytes for part in self.parts.values())
+
+
+def sampler(name: str, kind: str) -> str:
+    """Declares a texture in GLSL so that the including shader can replace or bind it.
+
+    If the macro of the name in capitals is defined before, that other texture is read. If the macro ending in
+    `_BINDING` is defined, as Vulkan needs it, the texture is at that binding.
+
+    Args:
+        name: Name of the uniform, `wlm_atlas_colour` for example.
+        kind: `sampler2D`, `usampler2D` or `sampler2DArray`.
+    """
+    return _SAMPLER.format(macro=name.upper(), name=name, kind=kind)

@@ -4,8 +4,8 @@ al., SIGGRAPH Asia 2023), at a size of its own.
 The abstract of the method, the interface of its published program and section 4.3 of
 lightmap-uv-clustering-cascade state: repeated contents share texels; the rest is background, whose triangles are
 grouped by colour, with a threshold of 10 levels; a new atlas holds what remains at its own resolution; a second pass
-leaves triangles out that were wrong: in 50 views of 512 x 512 pixels, where a view is below 38 dB, one triangle after another,
-that with the largest error first, until it isn't. 38 dB are those of the whole picture, background and all.
+leaves triangles out that were wrong: in 50 views of 512 x 512 pixels, where a view is below 38 dB, one triangle after
+another, that with the largest error first, until it isn't. 38 dB are those of the whole picture, background and all.
 
 Ours, where that is silent:
 

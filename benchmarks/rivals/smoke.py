@@ -5,9 +5,9 @@ import torch
 
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import Contender, Entry, HeldOut
-from wlm.smoke.learn.pool import Pool
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import GUIDES, PLANES
+from wlm.smoke.network.planes import GUIDES, PLANES
+from wlm.smoke.network.pool import Pool
 
 COARSE, FLIP_BOOK = "coarse march", "flip book"
 

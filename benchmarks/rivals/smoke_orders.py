@@ -15,8 +15,8 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import make_inputs, orders_march
 from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.orders import make_inputs, orders_march
 from wlm_kernels.smoke.orders import THINNEST
 
 CLASSIC = ((0.5, 0.5), (0.25, 0.25))

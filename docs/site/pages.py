@@ -22,8 +22,8 @@ PACKAGES = (
     "wlm.ops",
     "wlm.bake",
     "wlm.inspection",
-    "wlm.engines",
-    "wlm.web",
+    "wlm.export.engines",
+    "wlm.export.page",
 )
 _OUTSIDE = re.compile(
     r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"

@@ -6,14 +6,15 @@ import pytest
 from builders.bench_rows import ENVIRONMENT
 from typer.testing import CliRunner
 
-from benchmarks import Row, Run, compare, describe_environment, read_json, write_json
+from benchmarks import Row, Run, compare, describe_environment, write_json
 from benchmarks.app import app
 
 OLD = Row("lightmap", "city", "ours", "M", {"psnr": 45.0, "encode_seconds": 10.0, "bytes": 100})
 
 
 def worse(new: dict, old: Row = OLD, machine: str = "a CPU") -> list[str]:
-    changes = compare([replace(OLD, figures=new)], [Run(ENVIRONMENT, [old])], machine)
+    environment = ENVIRONMENT | {"device_name": machine}
+    changes = compare(Run(environment, [replace(OLD, figures=new)]), [Run(ENVIRONMENT, [old])])
     return [change.name for change in changes if change.worse]
 
 
@@ -44,39 +45,30 @@ def test_a_time_within_the_spread_of_its_samples_is_not_worse():
 
 def test_only_rows_that_both_have_are_compared():
     others = [replace(OLD, option="H"), replace(OLD, scene="room"), replace(OLD, method="BC7")]
-    assert compare([OLD], [Run(ENVIRONMENT, others)], "a CPU") == []
-    changes = compare([OLD], [Run(ENVIRONMENT, others), Run(ENVIRONMENT, [OLD])], "a CPU")
+    assert compare(Run(ENVIRONMENT, [OLD]), [Run(ENVIRONMENT, others)]) == []
+    changes = compare(Run(ENVIRONMENT, [OLD]), [Run(ENVIRONMENT, others), Run(ENVIRONMENT, [OLD])])
     assert [(change.name, change.old, change.new) for change in changes] == [
         ("psnr", 45.0, 45.0),
         ("encode_seconds", 10.0, 10.0),
     ]
 
 
-@pytest.fixture
-def bench(tmp_path, monkeypatch):
-    """Runs `python -m benchmarks lightmap --baseline` with one row, compared with another."""
-    import benchmarks.lightmap as module
-
-    old, environment = tmp_path / "old.json", describe_environment("cpu", "python -m benchmarks")
-
-    def call(new: Row, before: Row, *words):
-        write_json(old, [before], environment)
-        monkeypatch.setattr(module, "run", lambda **_: [new])
-        return CliRunner().invoke(app, ["lightmap", "--baseline", str(old), *map(str, words)])
-
-    return call
+def invoke(folder, new: Row, old: Row):
+    """Runs `python -m benchmarks compare` on files of one row each."""
+    environment = describe_environment("cpu", "python -m benchmarks")
+    for name, row in (("new.json", new), ("old.json", old)):
+        write_json(folder / name, [row], environment)
+    return CliRunner().invoke(app, ["compare", str(folder / "new.json"), str(folder / "old.json")])
 
 
-def test_the_command_fails_where_a_figure_is_worse(bench, tmp_path):
-    assert bench(OLD, OLD).exit_code == 0
-    result = bench(OLD.with_figures(psnr=44.0), OLD, "--json", tmp_path / "new.json")
+def test_the_command_fails_where_a_figure_is_worse(tmp_path):
+    assert invoke(tmp_path, OLD, OLD).exit_code == 0
+    result = invoke(tmp_path, OLD.with_figures(psnr=44.0), OLD)
     assert result.exit_code == 1
     assert "worse: city ours M: PSNR, dB: 45.00 before, 44.00 now" in result.stderr
-    assert read_json(tmp_path / "new.json")[0][0]["psnr"] == 44.0  # what was measured is kept
 
 
-def test_the_command_says_what_it_cannot_compare(bench, tmp_path):
-    assert "found none" in str(bench(OLD, replace(OLD, option="H")).exception)
-    assert "expected another file" in str(bench(OLD, OLD, "--json", tmp_path / "old.json").exception)
-    result = CliRunner().invoke(app, ["lightmap", "--baseline", str(tmp_path / "absent.json")])
-    assert "absent.json" in str(result.exception)
+def test_the_command_says_what_it_cannot_compare(tmp_path):
+    assert "found none" in invoke(tmp_path, OLD, replace(OLD, option="H")).stderr
+    result = CliRunner().invoke(app, ["compare", str(tmp_path / "old.json"), str(tmp_path / "absent.json")])
+    assert "absent.json" in result.stderr

@@ -125,7 +125,7 @@ def test_what_is_refused(sets, tmp_path):
     with pytest.raises(WlmError, match="No such file"):
         run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
     result = CliRunner().invoke(app, ["probe", "--volume-only", "--quick"])
-    assert result.exit_code != 0 and "--volume-only: expected without" in str(result.exception)
+    assert result.exit_code != 0 and "--volume-only: expected without" in result.stderr
     with pytest.raises(WlmError, match="device 'tpu'"):
         run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
     with pytest.raises(ValueError, match="at least one set and one profile"):

@@ -14,9 +14,9 @@ from benchmarks.smoke_light import make_cloud, six_rows
 from benchmarks.smoke_setup import QUICK, SmokeBench
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.march.fine import bake
+from wlm.smoke.synthetic import make_plume
 
 TINY = replace(
     QUICK,

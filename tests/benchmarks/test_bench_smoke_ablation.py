@@ -15,9 +15,9 @@ from benchmarks.runner import Bench
 from benchmarks.smoke_ablation import FULL, QUICK, AblationSizes, run, run_rows, variants
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import Score, of_network, score
-from wlm.smoke.learn.dataset import make_validation
-from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import Profile
+from wlm.smoke.network.dataset import make_validation
+from wlm.smoke.network.settings import Profile
+from wlm.smoke.network.trainer import Trainer, plan_round
 
 SIZES = AblationSizes(dataset={"resolution": 32}, validation={"frames": 2}, rounds=2, steps=5)
 BASE = Profile(

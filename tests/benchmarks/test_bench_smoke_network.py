@@ -15,12 +15,13 @@ from benchmarks.smoke_network import PANELS, plotted, run, run_rows
 from benchmarks.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.smoke.baking import bake
 from wlm.smoke.codec import shipped
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.learn.synthetic import make_plume
-from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
+from wlm.smoke.march.fine import bake
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm.smoke.synthetic import make_plume
 
 TINY = replace(
     QUICK,

@@ -103,8 +103,8 @@ def _smoke() -> Kept:
 
 
 def _pool() -> Kept:
-    from wlm.smoke.learn.pool import load_pool, save_pool
-    from wlm.smoke.learn.settings import DatasetSettings
+    from wlm.smoke.network.pool import load_pool, save_pool
+    from wlm.smoke.network.settings import DatasetSettings
 
     content = _written(lambda path: save_pool(path, _samples(), DatasetSettings(), "seed-0"))
     return Kept(content, load_pool, {}, {})
@@ -113,7 +113,7 @@ def _pool() -> Kept:
 def _samples() -> Any:
     import torch
 
-    from wlm.smoke.learn.pool import Pool
+    from wlm.smoke.network.pool import Pool
 
     random = torch.Generator().manual_seed(0)
     shapes = ((2, 2, 3, 16, 16), (2, 2, 8, 16, 16), (2, 2, 16, 16))
@@ -182,8 +182,7 @@ def _probe_running() -> Kept:
 
 def _training() -> Kept:
     from wlm.smoke.fit import train
-    from wlm.smoke.learn.settings import TrainSettings
-    from wlm.smoke.model import NetworkSettings, Profile
+    from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
     settings = TrainSettings(rounds=1, steps=4, batch=2, warmup=2, average=0.5)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)

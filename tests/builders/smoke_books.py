@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import torch
 
-from wlm.smoke.book import Book, pack_book
 from wlm.smoke.camera import Camera
-from wlm.smoke.flipbook_motion import ZERO, between
+from wlm.smoke.flipbook.book import Book, pack_book
+from wlm.smoke.flipbook.motion import ZERO, between
+from wlm.smoke.flipbook.shots import Shot
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.shots import Shot
 
 FIRE = Ramp((0.0, 0.4, 1.0), ((0.0, 0.0, 0.0), (0.9, 0.2, 0.0), (1.0, 0.8, 0.4)))
 TOWARD, IRRADIANCE, SKY = (0.48, -0.6, 0.64), (3.0, 2.0, 1.0), (0.2, 0.3, 0.4)

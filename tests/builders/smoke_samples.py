@@ -11,11 +11,13 @@ from builders.smoke_plumes import plume
 
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import encode_lightmaps, render_guide
+from wlm.smoke.march.fine import bake
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import encode_lightmaps, render_guide
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera
 from wlm_kernels.smoke.settings import March
 

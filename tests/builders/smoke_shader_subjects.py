@@ -10,13 +10,12 @@ from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames
 from builders.smoke_books import shown as shown_book
 
-from wlm.smoke.billboard import billboard_shader
 from wlm.smoke.camera import LAYOUTS, Camera
-from wlm.smoke.exporter import lay_out, pack
-from wlm.smoke.flipbook_depth import encoded_depth, from_point
-from wlm.smoke.flipbook_motion import ZERO
+from wlm.smoke.flipbook.depth import encoded_depth, from_point
+from wlm.smoke.flipbook.motion import ZERO
+from wlm.smoke.flipbook.shader import billboard_shader, smoke_shader
+from wlm.smoke.flipbook.textures import lay_out, pack
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.shader import smoke_shader
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.lights import PointLight
 

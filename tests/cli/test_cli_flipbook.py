@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from wlm.cli.app import app
 from wlm.inspection import inspect
 from wlm.smoke.camera import Camera
-from wlm.smoke.exporter import is_straight, read_flipbook, write_flipbook
+from wlm.smoke.flipbook.textures import is_straight, read_flipbook, write_flipbook
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import wlm
 from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
-from wlm.engines import export_atlas
+from wlm.export.engines.atlas import export_atlas
 from wlm.formats.exr import write_exr
 from wlm.inspection import files, inspect
 from wlm.inspection.folders import MOST

@@ -15,13 +15,14 @@ from PIL import Image
 
 from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr import read_planes
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.data import load_frames, read_shaded, read_six_way
-from wlm.smoke.exporter import read_flipbook
-from wlm.smoke.guiding import guide
+from wlm.smoke.flipbook.textures import read_flipbook
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
-from wlm.view.smoke import picture, to_bytes
+from wlm.view.pictures import to_bytes
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 LIGHT = LightSettings(toward=(1, 1, 1)).light()
@@ -61,9 +62,9 @@ def png(path):
 @pytest.mark.parametrize(
     ("words", "place", "stem", "other"),
     [
-        (["bake", "--step", 1], "wlm.smoke.baking.bake", "six", ["--step", 2]),
-        (["guide"], "wlm.smoke.guiding.guide", "guide", ["--seed", 7]),
-        (["predict", "--coarse"], "wlm.smoke.coarse.march", "six", ["--seed", 7]),
+        (["bake", "--step", 1], "wlm.smoke.march.fine.bake", "six", ["--step", 2]),
+        (["guide"], "wlm.smoke.march.coarse.guide", "guide", ["--seed", 7]),
+        (["predict", "--coarse"], "wlm.smoke.march.coarse.bake_coarse", "six", ["--seed", 7]),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, place, stem, other, frames, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from wlm.cli.app import app
 from wlm.smoke.data import write_six_way
-from wlm.smoke.exporter import write_flipbook
+from wlm.smoke.flipbook.textures import write_flipbook
 from wlm.smoke.scene import LightSettings, Looks
 
 

@@ -15,16 +15,16 @@ from builders.smoke_samples import file_content
 
 import wlm
 from wlm.fluid.volume import save_volume
-from wlm.smoke import codec, onnx_file
-from wlm.smoke.coarse import march
+from wlm.smoke import codec
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.data import load_frames, read_six_way
-from wlm.smoke.learn import dataset
-from wlm.smoke.learn.pool import load_pool
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.learn.trainer import Trainer
+from wlm.smoke.march.coarse import bake_coarse
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import GUIDES, encode_lightmaps, render_guide
+from wlm.smoke.network import dataset, onnx_file
+from wlm.smoke.network.planes import GUIDES, encode_lightmaps, render_guide
+from wlm.smoke.network.pool import load_pool
+from wlm.smoke.network.settings import DatasetSettings
+from wlm.smoke.network.trainer import Trainer
 from wlm_kernels.smoke.settings import March
 
 PROFILE = {
@@ -159,7 +159,7 @@ def test_predict_marches_as_in_training(network, volume, tmp_path):
 def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
     call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
     six = read_six_way(tmp_path / "a.exr")
-    expected = march(load_frames(volume).load(1), six.camera, March(step, step, seed=2))
+    expected = bake_coarse(load_frames(volume).load(1), six.camera, March(step, step, seed=2))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
 

@@ -8,7 +8,7 @@ from wlm.errors import WlmError
 from wlm.fluid import engine
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Domain, Lattice
-from wlm_kernels.fluid.lattice_solids import voxelise_sphere
+from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 
 SHAPE = (12, 8, 8)
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from wlm.fluid.lattice import Lattice
-from wlm_kernels.fluid.lattice_solids import voxelise_sphere
+from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 
 # u on the cavity's vertical midline (Ghia, Ghia and Shin 1982, table I), and where.
 GHIA_Y = (0.9766, 0.9531, 0.8516, 0.7344, 0.6172, 0.5, 0.4531, 0.2813, 0.1719, 0.1016, 0.0547)

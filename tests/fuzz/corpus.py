@@ -23,12 +23,12 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.three_grid import export_grid
 from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
-from wlm.smoke.baking import bake as bake_smoke
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.learn.pool import Pool, save_pool
-from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.fine import bake as bake_smoke
+from wlm.smoke.network.pool import Pool, save_pool
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
-from wlm.smoke.shots import with_surface
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
 

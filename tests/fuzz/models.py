@@ -19,9 +19,9 @@ from wlm.probe import fit as probe_fit
 from wlm.probe.day import DayModel
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform
-from wlm.smoke.learn.pool import load_pool
+from wlm.smoke.march.motion import read_velocity, write_velocity
+from wlm.smoke.network.pool import load_pool
 from wlm.smoke.transport.orders import load_orders
-from wlm.smoke.velocity import read_velocity, write_velocity
 from wlm.system import Meter
 
 from .containers import vary_artifact, vary_compact, vary_npz
@@ -264,10 +264,8 @@ def _smoke_checkpoint(path: Path) -> None:
 
 @functools.cache
 def _training() -> tuple[Any, Any]:
-    from wlm.smoke.fit import Profile
-    from wlm.smoke.learn.pool import Pool
-    from wlm.smoke.learn.settings import TrainSettings
-    from wlm.smoke.model import NetworkSettings
+    from wlm.smoke.network.pool import Pool
+    from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
     settings = TrainSettings(rounds=2, steps=1, batch=2, warmup=1)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)

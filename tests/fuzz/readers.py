@@ -35,8 +35,8 @@ from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.probe.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
-from wlm.smoke.exporter import read_flipbook
-from wlm.smoke.learn.settings import DatasetSettings
+from wlm.smoke.flipbook.textures import read_flipbook
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
 from . import models

@@ -18,7 +18,16 @@ from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
-from wlm_kernels.smoke import diffusion, march_coarse, march_guide, march_lights, march_motion, march_six, path
+from wlm_kernels.smoke import (
+    depth_lattice,
+    diffusion,
+    march_coarse,
+    march_guide,
+    march_lights,
+    march_motion,
+    march_six,
+    path,
+)
 from wlm_kernels.smoke import march as smoke_march
 
 ARCHITECTURE = 90
@@ -33,7 +42,7 @@ MODULES = (
     "fluid.advection_places",
     "fluid.grids",
     "fluid.lattice_links",
-    "fluid.lattice_solids",
+    "fluid.lattice_fields",
     "interpolate",
     "lightmap.blocks",
     "lightmap.decode",
@@ -52,7 +61,8 @@ MODULES = (
     "raster.rasterize",
     "raster.rays",
     "raster.texture",
-    "smoke.fluence",
+    "smoke.depth_lattice",
+    "smoke.diffusion",
     "smoke.orders",
     "smoke.picture",
     "smoke.shadow",
@@ -167,16 +177,18 @@ def test_marching(dtype: type, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
     """The march of all six lights in large steps, with emission and without."""
-    _compile_all(march_coarse.coarse_kernels(dtype, hot), tmp_path)
+    depths = vars(depth_lattice.depth_kernels(dtype)).values()
+    _compile_all([march_coarse.coarse_kernel(dtype, hot), *depths], tmp_path)
 
 
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_lights_and_paths(dtype: type, tmp_path: Path):
     """The march to lights, light from points by diffusion, and the path tracer."""
     _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
-    _compile_all(diffusion.light_kernels(dtype), tmp_path / "points")
+    _compile_all(vars(diffusion.light_kernels(dtype)).values(), tmp_path / "points")
     for solid in (False, True):
-        _compile_all(vars(path.path_kernels(dtype, solid)).values(), tmp_path / f"path{solid}")
+        kernels = path.path_kernels(dtype, solid)
+        _compile_all([kernels.majorants, kernels.window, kernels.coarser, kernels.trace], tmp_path / f"path{solid}")
 
 
 LATTICE_STEPS = (

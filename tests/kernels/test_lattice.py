@@ -10,8 +10,8 @@ from reference import lattice as reference
 from wlm.fluid import engine
 from wlm.fluid.lattice import Lattice
 from wlm_kernels.fluid.lattice import CAUSES, Spec, step_kernel, trouble_of
+from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import LATTICES
-from wlm_kernels.fluid.lattice_solids import voxelise_mesh, voxelise_sphere
 
 STEPS = 4
 SHAPE = (5, 4, 3)

@@ -13,6 +13,7 @@ from builders.small_sets import HOURS, tiny_profile
 from builders.synthetic import random_model
 
 import wlm
+from wlm.export.page.pages import make_page
 from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import Pace
 from wlm.formats.exr import read_exr
@@ -21,7 +22,6 @@ from wlm.lightmap.layers import codec
 from wlm.lightmap.layers.data import LayerArrays, from_layers
 from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.tiles import TileKind
-from wlm.web.pages import make_page
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from builders.smoke_plumes import facing, unit_grid
 
 from benchmarks.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, axis_faults, weights
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.fine import bake, lit
 
 
 def _plume(device: str = "cpu", n: int = 28, extinction: float = 0.25, seed: int = 2) -> DensityVolume:

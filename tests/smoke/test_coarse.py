@@ -9,12 +9,12 @@ import torch
 from builders.smoke_plumes import facing, plume
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.coarse import march, march_planes
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm_kernels.smoke import march_coarse
+from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
+from wlm.smoke.march.fine import bake
+from wlm_kernels.smoke import depth_lattice, march_coarse
+from wlm_kernels.smoke import march as kernels
 from wlm_kernels.smoke.settings import March
 
 TURNED = (0.5, 0.3, 1.0)
@@ -27,7 +27,7 @@ def _camera(volume: DensityVolume, size: int = 24, toward: tuple[float, float, f
 
 
 def _march(volume: DensityVolume, camera: Camera, **settings) -> SixWay:
-    return march(volume, camera, March(**settings))
+    return bake_coarse(volume, camera, March(**settings))
 
 
 def _planes(volume: DensityVolume, camera: Camera, **settings) -> torch.Tensor:
@@ -151,10 +151,10 @@ def test_sums_are_the_guiding_map(device: str):
     volume = plume(device=device)
     camera = _camera(volume)
     settings = {"jitter": 0.0, "threshold": 0.05, "g": -0.2}
-    six, maps = (method(volume, camera, March(2.5, **settings)) for method in (march, guide))
+    six, maps = (method(volume, camera, March(2.5, **settings)) for method in (bake_coarse, guide))
     torch.testing.assert_close(six.transparency, maps.transparency, rtol=0, atol=1e-6)
     torch.testing.assert_close(six.depth, maps.depth, rtol=0, atol=1e-5)
-    six, maps = (method(volume, camera, March(1.0, **settings)) for method in (march, guide))
+    six, maps = (method(volume, camera, March(1.0, **settings)) for method in (bake_coarse, guide))
     light = six["front"] + six["top"] + six["bottom"]
     assert float((light - maps.light).abs().mean()) < 0.005 * float(maps.light.max())
 
@@ -181,8 +181,8 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     camera = _camera(volume)
     skipped = _planes(volume, camera, step=1.5)
     made = []
-    occupied = march_coarse.occupied
-    monkeypatch.setattr(march_coarse, "occupied", lambda medium: made.append(occupied(medium)) or made[-1])
+    occupied = kernels.occupied
+    monkeypatch.setattr(kernels, "occupied", lambda medium: made.append(occupied(medium)) or made[-1])
     _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
@@ -245,11 +245,12 @@ def test_nodes_are_bounded(device: str):
     for shape, spacing in (((400, 400, 400), 1.0), ((10**6, 1, 1), 5.0), ((2, 30000, 30000), 1e-3)):
         box = SimpleNamespace(origin=np.zeros(3), voxel=1.0, shape=shape)
         view = _camera(volume, toward=VIEWS["diagonal"]).view(box)
-        lattice, counts = march_coarse._lattice(shape, view, spacing)
+        axes = (view.right, view.up, view.forward)
+        lattice, counts = depth_lattice.make_lattice(shape, axes, spacing, view.origin)
         assert min(counts) >= 2 and np.prod(counts, dtype=float) < 1.01 * 2**28
         # They cover the eight corners.
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(shape) + 1.0) - 0.5 - np.array(view.origin)
-        for axis, along in enumerate((view.right, view.up, view.forward)):
+        for axis, along in enumerate(axes):
             ends = lattice.low[axis], lattice.low[axis] + (counts[axis] - 1) * lattice.gap[axis]
             reach = corners @ np.array(along)
             assert ends == pytest.approx((reach.min(), reach.max()), rel=1e-5, abs=1e-2)

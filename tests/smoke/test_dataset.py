@@ -11,10 +11,10 @@ from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import axis_faults
-from wlm.smoke.learn import dataset
-from wlm.smoke.learn.dataset import (
+from wlm.smoke.march.fine import bake
+from wlm.smoke.network import dataset
+from wlm.smoke.network.dataset import (
     ATTEMPTS,
     STAGES,
     fixed_cameras,
@@ -22,13 +22,13 @@ from wlm.smoke.learn.dataset import (
     make_validation,
     pool_of_volume,
 )
-from wlm.smoke.learn.pool import Pool, load_pool, save_pool
-from wlm.smoke.learn.scenes import Tilted, draw_scene
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
+from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
+from wlm.smoke.network.pool import Pool, load_pool, save_pool
+from wlm.smoke.network.scenes import Tilted, draw_scene
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Air
 from wlm.smoke.simulation import make_solver, volume_of
-from wlm.view.smoke_pool import pool_sheet
+from wlm.view.smoke import pool_sheet
 from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(

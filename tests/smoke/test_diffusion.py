@@ -12,16 +12,15 @@ from builders.smoke_plumes import plume
 from benchmarks.rivals.smoke_orders import diffused
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
-from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.learning import psnr
 from wlm.smoke.transport.lighting import light_smoke, marching
 from wlm.smoke.transport.lights import PointLight, half_sphere
-from wlm.smoke.transport.orders import scatter
+from wlm.smoke.transport.orders import orders_march, scatter
 from wlm.smoke.transport.tracing import trace
-from wlm_kernels.smoke import fluence as kernels
+from wlm_kernels.smoke import diffusion as kernels
 
 
 def test_a_light_deep_in_thick_smoke_is_found(device: str):

@@ -11,12 +11,12 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import load_frames
-from wlm.smoke.flipbook_depth import encoded_depth, frames_depth, from_point, middle_depth
-from wlm.smoke.flipbook_motion import ZERO
-from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.flipbook.depth import encoded_depth, frames_depth, from_point, middle_depth
+from wlm.smoke.flipbook.motion import ZERO
+from wlm.smoke.march.fine import bake
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm_kernels.smoke.settings import March

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 from wlm import smoke
 from wlm.cli.smoke import app
 from wlm.errors import WlmError
-from wlm.smoke.exporter import lay_out
-from wlm.smoke.flipbook_motion import (
+from wlm.smoke.flipbook.motion import (
     ZERO,
     between,
     encoded,
@@ -20,11 +19,12 @@ from wlm.smoke.flipbook_motion import (
     open_motion,
     scale_of,
 )
+from wlm.smoke.flipbook.textures import lay_out
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.motion import read_velocity, velocity_file
 from wlm.smoke.scene import load_scene
 from wlm.smoke.simulation import simulate
 from wlm.smoke.transport.learning import psnr
-from wlm.smoke.velocity import read_velocity, velocity_file
 
 FRAMES = 26
 

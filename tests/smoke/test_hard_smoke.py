@@ -5,17 +5,16 @@ import pytest
 import torch
 
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import march
-from wlm.smoke.guiding import guide
+from wlm.smoke.march.coarse import bake_coarse, guide
+from wlm.smoke.march.fine import bake
 from wlm_kernels.smoke.settings import March
 
 STEPS = March(2.0, jitter=0.0, threshold=1e-6)
 MARCHES = {
     "bake": lambda volume, camera: bake(volume, camera, step=0.25),
-    "march": lambda volume, camera: march(volume, camera, STEPS),
-    "march in bricks": lambda volume, camera: march(volume, camera, March(0.25, jitter=0.0)),
+    "march": lambda volume, camera: bake_coarse(volume, camera, STEPS),
+    "march in bricks": lambda volume, camera: bake_coarse(volume, camera, March(0.25, jitter=0.0)),
     "guide": lambda volume, camera: guide(volume, camera, STEPS),
 }
 CLEAR = ("empty", "not a number", "away", "beside")

@@ -8,10 +8,10 @@ import torch
 from builders.smoke_plumes import facing
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
+from wlm.smoke.march.fine import bake, lit
 from wlm.smoke.shading import Light
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import fine_march, light_smoke
 from wlm.smoke.transport.lights import Environment, PointLight
 from wlm.smoke.transport.tracing import trace

@@ -7,8 +7,8 @@ import torch
 from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
-from wlm.smoke.learn.losses import Losses, temporal, warp
-from wlm.smoke.learn.settings import LossSettings
+from wlm.smoke.network.losses import Losses, temporal, warp
+from wlm.smoke.network.settings import LossSettings
 
 
 def test_parts_are_computed_only_where_they_weigh():

@@ -9,12 +9,12 @@ from reference.marching import span as clip
 from reference.marching import trilinear
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.baking import bake
-from wlm.smoke.learn.dataset import make_validation
-from wlm.smoke.learn.losses import warp
-from wlm.smoke.learn.motion import motion
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.planes import OPACITY_PLANE
+from wlm.smoke.march.fine import bake
+from wlm.smoke.march.motion import motion
+from wlm.smoke.network.dataset import make_validation
+from wlm.smoke.network.losses import warp
+from wlm.smoke.network.planes import OPACITY_PLANE
+from wlm.smoke.network.settings import DatasetSettings
 
 SIZE = 24
 

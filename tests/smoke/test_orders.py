@@ -13,13 +13,21 @@ from benchmarks.smoke_light import make_cloud
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import Inputs, make_inputs, orders_march
-from wlm.smoke.transport.learning import Lesson, fit_orders, learn, make_lessons, psnr
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.learning import (
+    ALBEDOS,
+    Lesson,
+    Sample,
+    draw_view,
+    fit_orders,
+    learn,
+    make_lessons,
+    make_sample,
+    psnr,
+)
 from wlm.smoke.transport.lights import PointLight
-from wlm.smoke.transport.orders import OrdersModel, load_orders, scatter
-from wlm.smoke.transport.samples import ALBEDOS, Sample, draw_view, make_sample
+from wlm.smoke.transport.orders import Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 from wlm_kernels.smoke.settings import March

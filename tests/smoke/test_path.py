@@ -11,13 +11,13 @@ from reference.transport import scattered_twice
 
 from benchmarks.path_tracer import PathTracer
 from wlm.errors import WlmError
-from wlm.fluid.shapes import box
+from wlm.fluid.obstacles import box
 from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.baking import bake, lit
 from wlm.smoke.camera import Camera
-from wlm.smoke.learn.synthetic import make_plume
-from wlm.smoke.marching import medium_of
+from wlm.smoke.march.fine import bake, lit
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import Light
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lights import Environment, PointLight
 from wlm.smoke.transport.tracing import Transport, trace
 from wlm_kernels.smoke import path

@@ -8,12 +8,11 @@ import torch
 from builders.smoke_plumes import plume
 from builders.smoke_samples import view_of
 
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import march
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import (
+from wlm.smoke.march.coarse import bake_coarse, guide
+from wlm.smoke.march.fine import bake
+from wlm.smoke.network.planes import (
     GUIDES,
     OPACITY_PLANE,
     PLANES,
@@ -107,12 +106,12 @@ def test_six_are_the_coarse_march_as_lightmaps_are_encoded(device):
     volume = replace(plume(hot=True, device=device), emission=30.0)
     camera = view_of(volume)
     planes = render_guide(volume, camera, "six", MARCH)
-    expected = encode_lightmaps(march(volume, camera, MARCH))
+    expected = encode_lightmaps(bake_coarse(volume, camera, MARCH))
     for name, plane in zip(PLANES, expected, strict=True):
         torch.testing.assert_close(planes[GUIDES["six"].index(name)], plane, rtol=1e-6, atol=1e-6, msg=name)
     assert planes[GUIDES["six"].index("emission")].max() > 0.5
     # As the other kinds' is, by torch.
-    maps = torch.stack([expected[0], expected[OPACITY_PLANE], march(volume, camera, MARCH).depth])
+    maps = torch.stack([expected[0], expected[OPACITY_PLANE], bake_coarse(volume, camera, MARCH).depth])
     depth = encode_guide(maps, *span(volume, camera))[2]
     torch.testing.assert_close(planes[GUIDES["six"].index("depth")], depth, rtol=1e-6, atol=1e-6)
     cold = render_guide(replace(volume, temperature=None), camera, "six", MARCH)

@@ -18,7 +18,6 @@ from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.volume import load_volume, save_volume
 from wlm.formats.exr import read_planes, write_planes
-from wlm.smoke.baking import bake
 from wlm.smoke.data import (
     CHECKPOINT,
     NumberedFiles,
@@ -29,7 +28,8 @@ from wlm.smoke.data import (
     write_guide,
     write_six_way,
 )
-from wlm.smoke.guiding import guide
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from wlm.fluid.shapes import sphere
+from wlm.fluid.obstacles import sphere
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility

@@ -7,9 +7,9 @@ from builders.running import call, fails
 from builders.smoke_plumes import facing, plume
 
 from wlm.fluid.volume import from_array, save_volume
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import weights
 from wlm.smoke.data import read_six_way
+from wlm.smoke.march.fine import bake
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import half_sphere

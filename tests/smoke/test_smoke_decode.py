@@ -8,9 +8,11 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import STEP, random_model, sample, view_of
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.coarse import march
-from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import GUIDES, decode_lightmaps, render_guide
+from wlm.smoke.march.coarse import bake_coarse
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import GUIDES, decode_lightmaps, render_guide
+from wlm.smoke.network.settings import NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm_kernels.smoke.settings import March
 
 
@@ -103,7 +105,7 @@ def test_with_six_lights_an_untrained_network_is_the_coarse_march(device):
     model = SmokeModel(SixWayNetwork(NetworkSettings(width=8, levels=3, guide="six")), {})
     decoder = model.decoder(device, height=32, width=32, half=False)
     six = decode_lightmaps(decoder(render_guide(volume, camera, decoder.guide, March(STEP, seed=5))))
-    coarse = march(volume, camera, March(STEP, seed=5))
+    coarse = bake_coarse(volume, camera, March(STEP, seed=5))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(coarse, name), rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match=r"expected \[9, 32, 32\]"):

@@ -16,11 +16,11 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.evaluation import HALF, NETWORK, REFERENCE, compare, evaluate, of_decoder, of_network, score
-from wlm.smoke.learn.dataset import make_validation
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import OPACITY_PLANE
+from wlm.smoke.network.dataset import make_validation
+from wlm.smoke.network.planes import OPACITY_PLANE
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import DatasetSettings
 
 FEW = DatasetSettings(
     cells=16, refine=2, resolution=24, frames=1, views=3, warmup=0.8, hot=0.0, validation_sequences=1, moving=0.0

@@ -13,10 +13,10 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.exr import read_exr, write_exr
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera, axis_faults
-from wlm.smoke.exporter import brightest_gain, cells, channels, pack, read_flipbook, unpack, write_flipbook
+from wlm.smoke.flipbook.textures import brightest_gain, cells, channels, pack, read_flipbook, unpack, write_flipbook
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.fine import bake
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 

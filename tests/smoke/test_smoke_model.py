@@ -17,18 +17,19 @@ from wlm.fluid.volume import from_array
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke import codec
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import march
 from wlm.smoke.codec import open_network, shipped
-from wlm.smoke.learn.settings import DatasetSettings
-from wlm.smoke.learn.synthetic import make_plume
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.model import ADAPTERS, NafBlock, NetworkSettings, SixWayNetwork, SmokeModel, parameter_count, support
-from wlm.smoke.onnx_file import export
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
-from wlm.smoke.prediction import SmokePredictor, predict
+from wlm.smoke.march.coarse import bake_coarse
+from wlm.smoke.march.fine import bake
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.onnx_file import export
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
+from wlm.smoke.network.prediction import SmokePredictor, predict
+from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
+from wlm.smoke.network.unet import ADAPTERS, NafBlock, SixWayNetwork, parameter_count, support
 from wlm.smoke.scene import CameraSettings, make_camera
+from wlm.smoke.synthetic import make_plume
 
 
 def _network(**settings) -> SixWayNetwork:
@@ -263,7 +264,7 @@ def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
     camera = make_camera(settings, volume.origin, (1.0, 1.2, 1.0))
     model = open_network()
     target = encode_lightmaps(bake(volume, camera, step=0.5, estimate=False))[:OPACITY_PLANE]
-    coarse = march(volume, camera, model.dataset.look(volume.shape))
+    coarse = bake_coarse(volume, camera, model.dataset.look(volume.shape))
 
     def score(six: SixWay) -> float:
         return psnr_from_mse(float((encode_lightmaps(six)[:OPACITY_PLANE] - target).square().mean()), 1.0)
@@ -283,7 +284,7 @@ def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
     camera = Camera.around(volume, toward=(0.3, 0.2, 1.0), pixels=96)
     predictor = SmokePredictor()
     target = encode_lightmaps(bake(volume, camera, step=0.5, estimate=False))
-    coarse = encode_lightmaps(march(volume, camera, open_network().dataset.look(volume.shape)))
+    coarse = encode_lightmaps(bake_coarse(volume, camera, open_network().dataset.look(volume.shape)))
     made = encode_lightmaps(predictor(volume, camera))
     for low, high in ((0, 6), (6, 7), (7, 8)):
         error, before = (float((planes[low:high] - target[low:high]).square().mean()) for planes in (made, coarse))

@@ -14,11 +14,11 @@ from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import of_network, score
 from wlm.smoke.fit import train
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.settings import LossSettings, TrainSettings
-from wlm.smoke.learn.trainer import Plan, Trainer, plan_round
-from wlm.smoke.model import NetworkSettings, Profile, SixWayNetwork
-from wlm.smoke.planes import GUIDES, OPACITY_PLANE, PLANES
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import LossSettings, NetworkSettings, Profile, TrainSettings
+from wlm.smoke.network.trainer import Plan, Trainer, plan_round
+from wlm.smoke.network.unet import SixWayNetwork
 
 TINY = NetworkSettings(width=8, levels=2)
 TEMPORAL = LossSettings(temporal=1.0)

@@ -10,7 +10,7 @@ from builders.contract import SUBJECTS
 from builders.smoke_samples import random_model
 
 from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example, Score
-from wlm.smoke.planes import PLANES
+from wlm.smoke.network.planes import PLANES
 from wlm.view.document import Document
 from wlm.view.reports import atlas_report, lightmap_report, probe_report, smoke_report
 

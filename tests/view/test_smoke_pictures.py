@@ -10,24 +10,16 @@ from builders.smoke_plumes import plume
 from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.smoke.baking import bake
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
-from wlm.view.smoke import (
-    contact_sheet,
-    draw_obstacles,
-    guide_pictures,
-    light_picture,
-    picture,
-    six_pictures,
-    to_bytes,
-    write_sequence,
-)
+from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.smoke import draw_obstacles, guide_pictures, picture, six_pictures
 from wlm_kernels.smoke.settings import March
 
 FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
@@ -222,10 +214,10 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
 
     if orders == "single":
         smoke = light_smoke(volume, camera, lights)
-        drawn, depth = light_picture(smoke, albedo=(0.9, 0.5, 0.0), **looks), smoke.depth
+        drawn, depth = picture(smoke, albedo=(0.9, 0.5, 0.0), **looks), smoke.depth
     else:
         smoke = scatter(volume, camera, lights, (0.9, 0.5, 0.0))
-        drawn, depth = light_picture(smoke, **looks), smoke.lit.depth
+        drawn, depth = picture(smoke, **looks), smoke.lit.depth
         assert smoke.lit.thrown.any()
     torch.testing.assert_close(drawn, shaded(smoke, looks["background"], lights))
     ball = [_ball(0.1, 0.6, 0.25)]
@@ -236,13 +228,13 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
     by_hand = shaded(smoke, behind, [replace(lights[0], visibility=seen), lights[1]])
     by_hand = torch.where((away < depth)[..., None], solid, by_hand)
     extra = {"albedo": (0.9, 0.5, 0.0)} if orders == "single" else {}
-    torch.testing.assert_close(light_picture(smoke, obstacles=ball, **looks, **extra), by_hand)
+    torch.testing.assert_close(picture(smoke, obstacles=ball, **looks, **extra), by_hand)
     assert (seen < 0.5).any() and (away < depth).any() and not torch.equal(by_hand, drawn)
 
 
 def test_lightmaps_are_lit_from_directions_alone():
     camera = _camera(8)
-    with pytest.raises(ValueError, match="expected directional lights"):
+    with pytest.raises(ValueError, match="expected only directional lights"):
         picture(_flat(camera, 0.5), [PointLight((0.0, 1.0, 0.0))])
     half = picture(_flat(camera, 0.5, 0.4), [FRONT], albedo=(0.5, 1.0, 0.0))
     torch.testing.assert_close(half, picture(_flat(camera, 0.5, 0.4), [FRONT]) * torch.tensor([0.5, 1.0, 0.0]))

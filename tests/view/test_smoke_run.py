@@ -6,12 +6,11 @@ import pytest
 import torch
 from builders.smoke_plumes import SPHERE, plume
 
-from wlm.smoke.replay import VolumeGraph
+from wlm.smoke.march.launch import VolumeGraph
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
 from wlm.smoke.shading import Ramp
 from wlm.smoke.transport.orders import scatter
-from wlm.view.smoke import light_picture, picture
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.smoke import Drawing, picture
 from wlm.view.smoke_run import AllOrders, SixWays
 
 
@@ -33,7 +32,7 @@ def test_a_graph_draws_each_frame(device, lighting):
         if isinstance(lighting, SixWays):
             expected = picture(made, lights, **parts, time=0.1 * number)
         else:
-            expected = light_picture(made, **parts, time=0.1 * number)
+            expected = picture(made, **parts, time=0.1 * number)
         torch.testing.assert_close(seen[-1], expected)
     assert not torch.equal(seen[0], seen[3]) and not torch.equal(seen[1], seen[2])
 

@@ -21,6 +21,7 @@ from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.tiles import TileKind
 from wlm.probe.data import save_probes
+from wlm.probe.sphere import basis
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
@@ -268,6 +269,54 @@ def test_a_file_of_probes_alone(tmp_path, show):
     before = scene_of(window)
     window.choose("volume")
     assert changed(window, before)
+
+
+def lit_from(direction):
+    """A probe [27] under a far white light."""
+    return (basis(np.asarray(direction, np.float64)[None], 9)[0][:, None] * np.ones(3)).ravel()
+
+
+@pytest.mark.parametrize(("up", "above"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
+def test_a_ball_is_bright_on_the_side_of_its_light(up, above, tmp_path, show):
+    for sign in (1, -1):
+        values = lit_from(sign * np.array(above))[None]
+        save_probes(tmp_path / "one.json", np.zeros((1, 3)), values)
+        ball = scene_of(show(tmp_path / "one.json", up=up)).mean(2)
+        inside = np.abs(ball - ball[0, 0]) > 3
+        rows = np.flatnonzero(inside.any(1))
+        upper, lower = (part[here].mean() for part, here in ((ball[r], inside[r]) for r in np.array_split(rows, 2)))
+        # The camera looks down on it.
+        assert sign * (upper - lower) > 30
+
+
+@pytest.mark.parametrize(("up", "axes"), [("y", np.eye(3)), ("z", np.eye(3)[[0, 2, 1]])])
+def test_balls_are_where_their_probes_are(up, axes, tmp_path, show):
+    """Of four white, red, green and blue probes: the green one is above, the others to the sides and nearer."""
+    colours = np.array([[1, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+    values = np.zeros((4, 9, 3))
+    values[:, 0] = colours * np.sqrt(4 * np.pi)
+    save_probes(tmp_path / "four.json", np.concatenate([np.zeros((1, 3)), 4 * axes]), values.reshape(4, 27))
+    picture = scene_of(show(tmp_path / "four.json", up=up))
+    origin, right, above, other = (
+        np.argwhere((np.abs(picture - 255 * colour) < 40).all(2)).mean(0) for colour in colours
+    )
+    assert above[0] < origin[0] - 20 and abs(above[1] - origin[1]) < 3
+    assert right[1] > origin[1] + 20 and right[0] > origin[0] + 5
+    # Right-handed axes: z points to the viewer's left with y up, y away from the viewer with z up.
+    assert other[1] < origin[1] - 20 if up == "y" else other[1] > origin[1] + 20
+
+
+@pytest.mark.parametrize("trial", ["import os; os.abort()", "raise SystemExit(1)", "import time; time.sleep(9)"])
+def test_a_machine_without_opengl_is_one_line_and_no_crash(trial, tmp_path, monkeypatch):
+    pytest.importorskip("pyvista")
+    monkeypatch.setattr(rendering, "_TRIAL", trial)
+    monkeypatch.setattr(rendering, "_TRIAL_SECONDS", 1.0)
+    rendering.require_opengl.cache_clear()
+    save_probes(tmp_path / "one.json", np.zeros((1, 3)), lit_from((0, 1, 0))[None])
+    with pytest.raises(WlmError, match="found no OpenGL that works") as error:
+        Window(open_scene([tmp_path / "one.json"]))
+    rendering.require_opengl.cache_clear()
+    assert "\n" not in str(error.value)
 
 
 def six_way(path, light=1.0, size=24):

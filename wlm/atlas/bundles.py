@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCKS, LUT_STEPS, TEXELS, AtlasModel, tail_codec, tail_shapes
-from wlm.atlas.shader import glsl
+from wlm.atlas.model import BLOCKS, TEXELS, AtlasModel, tail_codec, tail_shapes
+from wlm.atlas.shader import EXACT, glsl
 from wlm.atlas.stored import mesh_file
 from wlm.bundle import Bundle, Texture
 from wlm.errors import WlmError
@@ -60,8 +60,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         textures["blocks"] = _texture(model.blocks, BLOCKS, model.block_texels, layers)
     if shared:
         sheets, factors = sheet_texels(model), np.pad(model.factor.astype("<f4"), ((0, 0), (0, 0), (0, 1)))
-        textures["sheets"] = Texture(sheets, "R16G16B16A16_UINT", *sheets.shape[1::-1])
-        textures["factors"] = Texture(factors, "R32G32B32A32_FLOAT", *factors.shape[1::-1], image=factors[..., :3])
+        textures["sheets"] = Texture.from_texels(sheets, "R16G16B16A16_UINT")
+        textures["factors"] = Texture.from_texels(factors, "R32G32B32A32_FLOAT")
     if len(model.tail):
         (rows, columns), *rest = tail_shapes(*model.sheets[0].size)
         textures["tail"] = Texture(model.tail, _FORMATS[tail_codec(model.colour)], columns, rows, mips=len(rest))
@@ -78,6 +78,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         textures=textures,
         reference={"lightmap": Decoder(model, device).lightmap()},
         files={MESH_FILE: glb},
+        exact="" if shared else EXACT,
+        model=model,
     )
 
 
@@ -104,25 +106,22 @@ def _colour(model: AtlasModel, layered: bool) -> Texture:
 
 
 def _texture(data: np.ndarray, format: str, texels: np.ndarray, layers: int) -> Texture:
-    """A colour texture; its picture has the layers one below the other."""
+    """A colour texture, with the decoded texels of blocks."""
     rows, columns = texels.shape[1:3]
-    image = texels.reshape(-1, columns, 3).astype(np.float32)
+    image = (texels if layers else texels[0]).astype(np.float32) if format in ("bc6h", "astc") else None
     return Texture(data, _FORMATS[format], columns, rows, layers, image=image)
 
 
 def _lookup(model: AtlasModel) -> Texture:
-    """T_c. Its picture has the numbers of an entry as channels: whole numbers for tiles, else coordinates."""
-    rows, columns, numbers = model.lut.shape
-    picture = np.zeros((rows, columns, 3 if numbers == 2 else 4), np.float32)
-    picture[..., :numbers] = model.lut if model.method != "cascade" else model.lut / LUT_STEPS
+    """T_c: whole numbers for tiles, else coordinates."""
+    numbers = model.lut.shape[2]
     format = "R16G16B16A16_UINT" if numbers == 4 else "R16G16_UNORM" if model.method == "cascade" else "R16G16_UINT"
-    return Texture(np.ascontiguousarray(model.lut, "<u2"), format, columns, rows, image=picture)
+    return Texture.from_texels(np.ascontiguousarray(model.lut, "<u2"), format)
 
 
 def _document(model: AtlasModel, textures: dict[str, Texture], uv_set: int) -> dict[str, Any]:
     document = {
         "about": _SHARED_ABOUT if model.method == "shared" else _ONE_ABOUT,
-        "name": model.name,
         "source": model.source,
         "method": model.method,
         "colour": model.colour,

@@ -11,7 +11,7 @@ from wlm.atlas.model import (
     TAIL_OCTAVES,
     AtlasModel,
 )
-from wlm.shading import sampler
+from wlm.bundle import sampler
 
 EXACT = "WLM_ATLAS_EXACT"
 """Macro with which texels are fetched and mixed in floats."""

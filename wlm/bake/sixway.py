@@ -15,10 +15,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from wlm.config import load_settings
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.reading import named_file
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.data import Frames, load_frames
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings
 from wlm.smoke.shading import Light
 from wlm.smoke.transport import trace

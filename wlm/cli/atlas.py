@@ -257,8 +257,9 @@ def decode(
     else:
         from wlm.atlas.evaluation import RESOLUTION, VIEWS
         from wlm.atlas.views import scene_views
-        from wlm.view.atlas import draw, encode, save_png
+        from wlm.view.atlas import draw
         from wlm.view.display import white_of
+        from wlm.view.pictures import encode, save_png
 
         cameras = scene_views(model.scene, VIEWS if views is None else views)
         if view >= len(cameras):
@@ -293,10 +294,11 @@ def export(
     """Write what an engine needs of a file: textures, the mesh, a material or a shader."""
     language = shader_of(engine, shader, exact)
     quiet_warp()
-    from wlm.engines import export_atlas
+    from wlm.export import export
     from wlm.system import load
 
-    paths = export_atlas(load(file, "atlas"), output, engine, shader=language, exact=exact)
+    kit = None if engine == "raw" else engine
+    paths = export(load(file, "atlas"), output, kit, shader=language, exact=exact)
     rows = table(str(output), ["file", "bytes"])
     for path in paths:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")

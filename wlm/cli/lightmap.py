@@ -369,7 +369,7 @@ def export(
     if engine != "raw" and device != "cpu":
         raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
     quiet_warp()
-    from wlm.engines import export_lightmap
+    from wlm.export import export as export_kit
     from wlm.lightmap.front import export
 
     model = _model(file)
@@ -377,7 +377,7 @@ def export(
     if engine == "raw":
         paths = export(model, output, device=device, shader=language, exact=exact)
     else:
-        paths = export_lightmap(model, output, engine)
+        paths = export_kit(model, output, engine)
         left = [] if model.SYSTEM != _LAYERED else [sheet.label for sheet in model.sheets if sheet.linear]
         if left:
             note(f"warning: left out, since --engine {engine} shows light alone: {', '.join(left)}")

@@ -149,7 +149,7 @@ def guide(
     """
     quiet_warp()
     from wlm.smoke.data import write_guide
-    from wlm.smoke.guiding import guide
+    from wlm.smoke.march.coarse import guide
 
     march = March(step, jitter=jitter, seed=seed, threshold=threshold, g=g)
     frames = options.open(smoke)
@@ -199,7 +199,7 @@ def bake(
     those done are kept when it is stopped; the same command with --resume makes the others.
     """
     quiet_warp()
-    from wlm.smoke.baking import bake
+    from wlm.smoke.march.fine import bake
 
     if fit not in ("axes", "sphere"):
         raise WlmError(f"--fit: expected axes or sphere, got {fit!r}")
@@ -254,8 +254,8 @@ def shade(
     behind = None if background is None else vector("--background", background)
     quiet_warp()
     from wlm.smoke.scene import LightSettings, Looks
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, picture, to_bytes
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
 
     book = opened_book(smoke, textures, cells, source_layout, straight)
     source = source_of(smoke, options, step, supersample, 1.0, book)

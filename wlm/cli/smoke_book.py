@@ -14,8 +14,8 @@ from wlm.errors import WlmError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from wlm.smoke.book import Book
-    from wlm.smoke.shots import BakedFiles, FlipBook, FramesToBake, Shot
+    from wlm.smoke.flipbook.book import Book
+    from wlm.smoke.flipbook.shots import BakedFiles, FlipBook, FramesToBake, Shot
     from wlm.system import OnProgress
 
 Baked = Annotated[
@@ -91,7 +91,8 @@ def flipbook(
     quiet_warp()
     from wlm.formats.atomic import atomic_write
     from wlm.shading import ENDINGS
-    from wlm.smoke.exporter import write_page
+    from wlm.smoke.flipbook.shader import book_functions
+    from wlm.smoke.flipbook.textures import write_page
 
     book = opened_book(smoke, textures, cells, source_layout, straight)
     packing = {"layout": layout, "columns": columns, "count": count, "gain": gain, "motion": motion, "depth": depth}
@@ -106,7 +107,7 @@ def flipbook(
     clipped = sum(write_page(path, packed.pages[name]) for name, path in paths.items())
     if shader:
         for language in ("glsl", "hlsl", "msl", "wgsl"):
-            atomic_write(output.with_suffix(ENDINGS[language]), packed.shader(language).encode())
+            atomic_write(output.with_suffix(ENDINGS[language]), book_functions(packed, language).encode())
     show_book(str(smoke), packed, paths, clipped)
 
 
@@ -135,9 +136,9 @@ def packed_book(
     Raises:
         WlmError: An option, the smoke or a flip book is wrong.
     """
-    from wlm.smoke.book import pack_book
     from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.flipbook_motion import mip_padding, open_motion
+    from wlm.smoke.flipbook.book import pack_book
+    from wlm.smoke.flipbook.motion import mip_padding, open_motion
 
     if layout not in LAYOUTS:
         raise WlmError(f"--layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
@@ -192,7 +193,7 @@ def opened_book(
 ) -> "FlipBook | None":
     """The flip book that the options tell; None where they tell none."""
     from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.shots import FlipBook
+    from wlm.smoke.flipbook.shots import FlipBook
 
     if not textures:
         for option, given in (("cells", cells), ("from", layout), ("straight", straight)):
@@ -220,7 +221,7 @@ def source_of(
 ) -> "BakedFiles | FlipBook | FramesToBake":
     """The lightmaps to shade or pack: a flip book's, those of bake or predict, else of smoke that is baked now."""
     from wlm.interop import check_device
-    from wlm.smoke.shots import FramesToBake, baked_files
+    from wlm.smoke.flipbook.shots import FramesToBake, baked_files
 
     device = check_device(options.device)
     baked = baked_files(smoke, device) if book is None else replace(book, device=device)

@@ -92,21 +92,26 @@ def export(
     if padding is None:
         padding = 0 if mips is not None else _PADDING
     quiet_warp()
-    from wlm.engines import export_smoke
+    from dataclasses import replace
+
+    from wlm.export import export as export_kit
+    from wlm.export.bundles import bundle_of
 
     opened = opened_book(source, textures, cells, source_layout, straight)
     packed = packed_book(source, options, opened, **packing, layout=layout or "unity", padding=padding)
-    paths, clipped = export_smoke(packed, output, engine, name=source.resolve().stem, shader=language)
-    show_book(str(output), packed, {path.stem: path for path in paths if path.stem in packed.pages}, clipped)
+    bundle = replace(bundle_of(packed, "cpu"), name=source.resolve().stem)
+    paths = export_kit(bundle, output, None if engine == "raw" else engine, shader=language)
+    shown = {path.stem: path for path in paths if path.stem in packed.pages}
+    show_book(str(output), packed, shown, bundle.document["clipped"])
 
 
 def _network(output: Path, network: Path | None, resolution: int) -> None:
     check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke import onnx_file
     from wlm.smoke.codec import shipped
     from wlm.smoke.model import SmokeModel
-    from wlm.smoke.planes import GUIDES, PLANES
+    from wlm.smoke.network import onnx_file
+    from wlm.smoke.network.planes import GUIDES, PLANES
     from wlm.system import load
 
     network = network or shipped()

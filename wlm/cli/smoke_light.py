@@ -84,11 +84,10 @@ def light(
     _check_white(white)
     own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
     quiet_warp()
-    from wlm.smoke.transport.features import orders_march
     from wlm.smoke.transport.lighting import light_smoke
-    from wlm.smoke.transport.orders import load_orders, scatter
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import contact_sheet, light_picture, to_bytes
+    from wlm.smoke.transport.orders import load_orders, orders_march, scatter
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
     from wlm_kernels.smoke.settings import March
 
     frames = options.open(smoke)
@@ -113,7 +112,7 @@ def light(
                 extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
                 background = looks.background
             background = background if behind is None else behind
-            shaded = light_picture(made, albedo=colour, background=background, **extra)
+            shaded = picture(made, albedo=colour, background=background, **extra)
             pictures.append(to_bytes(shaded, white))
             path = file(frame)
             save_png(path, pictures[-1])
@@ -159,8 +158,7 @@ def trace(
     quiet_warp()
     from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.transport.tracing import HIGHEST, trace
-    from wlm.view.atlas import save_png
-    from wlm.view.smoke import to_bytes
+    from wlm.view.pictures import save_png, to_bytes
 
     environment = None if around is None else _even(around)
     frames = options.open(smoke)

@@ -67,7 +67,7 @@ def train(
     quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
     from wlm.smoke.fit import train as fit
-    from wlm.smoke.model import Profile
+    from wlm.smoke.network.settings import Profile
 
     settings = Profile.load(profile)
     checkpoint = Path(f"{output}{SUFFIX}")
@@ -202,10 +202,10 @@ def dataset(
     """
     quiet_warp()
     from wlm.config import load_settings
-    from wlm.smoke.learn.dataset import STAGES, make_pool, make_validation
-    from wlm.smoke.learn.pool import save_pool
-    from wlm.smoke.learn.settings import DatasetSettings
-    from wlm.view.smoke_pool import pool_sheet
+    from wlm.smoke.network.dataset import STAGES, make_pool, make_validation
+    from wlm.smoke.network.pool import save_pool
+    from wlm.smoke.network.settings import DatasetSettings
+    from wlm.view.smoke import pool_sheet
 
     settings = load_settings(DatasetSettings, settings_file)
     try:
@@ -243,19 +243,19 @@ def dataset(
 
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.coarse import march
+    from wlm.smoke.march.coarse import bake_coarse
     from wlm_kernels.smoke.settings import March
 
     def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
         voxels = max(volume.shape) / _MARCH if step is None else step
-        return march(volume, camera, March(voxels, seed=seed))
+        return bake_coarse(volume, camera, March(voxels, seed=seed))
 
     return make
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a network; notes once where little of it is taken."""
-    from wlm.smoke.prediction import SmokePredictor
+    from wlm.smoke.network.prediction import SmokePredictor
 
     predictor, first = SmokePredictor(model, device), True
 
@@ -272,7 +272,7 @@ def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[Densit
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     """The network, and what its file says of its training."""
-    from wlm.smoke.model import parameter_count
+    from wlm.smoke.network.unet import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
     training = {name: model.summary[name] for name in names if name in model.summary}
@@ -281,7 +281,7 @@ def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
 
 
 def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
-    from wlm.smoke.planes import PLANES
+    from wlm.smoke.network.planes import PLANES
 
     scores = table(str(path), ["smoke", "method", "PSNR", "lowest", "highest", "flicker"], text=["method"])
     planes = table(f"{path}: PSNR of each plane", ["smoke", "method", *PLANES], text=["method"])

@@ -245,7 +245,7 @@ def write_lightmaps(
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
-    from wlm.smoke.shots import with_surface
+    from wlm.smoke.flipbook.shots import with_surface
 
     rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
 

@@ -79,10 +79,10 @@ def run(
     from wlm.formats.film import film
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles
-    from wlm.smoke.prediction import SmokePredictor
+    from wlm.smoke.network.prediction import SmokePredictor
     from wlm.smoke.scene import load_scene
     from wlm.smoke.transport.orders import load_orders
-    from wlm.view.atlas import save_png
+    from wlm.view.pictures import save_png
     from wlm.view.smoke_run import AllOrders, SixWays, write_all
     from wlm.view.smoke_run import run as frames_of
 

@@ -28,7 +28,7 @@ def web(
     """Write one HTML file that shows the light, decoded by the browser's GPU; it needs no network."""
     check_output(output, ".html")
     quiet_warp()
-    from wlm.web import write_page
+    from wlm.export import write_page
 
     options = {"mesh": mesh, "original": original, "key": key, "hours": hours, "rate": rate, "up": up}
     with running("page") as progress:

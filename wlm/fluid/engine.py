@@ -10,7 +10,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.faces import Face, bounded_axes, face_links, walled_axes
 from wlm.interop import free_memory, no_collection
-from wlm_kernels.fluid import lattice_links, lattice_solids
+from wlm_kernels.fluid import lattice_fields, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, step_kernel
 from wlm_kernels.fluid.lattice_fields import fluid_kernels
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
@@ -65,7 +65,7 @@ class Engine:
         self.trouble = wp.full(1, QUIET, dtype=wp.int64, device=device)
         self._sums = self.zeros(2, wp.float64)
         self.solid = self.zeros(0, wp.uint8)
-        self.bodies = lattice_solids.Bodies()
+        self.bodies = lattice_fields.Bodies()
         for field in ("velocity", "spin", "centre"):
             setattr(self.bodies, field, self.zeros(BODIES, wp.vec3))
         self._force, self._forces = wp.vec3(), self.zeros(0, wp.vec3)

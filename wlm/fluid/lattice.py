@@ -184,7 +184,7 @@ class Lattice:
 
         Args:
             mask: bool, or the bodies' numbers 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
-                uint8 on the device as `wlm_kernels.fluid.lattice_solids` makes it.
+                uint8 on the device as `wlm_kernels.fluid.lattice_fields` makes it.
             velocity: Of the bodies' centres, cells a step; (3,) for body 1 or [K, 3] for bodies 1 to K.
             spin: Angular velocity, radians a step, likewise.
             centre: Cells, likewise; used where a body spins.

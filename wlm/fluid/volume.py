@@ -1,34 +1,4 @@
-"""Density volumes of smoke, checked, from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); and writing `.npz`.
-
-Stated behaviours. Repairs are listed in `DensityVolume.warnings`, one line for each kind.
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-NaN or infinite voxels                0; warning with the count and the first
-negative voxels                       0; warning likewise (solvers and filters leave small ones)
-all voxels zero                       fine: all is transparent
-one voxel                             fine
-no voxel                              error
-float16                               stays half; float32, float64 and integers become float32
-float64 beyond float32                as infinite: 0, warning
-other types, other than 3 dimensions  error
-more than 1024^3 voxels; above 512^3  error, unless the file is trusted
-those that a small file only claims
-temperature of another shape          error
-temperature so high that one voxel    lowered to that; warning with the count and the first
-gives off more than 65,504 (half's
-maximum)
-a length, extinction or emission      error
-beyond float32
-voxels of a `.nvdb` or `.vdb` that    resampled to cubic ones (`wlm.fluid.grids`)
-aren't cubes along the axes
-grids of points, vectors, ints        passed over in a `.vdb`; of a `.nvdb`, an error if it is chosen
-a file missing or damaged             error that names the file, and the field
-====================================  ================================================================
-
-A grid's density has no unit of its own: the extinction per length is `extinction` times it.
-"""
+"""Smoke without its empty parts: the cubes of 8^3 voxels in which there is any, for files that are soon written."""
 
 import math
 import os
@@ -40,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from torch.nn.functional import pad
 
 from wlm.errors import WlmError
-from wlm.fluid.bricks import EDGE, gather, scatter
-from wlm.fluid.grids import UPS, Grid, on_one_lattice
-from wlm.fluid.nanovdb import BAD_GRID, dense, entries
+from wlm.fluid.grids import BAD_GRID, UPS, Grid, dense, entries, on_one_lattice
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
@@ -52,6 +21,38 @@ from wlm.formats.npz import read_npz
 from wlm.formats.reading import read_file
 from wlm.formats.vdb import VdbFile
 from wlm.interop import check_device, device_name, to_warp
+
+EDGE = 8
+"""Voxels along a brick's edge."""
+
+
+def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Takes the bricks in which any of some fields isn't 0.
+
+    Args:
+        fields: [X, Y, Z] each, of one shape, on one device.
+
+    Returns:
+        Their numbers int32 [N], rising, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0 beyond the box.
+    """
+    margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
+    cut = []
+    for field in fields:
+        padded = pad(field, margins) if any(margins) else field
+        x, y, z = (n // EDGE for n in padded.shape)
+        cut.append(padded.reshape(x, EDGE, y, EDGE, z, EDGE))
+    some = torch.stack([(part != 0).any(5).any(3).any(1) for part in cut]).any(0)
+    return torch.nonzero(some.flatten())[:, 0].int(), [part.permute(0, 2, 4, 1, 3, 5)[some] for part in cut]
+
+
+def scatter(numbers: torch.Tensor, bricks: torch.Tensor, shape: Sequence[int]) -> torch.Tensor:
+    """What `gather` took, in its place: [X, Y, Z] of a shape, 0 elsewhere; the numbers are within it."""
+    counts = [-(-n // EDGE) for n in shape]
+    whole = torch.zeros([n * EDGE for n in counts], dtype=bricks.dtype, device=bricks.device)
+    x, y, z = torch.unravel_index(numbers.long(), counts)
+    whole.view(counts[0], EDGE, counts[1], EDGE, counts[2], EDGE)[x, :, y, :, z, :] = bricks
+    return whole[tuple(slice(n) for n in shape)].contiguous()
+
 
 _DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
 _LARGEST = 2**31 - 1  # voxels that a kernel can index

@@ -1,7 +1,7 @@
-"""Folders of files that belong together: claimed before long work, made beside their place and moved in whole.
+"""Output folders: checked before long work, written beside their place, and moved in as a whole.
 
-An index file, JSON with a `format` of its own, says whose folder it is. It is written last: a folder whose index is
-whole holds all that the index names.
+An index file, JSON with its own `format`, identifies the folder. It is written last, so a folder with a complete index
+holds all files that the index lists.
 """
 
 import json
@@ -20,25 +20,26 @@ from wlm.formats.lock import is_passing, locked, temporary
 from wlm.formats.reading import read_json_file
 
 UNFINISHED = "unfinished"
-"""Key of an index that stands in while files are being moved in."""
+"""Key that marks the temporary index of a folder while files are moved into it."""
 
+_NAME = re.compile(r"([\w.-]+/)?[\w.-]+")
 _NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
 
 
 def claim(folder: Path, index: str, format_name: str) -> None:
-    """Checks, before long work, that a folder can be written and holds nothing of others.
+    """Checks, before long work, that a folder can be written and holds no files other than an earlier output.
 
     Args:
-        folder: Where; it need not exist.
+        folder: The folder; it need not exist.
         index: Name of the index file.
         format_name: The index's `format`.
 
     Raises:
-        WlmError: It is a file, holds something other than an earlier output, or it or its parent can't be written.
+        WlmError: The path is a file, the folder holds other files, or it or its parent cannot be written.
     """
     try:
         if folder.exists() and read_index(folder / index).get("format") != format_name:
-            # What a killed process left in the making is no file of anybody's.
+            # Temporary files of a killed process do not count.
             if not all(is_passing(path.name) for path in folder.iterdir()):
                 raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
     except OSError as error:
@@ -53,12 +54,10 @@ def claim(folder: Path, index: str, format_name: str) -> None:
 
 @contextmanager
 def made_parents(folder: Path) -> Iterator[None]:
-    """Makes the folders above a folder, for an output that may lie deeper than `claim` allows.
-
-    Those that it made go again where the block raises, as far as they are empty.
+    """Creates the missing parent folders of an output, and removes them again if the block raises.
 
     Raises:
-        WlmError: They can't be made.
+        WlmError: A folder cannot be created.
     """
     parent = Path(os.path.abspath(folder)).parent
     missing = [each for each in (parent, *parent.parents) if not each.exists()]
@@ -76,21 +75,21 @@ def made_parents(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], bool]) -> Iterator[Path]:
-    """Yields a new folder beside the real one, and moves its files there at the end if nothing went wrong.
+def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], bool] | None = None) -> Iterator[Path]:
+    """Yields a temporary folder beside the real one, and moves its files into the real one if nothing went wrong.
 
-    The index is moved last. Where the moving is stopped half-way, the folder's index says `UNFINISHED`: it can't be
-    read, but can be written again.
+    The files may lie in subfolders. The index is moved last, with their names as its entry "files"; files that the
+    index of an earlier output lists and the new one lacks are removed. If the move is interrupted, the folder's index
+    is marked `UNFINISHED`: it cannot be read, but it can be written again.
 
     Args:
-        folder: Where; claimed, made if it isn't there.
+        folder: The folder; made if it does not exist.
         index: Name of the index file, which the block has to write.
         format_name: The index's `format`.
-        ours: Whether a name is one that such an output may have: files of an earlier output that the new one lacks are
-            removed.
+        ours: Whether a file name may belong to an earlier output without a list of its files; such files are removed.
 
     Raises:
-        WlmError: A file can't be written, messages name the real folder; or another process is writing there.
+        WlmError: A file cannot be written (the message names the real folder), or another process is writing there.
     """
     with locked(folder):
         claim(folder, index, format_name)
@@ -104,24 +103,40 @@ def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], boo
             raise WlmError(str(error).replace(str(made), str(folder))) from error
 
 
-def _move(made: Path, folder: Path, index: str, format_name: str, ours: Callable[[str], bool]) -> None:
+def _move(made: Path, folder: Path, index: str, format_name: str, ours: Callable[[str], bool] | None) -> None:
     """Moves an output's files into their folder."""
-    names = {path.name for path in made.iterdir()}
+    names = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file())
+    names.remove(index)
     folder.mkdir(exist_ok=True)
-    # An old index must not vouch for new files, nor may the folder become one that can't be written again.
-    write_index(folder / index, {"format": format_name, UNFINISHED: True})
-    for path in sorted(folder.iterdir()):
-        if path.name != index and path.name not in names and ours(path.name):
-            path.unlink(missing_ok=True)
-    for name in sorted(names - {index}):
+    old = set(_listed(folder, index))
+    if ours is not None:
+        old |= {path.name for path in folder.iterdir() if path.name != index and ours(path.name)}
+    write_index(made / index, read_index(made / index) | {"files": names})
+    # An old index must not vouch for new files, nor may the folder become one that cannot be written again.
+    write_index(folder / index, {"format": format_name, UNFINISHED: True, "files": sorted(old | set(names))})
+    for name in sorted(old - set(names)):
+        (folder / name).unlink(missing_ok=True)
+    for parent in {(folder / name).parent for name in old} - {folder}:
+        with suppress(OSError):
+            parent.rmdir()
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
         os.replace(made / name, folder / name)
     sync_folder(folder)
     os.replace(made / index, folder / index)
     sync_folder(folder)
 
 
+def _listed(folder: Path, index: str) -> list[str]:
+    """The files of an earlier output as its index lists them; only those in the folder or one folder below it."""
+    listed = read_index(folder / index).get("files")
+    names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+    safe = [name for name in names if _NAME.fullmatch(name) and not any(p.startswith(".") for p in name.split("/"))]
+    return [name for name in safe if (folder / name).is_file() and not (folder / name).parent.is_symlink()]
+
+
 def read_index(path: Path) -> dict[str, Any]:
-    """Reads an index; empty where there is none or it isn't a JSON object."""
+    """Reads an index; an empty mapping if the file is missing or not a JSON object."""
     try:
         content = read_json_file(path, "the index")
     except WlmError:
@@ -130,7 +145,7 @@ def read_index(path: Path) -> dict[str, Any]:
 
 
 def write_index(path: Path, content: dict[str, Any]) -> int:
-    """Writes an index, whole or not at all, as `compact_json`."""
+    """Writes an index atomically, formatted by `compact_json`; returns its size in bytes."""
     return atomic_write(path, compact_json(content).encode())
 
 
@@ -141,12 +156,12 @@ def compact_json(content: Any) -> str:
         ValueError: A number is NaN or infinite.
     """
     text = json.dumps(content, indent=1, allow_nan=False)
-    # One number per line would be most of the file. Strings hold no raw line break, so none of them is touched.
+    # Otherwise each number would have its own line. JSON strings hold no raw line break, so they are not changed.
     return _NUMBERS.sub(lambda match: "[" + " ".join(match[1].split()) + "]", text) + "\n"
 
 
 def rounded(values: np.ndarray) -> list[Any]:
-    """Nested lists of float32 numbers, each with the nine digits that lead back to it and not float64's seventeen."""
+    """Converts float32 numbers to nested lists, each rounded to the nine digits that identify it."""
     values = np.asarray(values, np.float64)
     if values.ndim > 1:
         return [rounded(row) for row in values]

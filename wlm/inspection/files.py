@@ -37,11 +37,7 @@ _PROBE_EXPORTS = {
 _EXPORTS = _PROBE_EXPORTS | {
     "wlm-bake": BAKED,
     "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
-    "wlm-lightmap-engine": "lightmaps over time for one engine: textures, weights and a component",
-    "wlm-atlas-engine": "a compressed lightmap of a mesh for one engine: textures, the mesh and a material or a shader",
-    "wlm-scene-engine": "the compressed lightmaps of a scene for one engine: textures, the scene and its materials",
-    "wlm-smoke-engine": "six-way smoke for one engine: a flip book of it and its shader",
-    "wlm-lightmap-layers-engine": "layered lightmaps over time for one engine: a folder for each sheet of light",
+    "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
     "wlm-probe-export": "light probes for an engine: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",

@@ -7,7 +7,6 @@ these, `wlm.lightmap.shader` reads them.
 
 import math
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 
@@ -235,11 +234,6 @@ def hour_tables(model: LightmapModel) -> np.ndarray:
     if not (np.isfinite(nets[0]).all() and np.isfinite(tables).all()):
         raise WlmError(f"{model.name}: cannot export: a weight is NaN or infinite")
     return tables
-
-
-def table_script() -> str:
-    """JavaScript that computes the table of any hour from `weights.json` and `networks.bin`: `wlmReads`, `wlmTable`."""
-    return (resources.files("wlm.lightmap") / "assets" / "table.js").read_text(encoding="utf-8").rstrip("\n")
 
 
 def _between(tau: float, count: int, repeats: bool) -> tuple[int, int, float]:

@@ -1,9 +1,9 @@
 """The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
 
+from wlm.bundle import sampler
 from wlm.lightmap.model import TILE, LightmapModel
 from wlm.lightmap.packed import CODES, HEAD, columns, fours, record
 from wlm.lightmap.tiles import TileKind
-from wlm.shading import sampler
 from wlm.texels import REACH
 
 EXACT = "WLM_LIGHTMAP_EXACT"

@@ -13,7 +13,9 @@ from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.formats.artifact import Artifact
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm.smoke.model import NetworkSettings, SixWayNetwork, SmokeModel
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.settings import NetworkSettings
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.system import Header, load
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safetensors"

@@ -27,8 +27,8 @@ from wlm.formats.exr import read_part, read_planes, write_planes
 from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
-from wlm.smoke.guiding import Guide
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import Guide
 from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
 from wlm.system import Meter, OnProgress
 

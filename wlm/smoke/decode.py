@@ -15,8 +15,9 @@ import warp as wp
 from torch import nn
 
 from wlm.interop import StepGraph, check_device, to_warp
-from wlm.smoke.model import REACH, NafBlock, SixWayNetwork, SmokeModel
-from wlm.smoke.planes import GUIDES, PLANES
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import GUIDES, PLANES
+from wlm.smoke.network.unet import REACH, NafBlock, SixWayNetwork
 from wlm_kernels.smoke import naf_block
 from wlm_kernels.smoke import planes as smoke_planes
 

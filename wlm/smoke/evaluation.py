@@ -27,12 +27,12 @@ from wlm.interop import check_device
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.decode import Decoder
-from wlm.smoke.learn.dataset import make_validation, pool_of_volume
-from wlm.smoke.learn.losses import residual
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.planes import OPACITY_PLANE, PLANES
+from wlm.smoke.network.dataset import make_validation, pool_of_volume
+from wlm.smoke.network.losses import residual
+from wlm.smoke.network.planes import OPACITY_PLANE, PLANES
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import Meter, OnProgress
 
 Method = Callable[[Pool, slice], torch.Tensor]

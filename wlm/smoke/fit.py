@@ -38,11 +38,12 @@ from wlm.formats.lock import locked
 from wlm.formats.parts import Part, check_parts
 from wlm.interop import check_device
 from wlm.smoke.evaluation import Score, of_network, score
-from wlm.smoke.learn import dataset
-from wlm.smoke.learn.pool import Pool
-from wlm.smoke.learn.trainer import Trainer, plan_round
-from wlm.smoke.model import Profile, SmokeModel
-from wlm.smoke.planes import PLANES
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network import dataset
+from wlm.smoke.network.planes import PLANES
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import Profile
+from wlm.smoke.network.trainer import Trainer, plan_round
 from wlm.system import Meter, OnProgress, Progress, load
 
 _CHUNK = 50  # steps between two reports

@@ -34,7 +34,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
-from wlm.fluid.shapes import box, cylinder, sphere
+from wlm.fluid.obstacles import box, cylinder, sphere
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 

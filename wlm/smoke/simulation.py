@@ -17,8 +17,8 @@ from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
+from wlm.smoke.march.motion import velocity_file, write_velocity
 from wlm.smoke.scene import Inlet, Scene, SourceSettings
-from wlm.smoke.velocity import velocity_file, write_velocity
 from wlm.system import Meter, OnProgress
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]

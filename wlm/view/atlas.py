@@ -5,20 +5,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
 
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import Sampler
 from wlm.atlas.views import Points, points_at, visible_uv
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_path
 from wlm.interop import check_device
 from wlm.ops import raster
 from wlm.ops.views import View
-from wlm.view.display import Display, white_of
-
-_BACKGROUND = 128  # light and dark surfaces stand out from it
-_MARGIN, _TITLE, _FONT = 6, 26, 16  # pixels
+from wlm.view.display import white_of
+from wlm.view.pictures import contact_sheet, encode
 
 
 def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
@@ -67,21 +63,6 @@ def draw(
     return pictures, hit.cpu().numpy()
 
 
-def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:
-    """Encodes linear light [H, W, 3] as sRGB bytes, grey beside the mesh."""
-    return np.where(hit[..., None], Display(1.0 / white).picture(light), np.uint8(_BACKGROUND))
-
-
-def save_png(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
-    """Writes uint8 [H, W, 3] as a PNG, whole or not at all.
-
-    Raises:
-        WlmError: The file can't be written.
-    """
-    with atomic_path(path) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG")
-
-
 def comparison(
     path: str | os.PathLike[str],
     scene: LightmappedScene,
@@ -92,10 +73,10 @@ def comparison(
     gain: float = 8.0,
     device: str = "cpu",
 ) -> None:
-    """Writes a PNG: one row per view, with the original, each decoder, and each decoder's absolute error times a gain.
+    """Writes a contact sheet: one row per view with the original, each decoder, and each decoder's absolute error.
 
-    All share one exposure: the original's 99.5th percentile over all views is white, and light is encoded as sRGB.
-    Errors are linear. Each view is cropped to the mesh.
+    All share one exposure: the 99.5th percentile of the original over all views is white, and light is encoded as sRGB.
+    Errors are linear and multiplied by a gain. Each view is cropped to the mesh.
 
     Args:
         path: The PNG to write; its folder must exist.
@@ -104,47 +85,28 @@ def comparison(
         views: The cameras, at least one.
         resolution: Pixels along a side of a view before it is cropped.
         gain: Factor on errors.
-        device: "cpu" or "cuda:N", the decoders'.
+        device: "cpu" or "cuda:N", the decoders' device.
 
     Raises:
-        ValueError: No decoder, or no view.
-        WlmError: No view sees the mesh, or the file can't be written.
+        ValueError: There is no decoder or no view.
+        WlmError: The mesh is visible in no view, or the file cannot be written.
     """
     if not samplers or not views:
         raise ValueError("expected at least one decoder and one view")
-    drawn = []
-    for view in views:
+    drawn = {}
+    for number, view in enumerate(views, 1):
         pictures, hit = draw(scene, {"original": original(scene, device), **samplers}, view, resolution, device)
         if hit.any():
             lines = hit.any(axis=1), hit.any(axis=0)
             window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
-            drawn.append(({name: picture[window] for name, picture in pictures.items()}, hit[window]))
+            drawn[f"view {number}"] = {name: picture[window] for name, picture in pictures.items()}, hit[window]
     if not drawn:
         raise WlmError(f"{scene.name}: cannot draw it: no view shows it")
-    white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn]))
-    rows = []
-    for pictures, hit in drawn:
+    white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn.values()]))
+    rows = {}
+    for label, (pictures, hit) in drawn.items():
         light = [encode(picture, hit, white) for picture in pictures.values()]
         errors = (np.abs(pictures[name] - pictures["original"]) * gain for name in samplers)
-        rows.append(light + [encode(error, hit, white) for error in errors])
-    titles = [f"error x {gain:g}, {name}" for name in samplers]
-    save_png(path, _sheet(rows, ["original", *samplers, *titles]))
-
-
-def _sheet(rows: list[list[np.ndarray]], titles: list[str]) -> np.ndarray:
-    """Arranges pictures in rows under titles, each in the middle of its cell."""
-    cell = max(row[0].shape[1] for row in rows)
-    heights = [row[0].shape[0] for row in rows]
-    width = len(titles) * (cell + _MARGIN) + _MARGIN
-    sheet = Image.new("RGB", (width, sum(heights) + _TITLE + _MARGIN * (len(rows) + 1)), (_BACKGROUND,) * 3)
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(_FONT)
-    for column, title in enumerate(titles):
-        middle = _MARGIN + column * (cell + _MARGIN) + cell // 2
-        pen.text((middle, _MARGIN), title, fill="white", font=font, anchor="ma")
-    y = _TITLE + _MARGIN
-    for row, height in zip(rows, heights, strict=True):
-        for column, picture in enumerate(row):
-            x = _MARGIN + column * (cell + _MARGIN) + (cell - picture.shape[1]) // 2
-            sheet.paste(Image.fromarray(picture), (x, y))
-        y += height + _MARGIN
-    return np.asarray(sheet)
+        rows[label] = light + [encode(error, hit, white) for error in errors]
+    titles = ["original", *samplers, *(f"error × {gain:g}, {name}" for name in samplers)]
+    contact_sheet(path, rows, titles, columns=len(titles))

@@ -1,6 +1,6 @@
-"""From linear light to the screen: exposure, tone mapping, sRGB, and the colours of an error.
+"""Conversion of linear light to screen colours: exposure, tone mapping, sRGB, and false colours of an error.
 
-The same as the pages for a browser have (`wlm/web/assets/light.js`), so that a picture of either is that of the other.
+The HTML pages convert in the same way (`wlm/export/page/assets/light.js`), so that both show the same picture.
 """
 
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ import numpy as np
 from wlm.texels import filmic, to_srgb
 
 TONES = ("clamped", "filmic")
-"""What becomes of light above white: it clips, or Reinhard's curve takes 4 to white."""
+"""How light above white is shown: it is clipped, or an extended Reinhard curve maps 4 to white."""
 
-_WHITE_PERCENTILE = 99.5  # as in `wlm.view.sheet`
+_WHITE_PERCENTILE = 99.5
 _HEAT = np.array([[0.0, 0.0, 0.0], [0.45, 0.1, 0.5], [1.0, 0.6, 0.1], [1.0, 1.0, 1.0]])
 _HEAT_AT = (0.0, 0.33, 0.66, 1.0)
 
 
 @dataclass(frozen=True)
 class Display:
-    """How light is shown.
+    """How linear light is converted to screen colours.
 
     Attributes:
-        exposure: Factor on linear light; 1 is white after it.
+        exposure: Factor on linear light, whose product 1 is white.
         tone: One of `TONES`.
         gain: Factor on errors.
     """
@@ -32,18 +32,18 @@ class Display:
     gain: float = 8.0
 
     def screen(self, light: np.ndarray) -> np.ndarray:
-        """Linear light of any shape to display values in [0, 1], float32."""
+        """Converts linear light of any shape to display values in [0, 1], float32."""
         x = np.maximum(np.asarray(light, np.float32) * np.float32(self.exposure), np.float32(0))
         if self.tone == "filmic":
             x = filmic(x)
         return to_srgb(x)
 
     def picture(self, light: np.ndarray) -> np.ndarray:
-        """Linear light of any shape to bytes."""
+        """Converts linear light of any shape to bytes."""
         return _bytes(self.screen(light))
 
     def error(self, decoded: np.ndarray, original: np.ndarray) -> np.ndarray:
-        """The error of the picture on the screen, the largest of the channels times the gain, as `heat` of it.
+        """Shows the error of the displayed picture: the largest channel's difference times the gain, as `heat`.
 
         Args:
             decoded, original: Linear light [..., 3].
@@ -56,19 +56,19 @@ class Display:
 
 
 def heat(values: np.ndarray) -> np.ndarray:
-    """Black, purple, orange, white for values [...] from 0 to 1; uint8 [..., 3]."""
+    """Maps values [...] from 0 to 1 to colours uint8 [..., 3]: black, purple, orange, white."""
     values = np.clip(values, 0.0, 1.0)
     table = np.linspace(0.0, 1.0, 256)
     place = np.interp(table, _HEAT_AT, range(len(_HEAT_AT)))
     share = place % 1.0
-    # Smooth between the stops.
+    # Smoothstep between the stops.
     place = np.floor(place) + share * share * (3.0 - 2.0 * share)
     colours = np.stack([np.interp(place, range(len(_HEAT)), channel) for channel in _HEAT.T], 1)
     return _bytes(colours)[np.round(values * 255.0).astype(np.uint8)]
 
 
 def white_of(light: np.ndarray) -> float:
-    """The radiance that is shown as white: the 99.5th percentile; 1 where there is no light."""
+    """Chooses the radiance that is shown as white: the 99.5th percentile; 1 if there is no light."""
     white = float(np.percentile(light, _WHITE_PERCENTILE)) if light.size else 0.0
     return white if white > 0 else float(light.max(initial=0.0)) or 1.0
 

@@ -24,8 +24,9 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.transform import Transform
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
-from wlm.smoke.model import SmokeModel, parameter_count
-from wlm.smoke.planes import EMISSION_PLANE, PLANES, decode_lightmaps
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import EMISSION_PLANE, PLANES, decode_lightmaps
+from wlm.smoke.network.unet import parameter_count
 from wlm.smoke.shading import Light
 from wlm.view.atlas import draw, original
 from wlm.view.display import Display, white_of

@@ -1,58 +1,208 @@
-"""Pictures of smoke: shaded frames with a scene's obstacles, guiding maps, sequences and contact sheets."""
+"""Pictures of smoke: frames under a scene's lights with its obstacles, guiding maps, lightmaps, training samples."""
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+import warp as wp
 
-from wlm.errors import WlmError
-from wlm.interop import device_name
-from wlm.smoke.camera import DIRECTIONS, Camera
-from wlm.smoke.guiding import Guide
+from wlm.interop import device_name, stream, to_warp
+from wlm.ops.raster import rasterize
+from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import ObstacleSettings
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.march.coarse import Guide
+from wlm.smoke.network.planes import GUIDES, PLANES
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
+from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
 from wlm.smoke.transport.lighting import LitSmoke
+from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
-from wlm.view.atlas import encode, save_png
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.pictures import MOST_COLUMNS, contact_sheet, spread, to_bytes
+from wlm_kernels.smoke import picture as kernels
 
-MOST_COLUMNS = 8
-"""Pictures in a row of a contact sheet."""
-
-_GREY = 96  # of a sheet: neither smoke nor shadow
-_MARGIN, _FONT = 4, 14  # pixels
+# Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
+_AMBIENT = 0.2
 
 
-def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
-    """Linear light to sRGB bytes.
+class Drawing:
+    """Draws pictures from one camera, under fixed lights, into buffers that are allocated once.
 
-    Args:
-        light: [H, W, 3], or [H, W]: grey.
-        white: The light that becomes white; brighter light clips.
+    At a pixel an obstacle is in front of all of the smoke or behind all of it, depending on the depth of the smoke's
+    surface. Obstacles shadow this surface from directional lights. Point lights cast no shadows of obstacles and do
+    not light them.
 
-    Returns:
-        uint8 [H, W, 3].
+    `move` sets the positions of the obstacles. A call then only launches kernels, so on CUDA a graph can capture it.
 
-    Raises:
-        ValueError: White isn't above 0.
+    Attributes:
+        image: float32 [H, W, 3], linear, the last picture.
+        solid_light, solid_depth: Light [H, W, 3] of the obstacles and distance [H, W] along the ray, infinite where
+            there is no obstacle.
     """
-    if not 0 < white < math.inf:
-        raise ValueError(f"white: expected a number above 0, got {white}")
-    pixels = np.asarray(light.cpu() if isinstance(light, torch.Tensor) else light, np.float32)
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[..., None], 3, axis=2)
-    return encode(pixels, np.ones(pixels.shape[:2], bool), white)
+
+    def __init__(
+        self,
+        camera: Camera,
+        lights: Sequence[AnyLight],
+        *,
+        albedo: Sequence[float] = (1.0, 1.0, 1.0),
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        ramp: Ramp | None = None,
+        obstacles: Sequence[ObstacleSettings] = (),
+        rule: str = "squared",
+        device: str = "cpu",
+    ) -> None:
+        """Allocates the buffers.
+
+        Args:
+            camera: The view.
+            lights: Any number. If there are obstacles, the lights' visibility is replaced by the obstacles' shadows.
+            albedo: R, G, B single-scattering albedo, applied to light scattered once.
+            background: A linear colour.
+            ramp: Colour of the emission; None: grey.
+            obstacles: Obstacles that are drawn and cast shadows on the smoke's surface.
+            rule: How the lightmaps are weighted by a light's direction, one of `wlm.smoke.camera.RULES`.
+            device: A device as `wlm.interop.check_device` returns it.
+
+        Raises:
+            ValueError: A light has no direction, a negative irradiance or a visibility of another shape; the albedo is
+                out of range; or the rule is unknown.
+        """
+        self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
+        self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))
+        height, width = camera.height, camera.width
+        colours, toward, shares, visible = [], [], [], []
+        for light in lights:
+            if isinstance(light, Light):
+                colours.append(checked_colour("irradiance", light.irradiance))
+                toward.append(unit(light.toward))
+                shares.append(weights(camera.axes @ toward[-1], rule))
+                visible.append(light.visibility)
+            else:
+                colours.append(checked_colour("intensity", light.intensity))
+                toward.append(np.zeros(3))
+                shares.append(np.zeros(6))
+                visible.append(None)
+            if visible[-1] is not None and tuple(visible[-1].shape) != (height, width):
+                raise ValueError(f"visibility: expected {(height, width)}, got {tuple(visible[-1].shape)}")
+
+        def put(
+            values: Sequence | np.ndarray, shape: tuple[int, ...], kind: torch.dtype = torch.float32
+        ) -> torch.Tensor:
+            return torch.tensor(np.asarray(values), dtype=kind).reshape(shape).to(device)
+
+        with stream(device):
+            self.image = torch.zeros((height, width, 3), device=device)
+            self.solid_light = torch.zeros_like(self.image)
+            self.solid_depth = torch.full((height, width), math.inf, device=device)
+            self._axes = [light_axes(way) if way.any() else None for way in toward]
+            self._visibility = torch.ones((len(lights), height, width), device=device)
+            for own, seen in zip(self._visibility, visible, strict=True):
+                if seen is not None:
+                    own.copy_(seen)
+            # At least one row: an empty array has no memory.
+            rows = max(len(lights), 1)
+            more = [np.zeros((rows - len(lights), n)) for n in (3, 3, 6)]
+            parts = zip((toward, colours, shares), more, strict=True)
+            self._lamps = tuple(put([*values, *zeros], (rows, zeros.shape[1])) for values, zeros in parts)
+            self._ramp = None if ramp is None else (put(ramp.stops, (-1,)), put(ramp.colours, (-1, 3)))
+            if self._obstacles:
+                points, triangles, owner = (torch.from_numpy(part).to(device) for part in obstacle_mesh(obstacles, 0.0))
+                tints = put([obstacle.colour for obstacle in obstacles], (-1, 3))
+                self._solids = (points, triangles, owner, tints)
+                self._clip = torch.empty((len(points), 4), device=device)
+
+    def move(self, time: float) -> None:
+        """Moves the obstacles to their positions at a time in seconds."""
+        if self._obstacles:
+            with stream(self._device):
+                self._solids[0].copy_(torch.from_numpy(obstacle_mesh(self._obstacles, time)[0]))
+
+    def draw_obstacles(self) -> None:
+        """Fills `solid_light` and `solid_depth`."""
+        if not self._obstacles:
+            return
+        with stream(self._device):
+            solids, view = self._as_solids(), self._camera.in_world()
+            kernels.clip_points(solids, view, to_warp(self._clip, wp.vec4))
+            drawn = rasterize(self._clip, self._solids[1], self._camera.height, self._camera.width)
+            seen = to_warp(drawn.triangle), to_warp(drawn.barycentric.contiguous(), wp.vec2)
+            out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
+            kernels.light_solids(solids, self._as_lamps(), _AMBIENT, view, *seen, *out)
+
+    def __call__(self, smoke: SixWay | LitSmoke | ScatteredSmoke) -> torch.Tensor:
+        """Draws a frame.
+
+        Args:
+            smoke: On the device: lightmaps with transparency and, if there are obstacles, with depth; or smoke that was
+                lit by the drawing's lights; light of all orders already includes its albedo.
+
+        Returns:
+            `image`.
+
+        Raises:
+            ValueError: The lightmaps lack a plane, or a light is a point light.
+        """
+        six = smoke if isinstance(smoke, SixWay) else None
+        seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
+        if six is not None and None in self._axes:
+            raise ValueError("six: expected only directional lights, since lightmaps hold no positions")
+        if seen.transparency is None:
+            raise ValueError("transparency: expected lightmaps with transparency, found none")
+        if self._obstacles and seen.depth is None:
+            raise ValueError("six: expected lightmaps with their depth, for the obstacles")
+        with stream(self._device):
+            solids = None
+            if self._obstacles:
+                self.draw_obstacles()
+                surface, mesh = to_warp(seen.depth.contiguous()), self._as_solids()
+                for axes, own in zip(self._axes, self._visibility, strict=True):
+                    if axes is not None:
+                        cast_shadow(mesh.points, mesh.triangles, axes, self._camera.in_world(), surface, to_warp(own))
+                solids = surface, to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
+            glow = self._glow_of(seen.emission, None if six is not None else seen.thrown)
+            transparency = to_warp(seen.transparency.float().contiguous())
+            image, common = to_warp(self.image, wp.vec3), (self._as_lamps(), self._background, solids)
+            if six is not None:
+                lightmaps = to_warp(six.lightmaps.float().contiguous())
+                kernels.compose(lightmaps, transparency, glow, self._albedo, *common, image)
+            else:
+                planes = smoke.planes if isinstance(smoke, ScatteredSmoke) else self._of_albedo(smoke.planes)
+                kernels.compose_lights(to_warp(planes, wp.vec3), transparency, glow, *common, image)
+        return self.image
+
+    def _of_albedo(self, planes: torch.Tensor) -> torch.Tensor:
+        """Multiplies light scattered once, [L, H, W], by the albedo: [L, H, W, 3]."""
+        return torch.stack([value * planes for value in self._albedo], -1)
+
+    def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
+        """Light that the smoke emits, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
+        if emission is None:
+            return None
+        ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))
+        glow = torch.empty_like(self.image)
+        kernels.glow_of(to_warp(emission.float().contiguous()), ramp, to_warp(glow, wp.vec3))
+        if thrown is not None:
+            glow += thrown * (1.0 if ramp is None else glow.sum((0, 1)) / emission.sum().clamp(min=1e-12))
+        return to_warp(glow, wp.vec3)
+
+    def _as_solids(self) -> kernels.Solids:
+        points, triangles, owner, tints = self._solids
+        return kernels.Solids(to_warp(points, wp.vec3), to_warp(triangles), to_warp(owner), to_warp(tints, wp.vec3))
+
+    def _as_lamps(self) -> kernels.Lamps:
+        toward, irradiance, shares = self._lamps
+        visibility = self._visibility if len(self._axes) else self.solid_depth[None]
+        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(shares), to_warp(visibility)
+        return kernels.Lamps(len(self._axes), *arrays)
 
 
 def draw_obstacles(
     obstacles: Sequence[ObstacleSettings], time: float, camera: Camera, lights: Sequence[Light], device: str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws diffuse obstacles under directional lights. They cast no shadows on each other, nor does the smoke on them.
+    """Draws diffuse obstacles under directional lights, without shadows on each other or from the smoke.
 
     Args:
         obstacles: Any number.
@@ -71,8 +221,8 @@ def draw_obstacles(
 
 
 def picture(
-    six: SixWay,
-    lights: Sequence[Light],
+    smoke: SixWay | LitSmoke | ScatteredSmoke,
+    lights: Sequence[AnyLight] | None = None,
     *,
     albedo: Sequence[float] = (1.0, 1.0, 1.0),
     background: Sequence[float] = (0.0, 0.0, 0.0),
@@ -81,20 +231,14 @@ def picture(
     time: float = 0.0,
     rule: str = "squared",
 ) -> torch.Tensor:
-    """Puts shaded smoke and a scene's obstacles into one picture.
-
-    A billboard is flat: at a pixel an obstacle is before all of the smoke or behind all of it, by the depth of the
-    smoke's surface.
+    """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does.
 
     Args:
-        six: Lightmaps with their camera and transparency; with obstacles, with their depth too.
-        lights: Any number.
-        albedo: R, G, B, the share of light that a scattering leaves.
-        background: A linear colour.
-        ramp: Colour of the emission.
-        obstacles: They are drawn, and cast shadows on the smoke's surface.
-        time: Of the obstacles, seconds.
-        rule: How a light's direction weighs the lightmaps.
+        smoke: Lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
+            was lit by lights of its own, by light scattered once or of all orders.
+        lights: Lights of the lightmaps; None for smoke that was lit already.
+        albedo, background, ramp, obstacles, rule: As of `Drawing`.
+        time: Time of the obstacles, seconds.
 
     Returns:
         float32 [H, W, 3], linear.
@@ -102,45 +246,18 @@ def picture(
     Raises:
         ValueError: The lightmaps lack their camera, transparency or, with obstacles, depth.
     """
-    if six.camera is None:
+    lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
+    if lit.camera is None:
         raise ValueError("six: expected lightmaps with their camera")
     options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
-    drawing = Drawing(six.camera, lights, **options, device=device_name(six.lightmaps.device))
-    drawing.move(time)
-    return drawing(six)
-
-
-def light_picture(
-    smoke: LitSmoke | ScatteredSmoke,
-    *,
-    albedo: Sequence[float] = (1.0, 1.0, 1.0),
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    ramp: Ramp | None = None,
-    obstacles: Sequence[ObstacleSettings] = (),
-    time: float = 0.0,
-) -> torch.Tensor:
-    """Puts smoke that its own lights light and a scene's obstacles into one picture, as `picture` does.
-
-    Args:
-        smoke: Light scattered once, or of all orders, which has its albedo already.
-        albedo: R, G, B of light scattered once.
-        background: A linear colour.
-        ramp: Colour of the emission.
-        obstacles: They are drawn, and keep directional lights off the smoke's surface.
-        time: Of the obstacles, seconds.
-
-    Returns:
-        float32 [H, W, 3], linear.
-    """
-    lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
-    options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles}
-    drawing = Drawing(lit.camera, lit.lights, **options, device=device_name(lit.transparency.device))
+    device = device_name(lit.transparency.device if lit.transparency is not None else lit.lightmaps.device)
+    drawing = Drawing(lit.camera, lit.lights if lights is None else lights, **options, device=device)
     drawing.move(time)
     return drawing(smoke)
 
 
 def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
-    """The lightmaps, the opacity and, of hot smoke, the emission, uint8 [H, W, 3] each, by name."""
+    """The lightmaps, the opacity and, for hot smoke, the emission as pictures uint8 [H, W, 3], by name."""
     planes = {name: six[name] for name in DIRECTIONS}
     if six.transparency is not None:
         planes["alpha"] = 1.0 - six.transparency
@@ -150,7 +267,7 @@ def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
 
 
 def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
-    """Light, transparency and depth, uint8 [H, W, 3] each, by name; the nearest depth is white, no smoke is black."""
+    """Light, transparency and depth as pictures uint8 [H, W, 3], by name; near is white, no smoke is black."""
     depth = guide.depth.cpu()
     smoke = depth > 0
     near, far = (float(depth[smoke].min()), float(depth[smoke].max())) if smoke.any() else (0.0, 0.0)
@@ -158,79 +275,47 @@ def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
     return {
         "light": to_bytes(guide.light, white),
         "transparency": to_bytes(guide.transparency),
-        "depth": np.repeat((grey.numpy() * 255.0 + 0.5).astype(np.uint8)[..., None], 3, axis=2),
+        "depth": _grey(grey),
     }
 
 
-def write_sequence(folder: str | os.PathLike[str], pictures: Iterable[np.ndarray], stem: str = "frame") -> list[Path]:
-    """Writes pictures as `STEM_0001.png` and so on, each whole or not at all.
+def pool_sheet(path: str | os.PathLike[str], pool: Pool, *, columns: int = MOST_COLUMNS) -> tuple[int, ...]:
+    """Writes a contact sheet of training samples: guiding maps, lightmaps and motion of the later frames, as encoded.
 
-    Args:
-        folder: Made if its parent is there.
-        pictures: uint8 [H, W, 3].
-        stem: First part of the names.
-
-    Returns:
-        The files.
-
-    Raises:
-        WlmError: A file can't be written.
-    """
-    folder = Path(folder)
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
-    paths = []
-    for number, pixels in enumerate(pictures, 1):
-        paths.append(folder / f"{stem}_{number:04d}.png")
-        save_png(paths[-1], pixels)
-    return paths
-
-
-def contact_sheet(
-    path: str | os.PathLike[str],
-    rows: Mapping[str, Sequence[np.ndarray]],
-    titles: Sequence[str] = (),
-    *,
-    columns: int = MOST_COLUMNS,
-) -> tuple[int, ...]:
-    """Writes a PNG of pictures in labelled rows; of more than fit in a row, evenly spread ones are chosen.
+    Motion to the right is red, motion upwards green, the opposite directions dark; grey-yellow is no motion. The
+    fastest motion in the pool has the full colour.
 
     Args:
         path: The PNG to write; its folder must exist.
-        rows: uint8 [H, W, 3] pictures by label, all of one size, as many in each row.
-        titles: Of the columns, as many as there are pictures in a row, or none.
-        columns: Pictures in a row at most.
+        pool: At least one sample.
+        columns: Most samples shown, evenly spread.
 
     Returns:
-        The numbers, from 0, of the chosen pictures.
+        Indices of the samples shown.
 
     Raises:
-        ValueError: No picture, or they differ in size or number.
-        WlmError: The file can't be written.
+        ValueError: The pool is empty.
+        WlmError: The file cannot be written.
     """
-    counts = {len(row) for row in rows.values()}
-    shapes = {np.shape(cell) for row in rows.values() for cell in row}
-    if len(counts) != 1 or len(shapes) != 1 or columns < 1:
-        raise ValueError(f"expected rows of as many pictures of one size, got {sorted(counts)} of {sorted(shapes)}")
-    (count,), (height, width, _) = counts, next(iter(shapes))
-    if titles and len(titles) != count:
-        raise ValueError(f"titles: expected {count}, got {len(titles)}")
-    chosen = [int(i) for i in np.unique(np.linspace(0, count - 1, min(columns, count)).round())]
-    font = ImageFont.load_default(_FONT)
-    label = max(math.ceil(font.getlength(text)) for text in rows) + 2 * _MARGIN
-    head = 2 * _FONT if titles else _MARGIN
-    size = (label + len(chosen) * (width + _MARGIN), head + len(rows) * (height + _MARGIN))
-    sheet = Image.new("RGB", size, (_GREY,) * 3)
-    pen = ImageDraw.Draw(sheet)
-    for column, i in enumerate(chosen):
-        x = label + column * (width + _MARGIN)
-        if titles:
-            pen.text((x + width // 2, _FONT), titles[i], "white", font, anchor="mm")
-        for row, cells in enumerate(rows.values()):
-            sheet.paste(Image.fromarray(cells[i]), (x, head + row * (height + _MARGIN)))
-    for row, text in enumerate(rows):
-        pen.text((_MARGIN, head + row * (height + _MARGIN) + height // 2), text, "white", font, anchor="lm")
-    save_png(path, np.asarray(sheet))
+    if not len(pool):
+        raise ValueError("pool: expected at least one sample, got none")
+    chosen = spread(len(pool), columns)
+    planes = next(names for names in GUIDES.values() if len(names) == pool.guides.shape[2])
+    rows = {f"guide: {name}": [_grey(pool.guides[i, 1, k]) for i in chosen] for k, name in enumerate(planes)}
+    rows |= {name: [_grey(pool.targets[i, 1, k]) for i in chosen] for k, name in enumerate(PLANES)}
+    fastest = max(float(pool.motion.abs().max()), 1e-6)
+    rows["motion"] = [_motion_colour(pool.motion[i], fastest) for i in chosen]
+    titles = [f"{i} of {int(pool.sequence[i])}" for i in chosen]
+    contact_sheet(path, rows, titles, columns=len(chosen))
     return tuple(chosen)
+
+
+def _grey(plane: torch.Tensor) -> np.ndarray:
+    levels = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
+    return np.repeat(levels[..., None], 3, axis=2)
+
+
+def _motion_colour(motion: torch.Tensor, fastest: float) -> np.ndarray:
+    right, down = (motion.float() / fastest).cpu().numpy()
+    colour = 0.5 + 0.5 * np.stack([right, -down, np.zeros_like(right)], -1)
+    return (np.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -15,18 +15,17 @@ import warp as wp
 
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
-from wlm.smoke.coarse import march
-from wlm.smoke.guiding import guide
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.prediction import SmokePredictor
-from wlm.smoke.replay import VolumeGraph
+from wlm.smoke.march.coarse import bake_coarse, guide
+from wlm.smoke.march.launch import VolumeGraph
+from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lights import AnyLight
 from wlm.smoke.transport.orders import OrdersModel, ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
-from wlm.view.smoke import to_bytes
-from wlm.view.smoke_drawing import Drawing
+from wlm.view.pictures import to_bytes
+from wlm.view.smoke import Drawing
 from wlm_kernels.smoke.settings import March
 
 SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"
@@ -93,7 +92,9 @@ class SixWays(Lighting):
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay:
         if self.network is None:
             longest = max(volume.shape)
-            return march(volume, camera, March(longest / MARCH if self.step is None else self.step, seed=self.seed))
+            return bake_coarse(
+                volume, camera, March(longest / MARCH if self.step is None else self.step, seed=self.seed)
+            )
         six = self.network(volume, camera, self.seed)
         return replace(six, depth=guide(volume, camera, _SURFACE).depth)
 

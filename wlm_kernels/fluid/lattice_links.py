@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from wlm_kernels.fluid.lattice_fields import Bodies, velocity_at
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
     Tables,
@@ -34,7 +35,6 @@ from wlm_kernels.fluid.lattice_sets import (
     opposite,
     wrapped,
 )
-from wlm_kernels.fluid.lattice_solids import Bodies, velocity_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,31 +1,262 @@
-"""Light that smoke scatters on and on, on a grid of few cells: what cells stop of a light, and what is seen of it.
+"""Multiple scattering by diffusion on a coarse grid: light that cells stop, its fluence, and what a camera sees of it.
 
-How light goes from cell to cell between the two is in `fluence`. Lengths are in voxels; cell (0, 0, 0) begins at the
-grid's corner.
+In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the light
+that the cell stops directly from a light source, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half
+of the fluence leaves at the box's faces (Marshak's condition). Rounds of red-black successive over-relaxation solve it,
+each for the D of the fluence before it. Grids go from coarse to fine: the coarsest has a few cells, between which light
+spreads within the sweeps of a round; each finer grid starts from the interpolated result of the one before.
+
+Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
 
 import functools
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.fluence import between_cells
-from wlm_kernels.smoke.march import Medium, View, absorbed, clip, marched_ray, size_of
-from wlm_kernels.smoke.march_coarse import by_bricks
-from wlm_kernels.smoke.march_lights import Lattice, depths_at
+from wlm_kernels.smoke.depth_lattice import Lattice, depths_at
+from wlm_kernels.smoke.march import (
+    OPTIONS,
+    MarchParameters,
+    Medium,
+    View,
+    absorbed,
+    begin,
+    between_nodes,
+    look,
+    parameters,
+    pass_step,
+    sample,
+    size_of,
+    smoke_struct,
+    steps_along,
+)
+from wlm_kernels.smoke.settings import March
 
-_OPTIONS = {"enable_backward": False}
-wp.set_module_options(_OPTIONS)
-_WAYS = 4096  # from a point light
-_LEAST = 1e-5  # of a way's light, of which no more is followed
+wp.set_module_options(OPTIONS)
+_TINY = 1e-12
+_FEWEST = 4  # cells along the longest edge below which a grid is not coarsened
+_ROUNDS, _SWEEPS = 2, 6
+_BEYOND = 4  # cells added to the grid's size in the factor of over-relaxation
+_FIRST = 3  # rounds on the coarsest grid
+_RAYS = 4096  # rays from a point light
+_LEAST = 1e-5  # share of a ray's light below which it ends
 _TURN = wp.constant(2.399963229728653)  # the golden angle
-_PARTS = 4  # of a cell along each axis at most, at whose middles light that comes straight from far is known
+_PARTS = 4  # largest number of samples of a cell along an axis for direct light
+
+
+@wp.kernel
+def _reach(
+    # in:
+    extinction: wp.array3d[float],
+    light: wp.array4d[float],
+    cell: wp.vec3,
+    # out:
+    reach: wp.array4d[float],
+):
+    """D, by central differences; cells beyond the box have the value of the nearest cell."""
+    n, i, j, k = wp.tid()
+    nx = light.shape[1]
+    ny = light.shape[2]
+    nz = light.shape[3]
+    x = light[n, wp.min(i + 1, nx - 1), j, k] - light[n, wp.max(i - 1, 0), j, k]
+    y = light[n, i, wp.min(j + 1, ny - 1), k] - light[n, i, wp.max(j - 1, 0), k]
+    z = light[n, i, j, wp.min(k + 1, nz - 1)] - light[n, i, j, wp.max(k - 1, 0)]
+    steep = 0.5 * wp.length(wp.cw_div(wp.vec3(x, y, z), cell)) / wp.max(light[n, i, j, k], _TINY)
+    # The gradient is at most what the grid resolves, and light travels at most through the box.
+    steep = wp.min(steep, 2.0 / wp.min(cell))
+    farthest = (cell[0] + cell[1] + cell[2]) * float(wp.max(wp.max(nx, ny), nz))
+    reach[n, i, j, k] = 1.0 / wp.max(3.0 * extinction[i, j, k] + steep, 1.0 / farthest)
+
+
+@wp.func
+def _flow(one: float, other: float, size: float) -> float:
+    """Flow between two neighbours of given D, per volume and difference of fluence."""
+    return 2.0 * one * other / ((one + other) * size * size)
+
+
+@wp.func
+def _exchange(own: float, reach: wp.array4d[float], n: int, i: int, j: int, k: int, size: float) -> float:
+    """Flow to a neighbouring cell, or loss through a face of the box, per volume and unit of fluence."""
+    if i < 0 or i >= reach.shape[1] or j < 0 or j >= reach.shape[2] or k < 0 or k >= reach.shape[3]:
+        return 1.0 / (size * (2.0 + 0.5 * size / own))
+    return _flow(own, reach[n, i, j, k], size)
+
+
+@wp.kernel
+def _couple(
+    # in:
+    extinction: wp.array3d[float],
+    reach: wp.array4d[float],
+    cell: wp.vec3,
+    albedos: wp.vec3,
+    each: int,
+    # out:
+    flows: wp.array4d[wp.vec4],
+):
+    """Flows to the next cells along the axes, 0 at the box's faces, and the reciprocal of all that a cell loses."""
+    n, i, j, k = wp.tid()
+    own = reach[n, i, j, k]
+    x = _exchange(own, reach, n, i + 1, j, k, cell[0])
+    y = _exchange(own, reach, n, i, j + 1, k, cell[1])
+    z = _exchange(own, reach, n, i, j, k + 1, cell[2])
+    lost = (1.0 - albedos[n % each]) * extinction[i, j, k] + x + y + z
+    lost += _exchange(own, reach, n, i - 1, j, k, cell[0])
+    lost += _exchange(own, reach, n, i, j - 1, k, cell[1])
+    lost += _exchange(own, reach, n, i, j, k - 1, cell[2])
+    x = wp.where(i + 1 < reach.shape[1], x, 0.0)
+    y = wp.where(j + 1 < reach.shape[2], y, 0.0)
+    z = wp.where(k + 1 < reach.shape[3], z, 0.0)
+    flows[n, i, j, k] = wp.vec4(x, y, z, 1.0 / lost)
+
+
+@wp.kernel
+def _relax(
+    # in:
+    source: wp.array4d[float],
+    flows: wp.array4d[wp.vec4],
+    albedos: wp.vec3,
+    each: int,
+    over: float,
+    colour: int,
+    # out:
+    light: wp.array4d[float],
+):
+    """Relaxes the cells of one colour; the `each` albedos of a source follow one another in the light."""
+    n, i, j, half = wp.tid()
+    k = 2 * half + ((i + j + colour) & 1)
+    if k >= light.shape[3]:
+        return
+    own = flows[n, i, j, k]
+    got = albedos[n % each] * source[n / each, i, j, k]
+    # Flows beyond the box's faces are 0: the clamped index reads a value that does not count.
+    got += own[0] * light[n, wp.min(i + 1, light.shape[1] - 1), j, k]
+    got += own[1] * light[n, i, wp.min(j + 1, light.shape[2] - 1), k]
+    got += own[2] * light[n, i, j, wp.min(k + 1, light.shape[3] - 1)]
+    if i > 0:
+        got += flows[n, i - 1, j, k][0] * light[n, i - 1, j, k]
+    if j > 0:
+        got += flows[n, i, j - 1, k][1] * light[n, i, j - 1, k]
+    if k > 0:
+        got += flows[n, i, j, k - 1][2] * light[n, i, j, k - 1]
+    now = light[n, i, j, k]
+    light[n, i, j, k] = wp.max(now + over * (got * own[3] - now), 0.0)
+
+
+@wp.func
+def _overlap(cell: int, cells: int, fine: int, fines: int) -> float:
+    """Share of a cell that one of the finer cells covers, along an axis."""
+    each = float(fines) / float(cells)
+    low = wp.max(float(cell) * each, float(fine))
+    high = wp.min(float(cell + 1) * each, float(fine + 1))
+    return wp.max(high - low, 0.0) / each
+
+
+@wp.kernel
+def _coarsen(
+    # in:
+    fine: wp.array4d[float],
+    # out:
+    out: wp.array4d[float],
+):
+    """Means over larger cells."""
+    n, i, j, k = wp.tid()
+    nx = fine.shape[1]
+    ny = fine.shape[2]
+    nz = fine.shape[3]
+    total = float(0.0)
+    for x in range((i * nx) / out.shape[1], wp.min(((i + 1) * nx - 1) / out.shape[1] + 1, nx)):
+        a = _overlap(i, out.shape[1], x, nx)
+        for y in range((j * ny) / out.shape[2], wp.min(((j + 1) * ny - 1) / out.shape[2] + 1, ny)):
+            b = a * _overlap(j, out.shape[2], y, ny)
+            for z in range((k * nz) / out.shape[3], wp.min(((k + 1) * nz - 1) / out.shape[3] + 1, nz)):
+                total += b * _overlap(k, out.shape[3], z, nz) * fine[n, x, y, z]
+    out[n, i, j, k] = total
+
+
+@wp.func
+def _place(cell: int, cells: int, coarse: int) -> float:
+    """Position of a cell's centre in units of coarser cells, whose first centre is at 0."""
+    return (float(cell) + 0.5) * float(coarse) / float(cells) - 0.5
+
+
+@wp.kernel
+def _refine(
+    # in:
+    coarse: wp.array4d[float],
+    # out:
+    out: wp.array4d[float],
+):
+    """Trilinear between the centres of larger cells."""
+    n, i, j, k = wp.tid()
+    x = _place(i, out.shape[1], coarse.shape[1])
+    y = _place(j, out.shape[2], coarse.shape[2])
+    z = _place(k, out.shape[3], coarse.shape[3])
+    out[n, i, j, k] = between_nodes(coarse[n], wp.vec3(x, y, z))
+
+
+def spread(
+    medium: Medium, extinction: wp.array, source: wp.array, cell: wp.vec3, albedos: wp.vec3, each: int, light: wp.array
+) -> None:
+    """Solves for the fluence of light that was scattered at least once.
+
+    Args:
+        medium: The smoke, which allocates buffers.
+        extinction: float [X, Y, Z], per voxel.
+        source: float [L, X, Y, Z], q.
+        cell: Edges of a cell.
+        albedos, each: Each source is solved for the first `each` of the albedos.
+        light: float [L * each, X, Y, Z], written: f.
+    """
+    device = light.device
+    grids = [(extinction.reshape((1, *extinction.shape)), source, cell)]
+    while max(grids[-1][1].shape[1:]) > _FEWEST:
+        counts, edges = grids[-1][1].shape[1:], grids[-1][2]
+        fewer = tuple((n + 1) // 2 for n in counts)
+        made = [medium.buffer((count, *fewer), float) for count in (1, source.shape[0])]
+        for fine, coarse in zip(grids[-1], made, strict=False):
+            wp.launch(_coarsen, coarse.shape, [fine], [coarse], device=device)
+        grids.append((*made, wp.vec3(*(edge * n / m for edge, n, m in zip(edges, counts, fewer, strict=True)))))
+    before = None
+    for number, (thickness, stopped, edges) in reversed(list(enumerate(grids))):
+        found = medium.buffer((light.shape[0], *stopped.shape[1:]), float) if number else light
+        if before is None:
+            found.zero_()
+        else:
+            wp.launch(_refine, found.shape, [before], [found], device=device)
+        rounds = _FIRST if before is None else _ROUNDS
+        _relax_rounds(medium, thickness, stopped, edges, albedos, each, found, rounds)
+        before = found
+
+
+def _relax_rounds(
+    medium: Medium,
+    thickness: wp.array,
+    source: wp.array,
+    cell: wp.vec3,
+    albedos: wp.vec3,
+    each: int,
+    light: wp.array,
+    rounds: int,
+) -> None:
+    """Runs rounds on one grid, beginning with `light`."""
+    reach, flows = medium.buffer(light.shape, float), medium.buffer(light.shape, wp.vec4)
+    halves = (*light.shape[:3], (light.shape[3] + 1) // 2)
+    extinction = thickness.reshape(thickness.shape[1:])
+    over = 2.0 / (1.0 + math.sin(math.pi / (max(light.shape[1:]) + _BEYOND)))
+    for _ in range(rounds):
+        wp.launch(_reach, light.shape, [extinction, light, cell], [reach], device=light.device)
+        wp.launch(_couple, light.shape, [extinction, reach, cell, albedos, each], [flows], device=light.device)
+        for sweep in range(2 * _SWEEPS):
+            inputs = [source, flows, albedos, each, over, sweep & 1]
+            wp.launch(_relax, halves, inputs, [light], device=light.device)
 
 
 @wp.func
 def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
-    """Adds light to the eight cells around a place; beyond the outermost centres to these."""
+    """Adds light to the eight cells around a position; beyond the outermost centres to the outermost cells."""
     q = wp.cw_div(place, cell) - wp.vec3(0.5, 0.5, 0.5)
     i = int(wp.floor(q[0]))
     j = int(wp.floor(q[1]))
@@ -43,16 +274,22 @@ def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
         wp.atomic_add(out, a, b, c, share * light)
 
 
-@functools.cache
-def light_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Builds (once) the kernels `shoot`, `leave` and `gather` for densities of `wp.float32` or `wp.float16`."""
+@dataclass(frozen=True)
+class _Kernels:
+    shoot: wp.Kernel
+    stop: wp.Kernel
+    gather: wp.Kernel
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+
+@functools.cache
+def light_kernels(dtype: Any) -> _Kernels:
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
+    smoke_type = smoke_struct(dtype)
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def shoot(
         # in:
-        density: wp.array3d[dtype],
-        bricks: wp.array3d[wp.uint8],
-        extinction: float,
+        smoke: smoke_type,
         place: wp.vec3,
         radius: float,
         step: float,
@@ -61,59 +298,54 @@ def light_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         # out:
         out: wp.array3d[float],
     ):
-        """One way from a point light: all light that ends on it is left to cells, those that it ends in."""
+        """One ray from a point light: the light that is stopped on it is added to the cells around."""
         n = wp.tid()
-        height = 1.0 - (2.0 * float(n) + 1.0) / float(_WAYS)
+        height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
         across = wp.sqrt(1.0 - height * height)
-        way = wp.vec3(across * wp.cos(around), height, across * wp.sin(around))
-        span = clip(size_of(density), place, way)
-        first = wp.max(span[0], 0.0)
-        if span[1] <= first:
-            return
-        count = int(wp.ceil((span[1] - first) / step))
-        d = (span[1] - first) / float(count)
+        r = steps_along(
+            size_of(smoke.density), place, wp.vec3(across * wp.cos(around), height, across * wp.sin(around)), step
+        )
+        r.offset = 0.5
         left = float(power)
-        held = float(0.0)
+        pending = float(0.0)
         moment = wp.vec3()
         before = wp.vec3()
-        for m in range(count):
-            s = first + (float(m) + 0.5) * d
-            p = place + s * way
-            ended = left * absorbed(extinction * by_bricks(density, bricks, p) * d)
-            left -= ended
-            # Within its radius a light is as bright as there.
-            if s < radius:
-                ended *= s * s / (radius * radius)
-            # Light between the same eight centres is left to them at once.
-            q = wp.cw_div(p, cell) - wp.vec3(0.5, 0.5, 0.5)
+        while r.done < r.count:
+            r = look(r, smoke)
+            r.done += 1
+            stopped = left * absorbed(r.x)
+            left -= stopped
+            # Within the light's radius its irradiance is constant.
+            if r.distance < radius:
+                stopped *= r.distance * r.distance / (radius * radius)
+            # Light between the same eight centres is added to them at once.
+            q = wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5)
             now = wp.vec3(wp.floor(q[0]), wp.floor(q[1]), wp.floor(q[2]))
-            if held > 0.0 and wp.length_sq(now - before) > 0.5:
-                _splat(moment / held, cell, held, out)
-                held = float(0.0)
+            if pending > 0.0 and wp.length_sq(now - before) > 0.5:
+                _splat(moment / pending, cell, pending, out)
+                pending = float(0.0)
                 moment = wp.vec3()
             before = now
-            held += ended
-            moment += ended * p
+            pending += stopped
+            moment += stopped * r.place
             if left < _LEAST * power:
-                break
-        if held > 0.0:
-            _splat(moment / held, cell, held, out)
+                r.done = r.count
+        if pending > 0.0:
+            _splat(moment / pending, cell, pending, out)
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
-    def leave(
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def stop(
         # in:
-        density: wp.array3d[dtype],
-        bricks: wp.array3d[wp.uint8],
+        smoke: smoke_type,
         nodes: wp.array3d[wp.vec2],
-        extinction: float,
         lattice: Lattice,
         cell: wp.vec3,
         parts: wp.vec3i,
         # out:
         out: wp.array3d[float],
     ):
-        """What a cell stops of the light that comes straight from far off, per volume."""
+        """Light from a light at infinity that a cell stops, per volume."""
         i, j, k = wp.tid()
         total = float(0.0)
         for x in range(parts[0]):
@@ -123,122 +355,94 @@ def light_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
                     b = float(j) + (float(y) + 0.5) / float(parts[1])
                     c = float(k) + (float(z) + 0.5) / float(parts[2])
                     p = wp.cw_mul(cell, wp.vec3(a, b, c))
-                    sigma = extinction * by_bricks(density, bricks, p)
+                    sigma = smoke.extinction * sample(smoke, p)
                     if sigma > 0.0:
                         total += sigma * wp.exp(-depths_at(nodes, lattice, p)[0])
         out[i, j, k] = 4.0 * wp.pi * total / float(parts[0] * parts[1] * parts[2])
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def gather(
         # in:
-        density: wp.array3d[dtype],
-        bricks: wp.array3d[wp.uint8],
-        extinction: float,
+        smoke: smoke_type,
         view: View,
-        step: float,
-        cutoff: float,
+        march: MarchParameters,
         cell: wp.vec3,
         light: wp.array4d[float],
         # out:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        """What smoke of albedo 1 in that light sends to a pixel, and of that what smoke of thin cells sends."""
+        """Light that smoke of albedo 1 in a fluence sends to a pixel, and the part of it from thin cells."""
         n, row, column = wp.tid()
-        r = marched_ray(view, row, column, size_of(density), step)
+        r = begin(view, row, column, smoke, march.step, 0.5)
         total = float(0.0)
         from_thin = float(0.0)
-        seen = float(0.0)
-        tau = float(0.0)
-        for m in range(r.count):
-            p = r.origin + (r.first + (float(m) + 0.5) * r.length) * r.direction
-            x = extinction * by_bricks(density, bricks, p) * r.length
-            if x > 0.0:
-                here = between_cells(light, n, wp.cw_div(p, cell) - wp.vec3(0.5, 0.5, 0.5))
-                share = wp.exp(-tau) * absorbed(x)
-                clear = share * wp.exp(-x / r.length * wp.min(cell))
+        opacity = float(0.0)
+        while r.done < r.count:
+            r = look(r, smoke)
+            if r.x > 0.0:
+                here = between_nodes(light[n], wp.cw_div(r.place, cell) - wp.vec3(0.5, 0.5, 0.5))
+                share = r.t * absorbed(r.x)
+                clear = share * wp.exp(-r.sigma * wp.min(cell))
                 total += share * here
                 from_thin += clear * here
-                seen += clear
-                tau += x
-                if wp.exp(-tau) < cutoff:
-                    break
+                opacity += clear
+            r = pass_step(r, march.cutoff)
         out[0, n, row, column] = total / (4.0 * wp.pi)
         out[1, n, row, column] = from_thin / (4.0 * wp.pi)
         if n == 0:
-            thin[row, column] = seen
+            thin[row, column] = opacity
 
-    return shoot, leave, gather
+    return _Kernels(shoot, stop, gather)
 
 
 def shoot(
-    medium: Medium,
-    place: wp.vec3,
-    radius: float,
-    step: float,
-    cell: wp.vec3,
-    power: float,
-    out: wp.array,
-    bricks: wp.array,
+    medium: Medium, place: wp.vec3, radius: float, step: float, cell: wp.vec3, power: float, out: wp.array
 ) -> None:
-    """Adds to cells what they stop of the light that comes straight from a point.
+    """Adds to each cell the light that it stops directly from a point light.
 
     Args:
         medium: The smoke.
-        place: Of the light.
-        radius: At smaller distances the irradiance is as at this one.
-        step: The longest step on the way.
+        place: Position of the light.
+        radius: Distance within which the irradiance is constant.
+        step: Longest step along the light's rays.
         cell: Edges of a cell.
-        power: Of the light.
+        power: Power of the light.
         out: float [X, Y, Z], cells.
-        bricks: Of `occupied`.
     """
-    density = medium.density
-    inputs = [density, bricks, medium.extinction, place, radius, step, cell, power / _WAYS]
-    wp.launch(light_kernels(density.dtype)[0], _WAYS, inputs=inputs, outputs=[out], device=density.device)
+    inputs = [medium.smoke, place, radius, step, cell, power / _RAYS]
+    wp.launch(light_kernels(medium.density.dtype).shoot, _RAYS, inputs, [out], device=medium.device)
 
 
-def leave(
-    medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array, bricks: wp.array
-) -> None:
-    """What cells stop of the light that comes straight from infinitely far off, of an irradiance of 4 pi.
+def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array) -> None:
+    """Computes the light that each cell stops directly from a light at infinity of irradiance 4 pi.
 
     Args:
-        medium, bricks: As for `shoot`.
-        depths: Of `march_lights.reach`.
+        medium: The smoke.
+        depths: Result of `depth_lattice.reach`.
         cell: Edges of a cell.
-        step: Between places of a cell at which light is known; but there are no more than four of them along an axis.
+        step: Distance between the samples of a cell, of which there are at most four along an axis.
         out: float [X, Y, Z], written: per volume.
     """
-    density, (lattice, nodes) = medium.density, depths
+    lattice, nodes = depths
     parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))
-    inputs = [density, bricks, nodes, medium.extinction, lattice, cell, parts]
-    wp.launch(light_kernels(density.dtype)[1], out.shape, inputs=inputs, outputs=[out], device=density.device)
+    inputs = [medium.smoke, nodes, lattice, cell, parts]
+    wp.launch(light_kernels(medium.density.dtype).stop, out.shape, inputs, [out], device=medium.device)
 
 
 def gather(
-    medium: Medium,
-    view: View,
-    step: float,
-    cutoff: float,
-    cell: wp.vec3,
-    light: wp.array,
-    out: wp.array,
-    thin: wp.array,
-    bricks: wp.array,
+    medium: Medium, view: View, march: March, cell: wp.vec3, light: wp.array, out: wp.array, thin: wp.array
 ) -> None:
-    """What smoke of albedo 1 in a fluence sends to a camera.
+    """Computes the light that smoke of albedo 1 in a fluence sends to a camera.
 
     Args:
-        medium, view, bricks: As for `shoot` and the other marches.
-        step: The longest step along a ray.
-        cutoff: A ray ends where less than this is left of its transparency.
+        medium, view: As for the other marches.
+        march: Its step and cutoff.
         cell: Edges of a cell.
         light: float [N, X, Y, Z], fluences; at least one.
-        out: float [2, N, H, W], written: all of it, and what thin smoke sends, where each place counts by the
-            transparency of a cell of smoke as dense as there.
-        thin: float [H, W], written: likewise of opacity.
+        out: float [2, N, H, W], written: all light, and the light from thin smoke, where each sample is weighted by the
+            transparency of a cell of smoke of its density.
+        thin: float [H, W], written: the opacity of thin smoke, weighted alike.
     """
-    density, size = medium.density, out.shape[1:]
-    inputs = [density, bricks, medium.extinction, view, step, cutoff, cell, light]
-    wp.launch(light_kernels(density.dtype)[2], size, inputs=inputs, outputs=[out, thin], device=density.device)
+    inputs = [medium.smoke, view, parameters(march), cell, light]
+    wp.launch(light_kernels(medium.density.dtype).gather, out.shape[1:], inputs, [out, thin], device=medium.device)

@@ -1,21 +1,29 @@
-"""The common parts of all marches through smoke: medium, cameras, rays and their steps, samples, phase function.
+"""Common parts of all ray marches through smoke: medium, cameras, rays and their steps, sampling, phase function.
 
-All is in voxels: the grid `[X, Y, Z]` fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
-between centres the density is trilinear, with zero outside the grid; so there is smoke up to half a voxel beyond the
-box. Extinction is `extinction * density` per voxel. A step is taken as of one density, that at its sample, and is
-integrated exactly: 1 - exp(-sigma h), not sigma h. A density below zero or NaN isn't looked for; the caller keeps them
-out.
+Lengths are in voxels. The grid [X, Y, Z] fills the box from 0 to (X, Y, Z); the centre of voxel i is at i + 1/2.
+Density is trilinear between centres and 0 outside the grid, so that smoke extends half a voxel beyond the box.
+Extinction per voxel is `extinction * density`. A step has the density of its sample and is integrated exactly:
+1 - exp(-sigma h) instead of sigma h. The caller must pass densities that are finite and not negative.
 
-A light is a direction towards it, of irradiance 4 pi, so that an isotropic phase function is 1 and not 1 / (4 pi).
-`march_guide`, `march_coarse`, `march_six` and `march_motion` are the marches themselves; none has a gradient,
-but `single_scatter` has.
-Read first: `tests/reference/marching.py`, the same in float64 NumPy, with nothing shared.
+A light is given by the direction towards it and has irradiance 4 pi, so that an isotropic phase function is 1 instead
+of 1 / (4 pi).
+
+Every march of a camera ray is the same loop; a kernel adds only what it accumulates:
+
+    r = begin(view, row, column, smoke, step, offset)
+    while r.done < r.count:
+        r = look(r, smoke)                  # r.place, r.sigma, r.x; r.t is the transparency before the step
+        ...
+        r = pass_step(r, cutoff)
+
+None of these marches has a gradient; `single_scatter` has one. Read `tests/reference/marching.py` first: it is the same
+in float64 NumPy, without shared work between pixels.
 """
 
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import warp as wp
@@ -23,29 +31,45 @@ import warp as wp
 from wlm_kernels.smoke.settings import March
 
 Empty = Callable[[tuple[int, ...], Any], wp.array]
-"""Makes a buffer, not set, of a shape and a type."""
+"""Function that allocates an uninitialised buffer of a shape and a type."""
 
 BRICK = 8
-"""Voxels along an edge of a brick, the unit in which empty space is left out."""
+"""Voxels along an edge of a brick. Marches skip bricks without smoke."""
 
-NO_BRICKS = wp.constant(0)
-"""In place of bricks where there are too few samples for bricks to pay."""
+OPTIONS = {"enable_backward": False}
+"""Options of every module of smoke kernels."""
 
-_OPTIONS = {"enable_backward": False}
 _NEVER = 1.0e30
-_SEEDS = 2**32  # of which kernels tell apart
+_SEEDS = 2**32
+_PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power of 2
+
+
+@functools.cache
+def smoke_struct(dtype: Any) -> Any:
+    """Builds (once) the struct by which kernels take smoke of `wp.float32` or `wp.float16`."""
+
+    @wp.struct
+    class Smoke:
+        density: wp.array3d[dtype]
+        temperature: wp.array3d[dtype]
+        bricks: wp.array3d[wp.uint8]
+        extinction: float
+        emission: float
+
+    return Smoke
 
 
 @dataclass(frozen=True)
 class Medium:
-    """Smoke on a device, as the functions that launch marches take it.
+    """Smoke on a device.
 
     Attributes:
         density: float or half [X, Y, Z].
-        extinction: Per voxel, of density 1.
-        temperature: As the density, of its shape; None: nothing emits.
-        emission: Light given off per voxel of way where the temperature is 1.
-        empty: Makes buffers, `empty(shape, dtype)` on the density's device; None: in Warp's own memory.
+        extinction: Extinction per voxel at density 1.
+        temperature: Array of the density's shape and type; None: the smoke emits no light.
+        emission: Light emitted per voxel at temperature 1.
+        empty: Allocates buffers on the density's device; None: Warp's own allocator.
+        bricks: Occupancy of bricks, from `in_bricks`; None: marches sample every voxel.
     """
 
     density: wp.array
@@ -53,26 +77,42 @@ class Medium:
     temperature: wp.array | None = None
     emission: float = 0.0
     empty: Empty | None = None
-
-    def buffer(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Makes a buffer, not set."""
-        if self.empty is None:
-            return wp.empty(shape, dtype=dtype, device=self.density.device)
-        return self.empty(shape, dtype)
+    bricks: wp.array | None = None
 
     @property
-    def glow(self) -> tuple[wp.array, float]:
-        """Temperature and emission for a kernel: of cold smoke any array, and 0."""
-        return (self.density, 0.0) if self.temperature is None else (self.temperature, self.emission)
+    def device(self) -> wp.Device:
+        """Device of the density."""
+        return self.density.device
+
+    def buffer(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Allocates an uninitialised buffer."""
+        if self.empty is None:
+            return wp.empty(shape, dtype=dtype, device=self.device)
+        return self.empty(shape, dtype)
+
+    def in_bricks(self) -> "Medium":
+        """Returns the same smoke with the occupancy of its bricks. Skipping empty bricks changes no result."""
+        return replace(self, bricks=occupied(self))
+
+    @functools.cached_property
+    def smoke(self) -> Any:
+        """The smoke as kernels take it; cold smoke has its density in place of a temperature, and emission 0."""
+        smoke = smoke_struct(self.density.dtype)()
+        smoke.density, smoke.extinction = self.density, float(self.extinction)
+        smoke.temperature, smoke.emission = self.density, 0.0
+        if self.temperature is not None:
+            smoke.temperature, smoke.emission = self.temperature, float(self.emission)
+        smoke.bricks = self.buffer((0, 0, 0), wp.uint8) if self.bricks is None else self.bricks
+        return smoke
 
 
 @wp.struct
 class View:
-    """A camera, in voxels. Row 0 is the top row; a pixel is seen at its centre.
+    """A camera, in voxels. Row 0 is the top row; rays go through pixel centres.
 
-    `pitch` is a pixel's size: in voxels where the view is orthographic, at distance 1 where it is in perspective.
-    `origin` is the image's centre in the camera's plane, or the eye; nothing behind it is seen. `voxel` is a
-    voxel's edge in the unit of depths, which are measured from `moved` voxels behind the origin.
+    `pitch` is the edge of a pixel in voxels for an orthographic view, at distance 1 in perspective. `origin` is the
+    image's centre in the camera's plane, or the eye; smoke behind it is not visible. `voxel` is the edge of a voxel in
+    the unit of depths. Depths are measured from `moved` voxels behind the origin.
     """
 
     origin: wp.vec3
@@ -89,7 +129,7 @@ class View:
 
 @wp.struct
 class MarchParameters:
-    """`March` as kernels take it. Its `spacing` and `light_step` become a lattice before a kernel runs."""
+    """`March` as kernels take it. `spacing` and `light_step` are used on the host, to build lattices."""
 
     step: float
     jitter: float
@@ -101,13 +141,26 @@ class MarchParameters:
 
 @wp.struct
 class Ray:
-    """A pixel's ray, and equal steps along it, of which the first begins `first` from its origin."""
+    """A ray, its `count` equal steps of `length`, the first of which begins at distance `first`, and the current step.
+
+    Of the current step, number `done`: `offset` is the position of its sample as a share of the step, `distance` and
+    `place` are those of the sample, `sigma` its extinction, `x` the step's optical depth. `tau` and `t` are the optical
+    depth and the transparency of the ray before the step.
+    """
 
     origin: wp.vec3
     direction: wp.vec3
     first: float
     length: float
     count: int
+    offset: float
+    done: int
+    distance: float
+    place: wp.vec3
+    sigma: float
+    x: float
+    tau: float
+    t: float
 
 
 @wp.func
@@ -127,7 +180,7 @@ def ray(view: View, row: int, column: int) -> Ray:
 
 @wp.func
 def clip(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
-    """First and last distance along a ray where a density may be; first > last: it misses the smoke."""
+    """First and last distance along a ray at which there may be smoke; first > last if the ray misses the smoke."""
     first = float(-_NEVER)
     last = float(_NEVER)
     for axis in range(3):
@@ -149,7 +202,7 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
 
 @wp.func
 def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float) -> Ray:
-    """A ray with steps no longer than `step` through all of the smoke before the origin; none where it is missed."""
+    """A ray with equal steps no longer than `step` through all smoke in front of the origin; no steps if it misses."""
     r = Ray()
     r.origin = origin
     r.direction = direction
@@ -162,21 +215,14 @@ def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float)
 
 
 @wp.func
-def marched_ray(view: View, row: int, column: int, size: wp.vec3, step: float) -> Ray:
-    """A pixel's ray with its steps through the smoke."""
-    r = ray(view, row, column)
-    return steps_along(size, r.origin, r.direction, step)
-
-
-@wp.func
 def point_on(r: Ray, n: int, offset: float) -> wp.vec3:
-    """Where the n-th step's sample is; `offset` is 1/2 in the step's middle."""
+    """Position of the sample of step n; an offset of 1/2 is the step's middle."""
     return r.origin + (r.first + (float(n) + offset) * r.length) * r.direction
 
 
 @wp.func
 def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
-    """Trilinear, zero outside; `p` is no farther out than half a voxel and rounding."""
+    """Trilinear density, 0 outside the grid."""
     x = p[0] - 0.5
     y = p[1] - 0.5
     z = p[2] - 0.5
@@ -186,7 +232,7 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
     fx = x - float(i)
     fy = y - float(j)
     fz = z - float(k)
-    # Voxels outside have no weight, and an index that can be read.
+    # Voxels outside the grid have weight 0 and a clamped index.
     nx = density.shape[0]
     ny = density.shape[1]
     nz = density.shape[2]
@@ -210,20 +256,34 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
 
 
 @wp.func
-def sample(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
-    """`density_at`, which looks no further where the brick is empty: the same number."""
-    i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
-    j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
-    k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
-    if bricks[i, j, k] == wp.uint8(0):
-        return 0.0
-    return density_at(density, p)
+def sample(smoke: Any, p: wp.vec3) -> float:
+    """`density_at`, which returns early in an empty brick. `p` lies at most half a voxel outside the grid."""
+    if smoke.bricks.shape[0] > 0:
+        i = wp.clamp(int(p[0]) // BRICK, 0, smoke.bricks.shape[0] - 1)
+        j = wp.clamp(int(p[1]) // BRICK, 0, smoke.bricks.shape[1] - 1)
+        k = wp.clamp(int(p[2]) // BRICK, 0, smoke.bricks.shape[2] - 1)
+        if smoke.bricks[i, j, k] == wp.uint8(0):
+            return 0.0
+    return density_at(smoke.density, p)
 
 
 @wp.func
-def sample(density: wp.array3d[Any], no_bricks: int, p: wp.vec3) -> float:  # noqa: F811, Warp overloads by type
-    """`density_at`: of `NO_BRICKS`."""
-    return density_at(density, p)
+def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
+    """Trilinear between elements of an array, element (i, j, k) being at q = (i, j, k); constant beyond its ends."""
+    x = wp.clamp(q[0], 0.0, float(nodes.shape[0] - 1))
+    y = wp.clamp(q[1], 0.0, float(nodes.shape[1] - 1))
+    z = wp.clamp(q[2], 0.0, float(nodes.shape[2] - 1))
+    i = int(x)
+    j = int(y)
+    k = int(z)
+    i1 = wp.min(i + 1, nodes.shape[0] - 1)
+    j1 = wp.min(j + 1, nodes.shape[1] - 1)
+    k1 = wp.min(k + 1, nodes.shape[2] - 1)
+    fy = y - float(j)
+    fz = z - float(k)
+    near = wp.lerp(wp.lerp(nodes[i, j, k], nodes[i, j, k1], fz), wp.lerp(nodes[i, j1, k], nodes[i, j1, k1], fz), fy)
+    far = wp.lerp(wp.lerp(nodes[i1, j, k], nodes[i1, j, k1], fz), wp.lerp(nodes[i1, j1, k], nodes[i1, j1, k1], fz), fy)
+    return wp.lerp(near, far, x - float(i))
 
 
 @wp.func
@@ -235,27 +295,96 @@ def absorbed(x: float) -> float:
 
 
 @wp.func
+def mean_transparency(x: float) -> float:
+    """(1 - exp(-x)) / x, the mean transparency along a step of optical depth x; 1 where there is no smoke."""
+    return wp.where(x > 0.0, absorbed(x) / x, 1.0)
+
+
+@wp.func
 def phase(g: float, cosine: float) -> float:
-    """Henyey-Greenstein phase function times 4 pi; `cosine` is 1 where the light goes straight on."""
+    """Henyey-Greenstein phase function times 4 pi; `cosine` is 1 for light that is not deflected."""
     d = 1.0 + g * g - 2.0 * g * cosine
     return (1.0 - g * g) / (d * wp.sqrt(d))
 
 
 @wp.func
-def optical_depth(
-    density: wp.array3d[Any], bricks: Any, p: wp.vec3, toward: wp.vec3, extinction: float, step: float
-) -> float:
-    """From p out of the smoke, in equal steps no longer than `step`, each sampled at its middle (eq. 3)."""
-    r = steps_along(size_of(density), p, toward, step)
+def noise(row: int, column: int, seed: int) -> float:
+    """Interleaved gradient noise in [0, 1) (Jimenez 2014); its sum over a few pixels varies little."""
+    pattern = float(seed & (_PATTERNS - 1))
+    x = float(column) + 5.588238 * pattern
+    y = float(row) + 5.588238 * pattern
+    f = 0.06711056 * x + 0.00583715 * y
+    f = 52.9829189 * (f - wp.floor(f))
+    # A product that is rounded once for the floor and not for the difference may leave the range by an ulp.
+    return wp.clamp(f - wp.floor(f), 0.0, 0.99999994)
+
+
+@wp.func
+def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: float) -> Ray:
+    """The ray of a pixel before its first step through the smoke; an offset of 1/2 is the middle of each step."""
+    r = ray(view, row, column)
+    r = steps_along(size_of(smoke.density), r.origin, r.direction, step)
+    r.offset = offset
+    r.t = 1.0
+    return r
+
+
+@wp.func
+def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchParameters) -> Ray:
+    """`begin` with samples shifted by gradient noise."""
+    offset = 0.5 + march.jitter * (noise(row, column, march.seed) - 0.5)
+    return begin(view, row, column, smoke, march.step, offset)
+
+
+@wp.func
+def look(r: Ray, smoke: Any) -> Ray:
+    """Samples the current step."""
+    r.distance = r.first + (float(r.done) + r.offset) * r.length
+    r.place = r.origin + r.distance * r.direction
+    r.sigma = smoke.extinction * sample(smoke, r.place)
+    r.x = r.sigma * r.length
+    return r
+
+
+@wp.func
+def pass_step(r: Ray, cutoff: float) -> Ray:
+    """Goes to the next step, or to the end of the ray where less than the cutoff of its transparency is left."""
+    r.done += 1
+    if r.x > 0.0:
+        r.tau += r.x
+        r.t = wp.exp(-r.tau)
+        if r.t < cutoff:
+            r.done = r.count
+    return r
+
+
+@wp.func
+def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
+    """Distance to the first sample whose extinction exceeds the threshold; `depth` is the result so far, 0: none."""
+    if depth == 0.0 and r.sigma > threshold:
+        return (r.distance + view.moved) * view.voxel
+    return depth
+
+
+@wp.func
+def emitted(r: Ray, smoke: Any) -> float:
+    """Light that a step emits and that reaches the camera; fire without smoke emits too."""
+    return r.t * mean_transparency(r.x) * smoke.emission * r.length * density_at(smoke.temperature, r.place)
+
+
+@wp.func
+def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
+    """Optical depth from p out of the smoke, in equal steps no longer than `step`, sampled at their middles (eq. 3)."""
+    r = steps_along(size_of(smoke.density), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
-        tau += sample(density, bricks, point_on(r, n, 0.5))
-    return tau * r.length * extinction
+        tau += sample(smoke, point_on(r, n, 0.5))
+    return tau * r.length * smoke.extinction
 
 
 @wp.func
 def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int) -> wp.vec3:
-    """Where a lattice's node lies: the first and the last along an axis on the borders of the smoke."""
+    """Position of a node of a lattice whose first and last nodes along each axis lie on the border of the smoke."""
     return wp.vec3(
         float(i) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
         float(j) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
@@ -264,8 +393,8 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Nodes of a lattice no farther apart than a step, or a voxel, from half a voxel out of the grid to half beyond."""
-    # Each marches to its lights by itself: of closer ones the time would grow with the fourth power.
+    """Numbers of nodes of a lattice over the smoke, whose spacing is at most the larger of a step and a voxel."""
+    # Each node marches to its lights separately, so the work grows with the fourth power of the resolution.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
@@ -273,14 +402,14 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
 def occupied_kernel(dtype: Any) -> wp.Kernel:
     """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def rows(
         # in:
         density: wp.array3d[dtype],
         # out:
         out: wp.array3d[wp.uint8],
     ):
-        """Smoke in a row of voxels as long as a brick, and the voxel beyond either end."""
+        """Whether a row of voxels as long as a brick contains smoke, the voxel beyond either end included."""
         i, j, c = wp.tid()
         smoke = wp.uint8(0)
         for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
@@ -291,7 +420,7 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
     return rows
 
 
-@wp.kernel(module="unique", module_options=_OPTIONS)
+@wp.kernel(module="unique", module_options=OPTIONS)
 def _bricks_of_rows(
     # in:
     rows: wp.array3d[wp.uint8],
@@ -300,7 +429,7 @@ def _bricks_of_rows(
 ):
     a, b, c = wp.tid()
     smoke = wp.uint8(0)
-    # A point in a brick reads half a voxel beyond it too.
+    # A sample in a brick reads up to half a voxel beyond the brick.
     for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, rows.shape[0])):
         for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, rows.shape[1])):
             smoke = wp.max(smoke, rows[i, j, c])
@@ -308,14 +437,14 @@ def _bricks_of_rows(
 
 
 def occupied(medium: Medium) -> wp.array:
-    """Which bricks have smoke within reach of a sample in them.
+    """Finds the bricks in which a sample may read smoke.
 
     Returns:
-        uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is any.
+        uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is smoke within reach.
     """
     density = medium.density
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    # By rows first: neighbouring threads then read neighbouring voxels, each of them once.
+    # Rows first: neighbouring threads then read neighbouring voxels, and each voxel once.
     rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
     wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
     wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
@@ -342,11 +471,17 @@ def make_view(
     return view
 
 
+def require_orthographic(view: View, what: str) -> None:
+    """Raises ValueError if a camera is in perspective."""
+    if view.perspective:
+        raise ValueError(f"{what} need an orthographic camera")
+
+
 def parameters(march: March) -> MarchParameters:
-    """A march's settings for a kernel."""
+    """The settings of a march as kernels take them."""
     values = MarchParameters()
     values.step, values.jitter, values.threshold = float(march.step), float(march.jitter), float(march.threshold)
     values.g, values.cutoff = float(march.g), float(march.cutoff)
-    # Any whole number as one of 32 bits with a sign.
+    # Kernels take 32-bit signed integers.
     values.seed = (march.seed + _SEEDS // 2) % _SEEDS - _SEEDS // 2
     return values

@@ -1,15 +1,16 @@
 """A path tracer of volumes: light of every order of scattering in a density grid, without bias.
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2), both with a majorant per brick, through which an optical
-depth that is drawn once is spent. Where a density is needed, one of the eight voxels around the place is drawn by its
-weight: either tracking asks for no more than its mean, which is that of `density_at`. At each scattering every
-light is tried (next event estimation); the environment is reached by such a try and by the path's own escape, weighed
-by the balance heuristic. Emission is gathered along the free paths: each tentative collision counts for e / majorant.
+volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick, and spend an optical depth
+that is drawn once over the bricks of a ray. Where a density is needed, one of the eight voxels around the position is
+drawn by its weight: both kinds of tracking need only the mean, which is that of `density_at`. At each scattering every
+light is sampled (next event estimation). The environment is sampled too, and is also reached by paths that leave the
+smoke; the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
+for e / majorant.
 
-Units are those of `march`. Light of order n has been
-scattered n times. Random numbers are a pixel's own: the result depends on the seed alone.
-Read first: `scattered_twice` of `tests/reference/transport.py`, the second order by quadrature.
+Units are those of `march`. Light of order n has been scattered n times. Random numbers belong to a pixel, so that the
+result depends on the seed alone. Read `scattered_twice` of `tests/reference/transport.py` first: the second order by
+quadrature.
 """
 
 import functools
@@ -21,27 +22,26 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, Medium, View, density_at, phase, ray
-from wlm_kernels.smoke.path_walk import drawn, enter, onward
-from wlm_kernels.smoke.path_ways import Sky, chance_of, following, scatter, stir, texel, toward_sky, uniform
+from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray, smoke_struct
 
-_OPTIONS = {"enable_backward": False}
 _NEVER = wp.constant(1.0e30)
-_GLOW = 1.0 / BRICK  # least majorant where smoke glows: about one place a brick at which its light is gathered
-_SLACK = 1.0001  # of a majorant over rounding of interpolated densities
-_DEEP = 2.0  # optical depth through a brick, of the densest smoke, that bricks may have
-_THREADS = 2**20  # on a GPU, of which each traces several parts one after another
-_FAINT = wp.constant(0.1)  # what is below this is carried on by fewer paths
+_GLOW = 1.0 / BRICK  # least majorant of hot smoke: about one sample of its emission per brick
+_SLACK = 1.0001  # factor of a majorant that covers the rounding of interpolated densities
+_DEEP = 2.0  # largest optical depth through a brick of the densest smoke, up to which bricks are made larger
+_THREADS = 2**20  # threads on a GPU, each of which traces several parts in turn
+_FAINT = wp.constant(0.1)  # weight below which paths end by Russian roulette
+_TWO_PI = wp.constant(2.0 * math.pi)
 _FOUR_PI = wp.constant(4.0 * math.pi)
+_TENTH_BIT = wp.constant(1.0 / 1024.0)
 
 
 @wp.struct
 class PathLight:
     """A light, in voxels.
 
-    `place` is the direction to a light infinitely far off, of length 1, or a point light's position. `colour` is the
-    irradiance over 4 pi, of a point light that at a distance of one voxel. Within `radius` of a point light its
-    irradiance no longer grows.
+    `place` is the direction to a light at infinity, of length 1, or the position of a point light. `colour` is the
+    irradiance over 4 pi, for a point light at a distance of one voxel. Within `radius` of a point light its irradiance
+    is constant.
     """
 
     place: wp.vec3
@@ -52,7 +52,7 @@ class PathLight:
 
 @wp.struct
 class PathSettings:
-    """`albedo` by colour; paths end after `highest` scatterings; `kept` of them have planes of their own."""
+    """`albedo` R, G, B; paths end after `highest` scatterings; the first `kept` orders have planes of their own."""
 
     albedo: wp.vec3
     g: float
@@ -63,8 +63,33 @@ class PathSettings:
 
 
 @wp.struct
+class Sky:
+    """Light from infinity in all directions, a map of texels of constant radiance.
+
+    Row 0 is around +y; column 0 begins at +x and columns proceed towards +z. `rows` and `columns` are cumulative
+    probabilities of a row, and of a column within its row. `total` is the integral of the mean radiance over the
+    sphere; 0: there is no sky.
+    """
+
+    radiance: wp.array2d[wp.vec3]
+    rows: wp.array1d[float]
+    columns: wp.array2d[float]
+    total: float
+
+
+@wp.struct
+class _Grid:
+    """Majorants per brick of `edge` voxels; the bricks begin at `low` and reach `size` voxels from there."""
+
+    bounds: wp.array3d[float]
+    edge: float
+    low: wp.vec3
+    size: wp.vec3
+
+
+@wp.struct
 class _Flight:
-    """Where a free path ends, the light gathered on its way, and the random state after it."""
+    """Distance at which a free path ends, whether it hit smoke, emission gathered, and the next random state."""
 
     t: float
     hit: int
@@ -74,45 +99,248 @@ class _Flight:
 
 @wp.struct
 class _Passed:
-    """The share of light that passes, and the random state after it."""
+    """Share of light that passes, and the next random state."""
 
     share: float
     random: wp.uint64
 
 
+@wp.struct
+class _Way:
+    """A direction, its probability per solid angle, and the next random state."""
+
+    direction: wp.vec3
+    chance: float
+    random: wp.uint64
+
+
+@wp.struct
+class _Path:
+    """A path: position, direction, weight, order of scattering, and the next random state.
+
+    `chance` is the probability per solid angle with which the direction was sampled; 0 for the camera's direction, for
+    which no light was sampled.
+    """
+
+    p: wp.vec3
+    d: wp.vec3
+    through: wp.vec3
+    chance: float
+    order: int
+    alive: int
+    random: wp.uint64
+
+
 @wp.func
-def _fly(
-    density: wp.array3d[Any],
-    temperature: wp.array3d[Any],
-    bounds: wp.array3d[float],
-    edge: float,
-    low: wp.vec3,
-    size: wp.vec3,
-    extinction: float,
-    emission: float,
-    p: wp.vec3,
-    d: wp.vec3,
-    limit: float,
-    random: wp.uint64,
-) -> _Flight:
-    """A free path by delta tracking, up to a limit."""
+def stir(x: wp.uint64) -> wp.uint64:
+    x = x ^ (x >> wp.uint64(31))
+    x = x * wp.uint64(6364136223846793005)
+    x = x ^ (x >> wp.uint64(29))
+    x = x * wp.uint64(3935559000370003845)
+    return x ^ (x >> wp.uint64(32))
+
+
+@wp.func
+def following(random: wp.uint64) -> wp.uint64:
+    return random * wp.uint64(6364136223846793005) + wp.uint64(1442695040888963407)
+
+
+@wp.func
+def bits(random: wp.uint64) -> wp.uint32:
+    """32 random bits (PCG-XSH-RR, O'Neill 2014)."""
+    x = wp.uint32(((random >> wp.uint64(18)) ^ random) >> wp.uint64(27))
+    turn = wp.uint32(random >> wp.uint64(59))
+    return (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
+
+
+@wp.func
+def uniform(random: wp.uint64) -> float:
+    """A number of at least 0 and below 1, of 24 bits."""
+    return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
+
+
+@wp.func
+def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
+    """Samples the Henyey-Greenstein phase function for a path along d."""
+    cosine = 1.0 - 2.0 * u
+    if wp.abs(g) > 1.0e-3:
+        share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
+        cosine = (1.0 + g * g - share * share) / (2.0 * g)
+    cosine = wp.clamp(cosine, -1.0, 1.0)
+    sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
+    # Two directions across d, without division by a number near 0 (Duff et al. 2017).
+    sign = wp.where(d[2] >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + d[2])
+    b = d[0] * d[1] * a
+    across = wp.vec3(1.0 + sign * d[0] * d[0] * a, sign * b, -sign * d[0])
+    beside = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
+    angle = _TWO_PI * v
+    return wp.normalize(cosine * d + sine * (wp.cos(angle) * across + wp.sin(angle) * beside))
+
+
+@wp.func
+def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
+    """Radiance of the sky in a direction."""
+    rows = sky.radiance.shape[0]
+    columns = sky.radiance.shape[1]
+    row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
+    turn = wp.atan2(d[2], d[0])
+    if turn < 0.0:
+        turn += _TWO_PI
+    column = int(turn / _TWO_PI * float(columns))
+    return sky.radiance[wp.clamp(row, 0, rows - 1), wp.clamp(column, 0, columns - 1)]
+
+
+@wp.func
+def chance_of(sky: Sky, radiance: wp.vec3) -> float:
+    """Probability per solid angle of a direction in a texel of a radiance."""
+    return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
+
+
+@wp.func
+def toward_sky(sky: Sky, random: wp.uint64) -> _Way:
+    """Samples a direction by the brightness of the sky."""
+    way = _Way()
+    rows = sky.radiance.shape[0]
+    columns = sky.radiance.shape[1]
+    random = following(random)
+    u = uniform(random)
+    row = int(0)
+    past = rows - 1
+    while row < past:
+        middle = (row + past) // 2
+        if sky.rows[middle] > u:
+            past = middle
+        else:
+            row = middle + 1
+    random = following(random)
+    u = uniform(random)
+    column = int(0)
+    past = columns - 1
+    while column < past:
+        middle = (column + past) // 2
+        if sky.columns[row, middle] > u:
+            past = middle
+        else:
+            column = middle + 1
+    top = wp.cos(0.5 * _TWO_PI * float(row) / float(rows))
+    bottom = wp.cos(0.5 * _TWO_PI * float(row + 1) / float(rows))
+    random = following(random)
+    height = wp.lerp(top, bottom, uniform(random))
+    random = following(random)
+    turn = _TWO_PI * (float(column) + uniform(random)) / float(columns)
+    across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
+    way.direction = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
+    way.chance = chance_of(sky, sky.radiance[row, column])
+    way.random = random
+    return way
+
+
+_NEVER = wp.constant(1.0e30)
+_TENTH_BIT = wp.constant(1.0 / 1024.0)
+
+
+@wp.struct
+class _Walk:
+    """A ray's walk through bricks: in `cell` from distance `t` to `border`; the walk ends at `end`.
+
+    `leave` has the distances at which the ray leaves the brick along each axis, `across` those through one brick.
+    """
+
+    cell: wp.vec3i
+    leave: wp.vec3
+    across: wp.vec3
+    t: float
+    border: float
+    end: float
+    most: float
+
+
+@wp.func
+def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
+    """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
+    if d > 1.0e-9 and cell < count - 1:
+        return (float(cell + 1) * edge - p) / d
+    if d < -1.0e-9 and cell > 0:
+        return (float(cell) * edge - p) / d
+    return _NEVER
+
+
+@wp.func
+def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
+    """The brick in which a ray from p begins; the walk is empty if the ray misses the smoke up to its limit."""
+    w = _Walk()
+    q = p - grid.low
+    span = clip(grid.size, q, d)
+    w.t = wp.max(span[0], 0.0)
+    w.end = wp.min(span[1], limit)
+    for axis in range(3):
+        at = int(wp.floor((q[axis] + w.t * d[axis]) / grid.edge))
+        w.cell[axis] = wp.clamp(at, 0, grid.bounds.shape[axis] - 1)
+        w.leave[axis] = _border(w.cell[axis], grid.bounds.shape[axis], grid.edge, q[axis], d[axis])
+        w.across[axis] = grid.edge / wp.max(wp.abs(d[axis]), 1.0e-9)
+    w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+    w.most = grid.bounds[w.cell[0], w.cell[1], w.cell[2]]
+    return w
+
+
+@wp.func
+def _further(cell: int, count: int, leave: float, across: float) -> float:
+    """Distance at which a ray leaves the brick that it has just entered along an axis."""
+    return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
+
+
+@wp.func
+def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
+    """The walk in the next brick, or at its end."""
+    w.t = w.border
+    if w.t < w.end:
+        if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
+            w.cell[0] += wp.where(d[0] > 0.0, 1, -1)
+            w.leave[0] = _further(w.cell[0], bounds.shape[0], w.leave[0], w.across[0])
+        elif w.leave[1] <= w.leave[2]:
+            w.cell[1] += wp.where(d[1] > 0.0, 1, -1)
+            w.leave[1] = _further(w.cell[1], bounds.shape[1], w.leave[1], w.across[1])
+        else:
+            w.cell[2] += wp.where(d[2] > 0.0, 1, -1)
+            w.leave[2] = _further(w.cell[2], bounds.shape[2], w.leave[2], w.across[2])
+        w.border = wp.min(wp.min(w.leave[0], wp.min(w.leave[1], w.leave[2])), w.end)
+        w.most = bounds[w.cell[0], w.cell[1], w.cell[2]]
+    return w
+
+
+@wp.func
+def drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
+    """Density of one of the voxels around a position, drawn such that its mean is `density_at`."""
+    x = bits(random)
+    i = int(wp.floor(p[0] + (float(x & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    j = int(wp.floor(p[1] + (float((x >> wp.uint32(10)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    k = int(wp.floor(p[2] + (float((x >> wp.uint32(20)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
+    if i < 0 or j < 0 or k < 0 or i >= density.shape[0] or j >= density.shape[1] or k >= density.shape[2]:
+        return 0.0
+    return float(density[i, j, k])
+
+
+@wp.func
+def _fly(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: wp.uint64) -> _Flight:
+    """Samples a free path by delta tracking, up to a limit."""
     f = _Flight()
     glow = float(0.0)
     random = following(random)
-    left = -wp.log(1.0 - uniform(random))  # optical depth, of the majorants, to the next place that is looked at
-    w = enter(bounds, edge, size, p - low, d, limit)
+    left = -wp.log(1.0 - uniform(random))  # optical depth of the majorants up to the next tentative collision
+    w = _enter(grid, p, d, limit)
     while w.t < w.end:
         through = w.most * (w.border - w.t)
         if left >= through:
             left -= through
-            w = onward(w, bounds, d)
+            w = _onward(w, grid.bounds, d)
         else:
             w.t += left / w.most
             at = p + w.t * d
-            if emission > 0.0:
-                glow += emission * density_at(temperature, at) / w.most
+            if smoke.emission > 0.0:
+                glow += smoke.emission * density_at(smoke.temperature, at) / w.most
             random = following(random)
-            found = extinction * drawn(density, at, random)
+            found = smoke.extinction * drawn(smoke.density, at, random)
             random = following(random)
             if uniform(random) * w.most < found:
                 f.hit = 1
@@ -126,33 +354,22 @@ def _fly(
 
 
 @wp.func
-def _passed(
-    density: wp.array3d[Any],
-    bounds: wp.array3d[float],
-    edge: float,
-    low: wp.vec3,
-    size: wp.vec3,
-    extinction: float,
-    p: wp.vec3,
-    d: wp.vec3,
-    limit: float,
-    random: wp.uint64,
-) -> _Passed:
-    """The share of light that passes along a ray up to a limit, by ratio tracking."""
+def _passed(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: wp.uint64) -> _Passed:
+    """Estimates the share of light that passes along a ray up to a limit, by ratio tracking."""
     f = _Passed()
     share = float(1.0)
     random = following(random)
     left = -wp.log(1.0 - uniform(random))
-    w = enter(bounds, edge, size, p - low, d, limit)
+    w = _enter(grid, p, d, limit)
     while w.t < w.end:
         through = w.most * (w.border - w.t)
         if left >= through:
             left -= through
-            w = onward(w, bounds, d)
+            w = _onward(w, grid.bounds, d)
         else:
             w.t += left / w.most
             random = following(random)
-            share = share * (1.0 - extinction * drawn(density, p + w.t * d, random) / w.most)
+            share = share * (1.0 - smoke.extinction * drawn(smoke.density, p + w.t * d, random) / w.most)
             if share < _FAINT:
                 random = following(random)
                 if uniform(random) * _FAINT < share:
@@ -167,10 +384,15 @@ def _passed(
     return f
 
 
+@wp.func
+def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.vec3):
+    # A thread is the only one that writes its pixel of a part.
+    out[plane, row, column] = out[plane, row, column] + light
+
+
 @dataclass(frozen=True)
 class _Kernels:
-    """Of one type of density."""
-
+    scene_type: Any
     majorants: wp.Kernel
     window: wp.Kernel
     coarser: wp.Kernel
@@ -180,14 +402,24 @@ class _Kernels:
 @functools.cache
 def path_kernels(dtype: Any, solid: bool) -> _Kernels:
     """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`; `solid`: with obstacles."""
+    smoke_type = smoke_struct(dtype)
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.struct
+    class Scene:
+        """Everything that paths meet: smoke, lights, the sky, and the mesh of obstacles in voxels."""
+
+        smoke: smoke_type
+        grid: _Grid
+        view: View
+        lights: wp.array1d[PathLight]
+        sky: Sky
+        mesh: wp.uint64
+        settings: PathSettings
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def majorants(
         # in:
-        density: wp.array3d[dtype],
-        temperature: wp.array3d[dtype],
-        extinction: float,
-        emission: float,
+        smoke: smoke_type,
         least: float,
         slack: float,
         # out:
@@ -196,18 +428,18 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
         a, b, c = wp.tid()
         most = float(0.0)
         hot = float(0.0)
-        # A point in a brick reads half a voxel beyond it too.
-        for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, density.shape[0])):
-            for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, density.shape[1])):
-                for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
-                    most = wp.max(most, float(density[i, j, k]))
-                    hot = wp.max(hot, float(temperature[i, j, k]))
-        most = most * extinction * slack
-        if emission > 0.0 and hot > 0.0:
+        # A sample in a brick reads up to half a voxel beyond the brick.
+        for i in range(wp.max(a * BRICK - 1, 0), wp.min((a + 1) * BRICK + 1, smoke.density.shape[0])):
+            for j in range(wp.max(b * BRICK - 1, 0), wp.min((b + 1) * BRICK + 1, smoke.density.shape[1])):
+                for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, smoke.density.shape[2])):
+                    most = wp.max(most, float(smoke.density[i, j, k]))
+                    hot = wp.max(hot, float(smoke.temperature[i, j, k]))
+        most = most * smoke.extinction * slack
+        if smoke.emission > 0.0 and hot > 0.0:
             most = wp.max(most, least)
         out[a, b, c] = most
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def window(
         # in:
         bounds: wp.array3d[float],
@@ -218,7 +450,7 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
         a, b, c = wp.tid()
         out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def coarser(
         # in:
         bounds: wp.array3d[float],
@@ -235,28 +467,92 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
-        """Distance to the first obstacle along a ray, or never."""
+        """Distance to the first obstacle along a ray; `_NEVER` if there is none."""
         if wp.static(solid):
             found = wp.mesh_query_ray(mesh, p, d, _NEVER)
             return wp.where(found.result, found.t, _NEVER)
         return _NEVER
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.func
+    def extend(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> _Path:
+        """Follows a path to its next scattering, or out of the smoke to the sky, where it ends."""
+        planes = s.settings.kept + 2
+        count = s.lights.shape[0]
+        limit = float(0.0)
+        if path.order == 0:
+            # An orthographic ray starts at the border of the smoke; obstacles in front of that block it too.
+            limit = free(s.mesh, path.p - s.view.moved * path.d, path.d) - s.view.moved
+        else:
+            limit = free(s.mesh, path.p, path.d)
+        flight = _fly(s.smoke, s.grid, path.p, path.d, limit, path.random)
+        path.random = flight.random
+        plane = wp.min(path.order, planes - 1)
+        if flight.glow > 0.0:
+            _add(out, (base + count + 1) * planes + plane, row, column, flight.glow * path.through)
+        if flight.hit == 0:
+            if s.sky.total > 0.0 and limit >= 0.5 * _NEVER:
+                light = texel(s.sky, path.d)
+                share = float(1.0)
+                if path.chance > 0.0:
+                    share = path.chance / (path.chance + chance_of(s.sky, light))
+                _add(out, (base + count) * planes + plane, row, column, share * wp.cw_mul(path.through, light))
+            path.alive = 0
+            return path
+        path.p = path.p + flight.t * path.d
+        path.order += 1
+        path.through = wp.cw_mul(path.through, s.settings.albedo)
+        weight = 1.0 / float(s.settings.samples)
+        most = wp.max(path.through[0], wp.max(path.through[1], path.through[2])) / weight
+        if most < _FAINT:
+            path.random = following(path.random)
+            if uniform(path.random) * _FAINT < most:
+                path.through = path.through * (_FAINT / most)
+            else:
+                path.alive = 0
+        if path.order > s.settings.highest:
+            path.alive = 0
+        return path
+
+    @wp.func
+    def connect(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> wp.uint64:
+        """Adds the light of each light and of the sky that is scattered at the end of a path; returns the next random
+        state."""
+        planes = s.settings.kept + 2
+        count = s.lights.shape[0]
+        plane = wp.min(path.order, planes - 1)
+        random = path.random
+        for n in range(count):
+            way = s.lights[n].place
+            reach = float(_NEVER)
+            strength = float(1.0)
+            if s.lights[n].point != 0:
+                way = way - path.p
+                reach = wp.length(way)
+                away = wp.max(reach, s.lights[n].radius)
+                strength = 1.0 / wp.max(away * away, 1.0e-12)
+                way = wp.normalize(way)
+            if free(s.mesh, path.p, way) >= reach:
+                got = _passed(s.smoke, s.grid, path.p, way, reach, random)
+                random = got.random
+                strength = strength * got.share * phase(s.settings.g, wp.dot(path.d, way))
+                light = strength * wp.cw_mul(path.through, s.lights[n].colour)
+                _add(out, (base + n) * planes + plane, row, column, light)
+        if s.sky.total > 0.0:
+            far = toward_sky(s.sky, random)
+            random = far.random
+            if free(s.mesh, path.p, far.direction) >= _NEVER:
+                got = _passed(s.smoke, s.grid, path.p, far.direction, _NEVER, random)
+                random = got.random
+                own = phase(s.settings.g, wp.dot(path.d, far.direction)) / _FOUR_PI
+                strength = got.share * own / (own + far.chance)
+                light = strength * wp.cw_mul(path.through, texel(s.sky, far.direction))
+                _add(out, (base + count) * planes + plane, row, column, light)
+        return random
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def trace(
         # in:
-        density: wp.array3d[dtype],
-        temperature: wp.array3d[dtype],
-        bounds: wp.array3d[float],
-        edge: float,
-        low: wp.vec3,
-        size: wp.vec3,
-        extinction: float,
-        emission: float,
-        view: View,
-        lights: wp.array1d[PathLight],
-        sky: Sky,
-        mesh: wp.uint64,
-        settings: PathSettings,
+        s: Scene,
         first: int,
         last: int,
         parts: int,
@@ -265,123 +561,52 @@ def path_kernels(dtype: Any, solid: bool) -> _Kernels:
         out: wp.array3d[wp.vec3],
     ):
         group, row, column = wp.tid()
-        count = lights.shape[0]
-        planes = settings.kept + 2
-        sources = count + 2
-        weight = 1.0 / float(settings.samples)
-        pixel = wp.uint64(row) * wp.uint64(view.width) + wp.uint64(column)
-        start = ray(view, row, column)
+        pixel = wp.uint64(row) * wp.uint64(s.view.width) + wp.uint64(column)
+        start = ray(s.view, row, column)
         part = first + group * together - 1
         past = wp.min(first + (group + 1) * together, last)
         samples = int(0)
-        random = wp.uint64(0)
-        p = wp.vec3()
-        d = wp.vec3()
-        chance = float(0.0)  # of the direction per solid angle; 0: the camera's, which no light was tried for
-        through = wp.vec3()
-        order = int(0)
-        alive = int(0)
-        # One loop for all paths: a thread whose path has ended begins its next while its neighbours go on.
+        path = _Path()
+        # One loop for all paths: a thread whose path has ended begins its next path while its neighbours continue.
         while part < past:
-            if alive == 0:
+            if path.alive == 0:
                 if samples == 0:
                     part += 1
                     # Some parts have one sample more than others.
-                    samples = settings.samples // parts + wp.where(part < settings.samples % parts, 1, 0)
-                    random = stir(settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(part)))
+                    samples = s.settings.samples // parts + wp.where(part < s.settings.samples % parts, 1, 0)
+                    path.random = stir(s.settings.key + stir(pixel * wp.uint64(1048576) + wp.uint64(part)))
                 samples -= 1
-                p = start.origin
-                d = start.direction
-                chance = 0.0
-                through = wp.vec3(weight)
-                order = 0
-                alive = 1
+                path.p = start.origin
+                path.d = start.direction
+                path.chance = 0.0
+                path.through = wp.vec3(1.0 / float(s.settings.samples))
+                path.order = 0
+                path.alive = 1
             if part < past:
-                base = (part - first) * sources
-                limit = float(0.0)
-                if order == 0:
-                    # An orthographic ray starts where the smoke does; what lies before that blocks as well.
-                    limit = free(mesh, p - view.moved * d, d) - view.moved
-                else:
-                    limit = free(mesh, p, d)
-                flight = _fly(density, temperature, bounds, edge, low, size, extinction, emission, p, d, limit, random)
-                random = flight.random
-                plane = wp.min(order, planes - 1)
-                if flight.glow > 0.0:
-                    at = (base + count + 1) * planes + plane
-                    out[at, row, column] = out[at, row, column] + flight.glow * through
-                if flight.hit == 0:
-                    if sky.total > 0.0 and limit >= 0.5 * _NEVER:
-                        light = texel(sky, d)
-                        share = float(1.0)
-                        if chance > 0.0:
-                            share = chance / (chance + chance_of(sky, light))
-                        at = (base + count) * planes + plane
-                        out[at, row, column] = out[at, row, column] + share * wp.cw_mul(through, light)
-                    alive = 0
-                else:
-                    p = p + flight.t * d
-                    order += 1
-                    through = wp.cw_mul(through, settings.albedo)
-                    most = wp.max(through[0], wp.max(through[1], through[2])) / weight
-                    if most < _FAINT:
-                        random = following(random)
-                        if uniform(random) * _FAINT < most:
-                            through = through * (_FAINT / most)
-                        else:
-                            alive = 0
-                    if order > settings.highest:
-                        alive = 0
-                if alive == 1:
-                    plane = wp.min(order, planes - 1)
-                    for n in range(count):
-                        way = lights[n].place
-                        reach = float(_NEVER)
-                        strength = float(1.0)
-                        if lights[n].point != 0:
-                            way = way - p
-                            reach = wp.length(way)
-                            away = wp.max(reach, lights[n].radius)
-                            strength = 1.0 / wp.max(away * away, 1.0e-12)
-                            way = wp.normalize(way)
-                        if free(mesh, p, way) >= reach:
-                            got = _passed(density, bounds, edge, low, size, extinction, p, way, reach, random)
-                            random = got.random
-                            strength = strength * got.share * phase(settings.g, wp.dot(d, way))
-                            at = (base + n) * planes + plane
-                            light = strength * wp.cw_mul(through, lights[n].colour)
-                            out[at, row, column] = out[at, row, column] + light
-                    if sky.total > 0.0:
-                        far = toward_sky(sky, random)
-                        random = far.random
-                        if free(mesh, p, far.direction) >= _NEVER:
-                            toward = far.direction
-                            got = _passed(density, bounds, edge, low, size, extinction, p, toward, _NEVER, random)
-                            random = got.random
-                            own = phase(settings.g, wp.dot(d, far.direction)) / _FOUR_PI
-                            strength = got.share * own / (own + far.chance)
-                            at = (base + count) * planes + plane
-                            light = strength * wp.cw_mul(through, texel(sky, far.direction))
-                            out[at, row, column] = out[at, row, column] + light
-                    # After its last order a path goes on to the sky and to what glows alone.
-                    if order == settings.highest and sky.total == 0.0 and emission == 0.0:
-                        alive = 0
+                base = (part - first) * (s.lights.shape[0] + 2)
+                path = extend(s, path, base, row, column, out)
+                if path.alive == 1:
+                    random = connect(s, path, base, row, column, out)
+                    # After its last order a path continues only to the sky and to emission.
+                    if path.order == s.settings.highest and s.sky.total == 0.0 and s.smoke.emission == 0.0:
+                        path.alive = 0
                     random = following(random)
                     u = uniform(random)
                     random = following(random)
-                    before = d
-                    d = scatter(settings.g, d, u, uniform(random))
-                    chance = phase(settings.g, wp.dot(before, d)) / _FOUR_PI
+                    before = path.d
+                    path.d = scatter(s.settings.g, before, u, uniform(random))
+                    path.chance = phase(s.settings.g, wp.dot(before, path.d)) / _FOUR_PI
+                    path.random = random
 
-    return _Kernels(majorants, window, coarser, trace)
+    return _Kernels(Scene, majorants, window, coarser, trace)
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
     """Makes lights for `trace`.
 
     Args:
-        lights: Of each a direction of length 1 or a position, the colour, and the radius of a point light, or None: it
-            is infinitely far off. All in voxels, as `PathLight` has them.
+        lights: For each light its direction of length 1 or its position, its colour, and the radius of a point light
+            or None for a light at infinity; in voxels, as in `PathLight`.
     """
     made = []
     for place, colour, radius in lights:
@@ -394,10 +619,10 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
 
 @dataclass(frozen=True)
 class Majorants:
-    """The greatest extinction per voxel that a sample in each brick can find, of the part of the grid with smoke.
+    """Largest extinction per voxel that a sample in each brick can find, for the part of the grid with smoke.
 
-    `most` is float [X, Y, Z] of bricks of an edge of so many voxels, the first of which begins at `low`; they reach up
-    to `size` voxels from there. Beyond them there is nothing.
+    `most` is float [X, Y, Z], a number per brick of `edge` voxels. The first brick begins at `low`; the bricks extend
+    `size` voxels from there. There is no smoke outside them.
     """
 
     most: wp.array
@@ -407,33 +632,31 @@ class Majorants:
 
 
 def bounds(medium: Medium, densest: float) -> Majorants:
-    """Finds majorants, of bricks through which the optical depth is about one where smoke is densest.
+    """Computes majorants, for bricks through which the optical depth of the densest smoke is about one.
 
     Args:
         medium: The smoke.
-        densest: Its greatest extinction per voxel.
+        densest: Its largest extinction per voxel.
     """
-    density, (temperature, emission) = medium.density, medium.glow
+    density, device, edge = medium.density, medium.device, BRICK
     kernels = path_kernels(density.dtype, False)
-    edge, device = BRICK, density.device
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
-    inputs = [density, temperature, medium.extinction, emission, _GLOW, _SLACK]
-    wp.launch(kernels.majorants, most.shape, inputs=inputs, outputs=[most], device=device)
+    wp.launch(kernels.majorants, most.shape, [medium.smoke, _GLOW, _SLACK], [most], device=device)
     begin, end = _filled(most.numpy() > 0.0)
     low = tuple(edge * n for n in begin)
     size = tuple(min(edge * n, most) - least for n, most, least in zip(end, density.shape, low, strict=True))
     inner = medium.buffer(tuple(b - a for a, b in zip(begin, end, strict=True)), float)
-    wp.launch(kernels.window, inner.shape, inputs=[most, wp.vec3i(*begin)], outputs=[inner], device=device)
+    wp.launch(kernels.window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
     while 2 * edge * densest <= _DEEP and max(inner.shape) > 1:
         edge *= 2
         wider = medium.buffer(tuple(-(-n // 2) for n in inner.shape), float)
-        wp.launch(kernels.coarser, wider.shape, inputs=[inner], outputs=[wider], device=device)
+        wp.launch(kernels.coarser, wider.shape, [inner], [wider], device=device)
         inner = wider
     return Majorants(inner, edge, low, size)
 
 
 def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
-    """The least box around what is there, first and past the last along each axis; one cell where there is nothing."""
+    """Smallest box of true cells: the first, and past the last, along each axis; one cell if none is true."""
     begin, end = [], []
     for axis in range(3):
         found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))
@@ -454,29 +677,32 @@ def trace(
     parts: int,
     out: wp.array,
 ) -> None:
-    """Traces some of the parts that the samples are divided into.
+    """Traces some of the parts into which the samples are divided.
 
     Args:
         medium: The smoke.
         view: The camera, [H, W] pixels; paths go through pixel centres.
         majorants: From `bounds`.
         lights: `PathLight` [L]; L may be 0.
-        sky: Of total 0: none.
-        mesh: Of obstacles, in voxels, which absorb all light; 0: none.
-        settings: The paths.
-        first: The first part to trace.
-        parts: Parts in all.
-        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], added to: of P parts each light, the sky and the emission;
-            of each of these the light of order 0, 1 and so on, and last that of all orders above `settings.kept`. The
-            parts add up to the mean over all samples.
+        sky: The environment; total 0: none.
+        mesh: Mesh of obstacles in voxels, which absorb all light; 0: none.
+        settings: Settings of the paths.
+        first: First part to trace.
+        parts: Number of parts in total.
+        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], added to: for each of P parts each light, the sky and the
+            emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above
+            `settings.kept`. The sum over all parts is the mean over all samples.
     """
-    density, (temperature, emission) = medium.density, medium.glow
+    kernels = path_kernels(medium.density.dtype, mesh != 0)
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
-    # Fewer threads than keep a GPU busy wouldn't be faster for more paths each.
-    together = max(1, traced * view.height * view.width // _THREADS) if density.device.is_cuda else 1
+    # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
+    together = max(1, traced * view.height * view.width // _THREADS) if medium.device.is_cuda else 1
+    scene = kernels.scene_type()
+    scene.smoke, scene.view, scene.lights, scene.sky = medium.smoke, view, lights, sky
+    scene.mesh, scene.settings = mesh, settings
+    grid = _Grid()
+    grid.bounds, grid.edge = majorants.most, float(majorants.edge)
+    grid.low, grid.size = (wp.vec3(*map(float, v)) for v in (majorants.low, majorants.size))
+    scene.grid = grid
     size = (-(-traced // together), view.height, view.width)
-    inputs = [density, temperature, majorants.most, float(majorants.edge), wp.vec3(*map(float, majorants.low))]
-    inputs += [wp.vec3(*map(float, majorants.size)), medium.extinction, emission, view, lights]
-    inputs += [sky, mesh, settings, first, first + traced, parts, together]
-    kernel = path_kernels(density.dtype, mesh != 0).trace
-    wp.launch(kernel, size, inputs=inputs, outputs=[out], device=density.device)
+    wp.launch(kernels.trace, size, [scene, first, first + traced, parts, together], [out], device=medium.device)

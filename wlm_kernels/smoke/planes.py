@@ -4,7 +4,7 @@ Each is one pass over the image in place of some tens of small ones. `encode_six
 the guide, `decode` the network's planes into light. `kernels` builds and caches, for a number type, the kernels
 that add the outputs of the network's heads and a filter of the guide, where smoke is near; sums are float32 whatever
 the type is. Nothing has a gradient: training is torch's.
-Read first: `encode_guide`, `encode_lightmaps` and `decode_lightmaps` of `wlm/smoke/planes.py` for the
+Read first: `encode_guide`, `encode_lightmaps` and `decode_lightmaps` of `wlm/smoke/network/planes.py` for the
 encodings, and `_wanted` of `tests/kernels/test_six_planes.py`, which is `compose` in a few lines of torch.
 """
 

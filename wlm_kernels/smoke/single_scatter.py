@@ -19,7 +19,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import absorbed, node_position, point_on, size_of, steps_along
+from wlm_kernels.smoke.march import absorbed, mean_transparency, node_position, point_on, size_of, steps_along
 
 wp.set_module_options({"enable_backward": False})
 
@@ -114,14 +114,8 @@ def _add(grad: wp.array3d[Any], cell: _Cell, g: Any):
 
 
 @wp.func
-def _share(x: float) -> float:
-    """(1 - exp(-x)) / x."""
-    return wp.where(x > 0.0, absorbed(x) / x, 1.0)
-
-
-@wp.func
 def _share_slope(x: float) -> float:
-    """The derivative of `_share`, without cancellation where x is small."""
+    """The derivative of `mean_transparency`, without cancellation where x is small."""
     if x < 0.05:
         return -0.5 + x * (1.0 / 3.0 - x * (0.125 - x * (1.0 / 30.0 - x / 144.0)))
     return (wp.exp(-x) - absorbed(x) / x) / x
@@ -194,7 +188,7 @@ def _march(
         x = _read(density, voxel) * r.length
         t = wp.exp(-tau)
         if emission.shape[0] > 0:
-            glow += t * _share(x) * r.length * _read(emission, voxel)
+            glow += t * mean_transparency(x) * r.length * _read(emission, voxel)
         if nodes.shape[0] > 0 and x > 0.0:
             node = _node(nodes[0], size, p)
             for light in range(nodes.shape[0]):
@@ -249,10 +243,10 @@ def _march_backward(
         if emission.shape[0] > 0:
             glow = r.length * wp.dot(_read(emission, voxel), grad_emitted[i])
             if grad_emission.shape[0] > 0:
-                _add(grad_emission, voxel, t * _share(x) * r.length * grad_emitted[i])
+                _add(grad_emission, voxel, t * mean_transparency(x) * r.length * grad_emitted[i])
         on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
         _add(grad_density, voxel, on_x * r.length)
-        hidden += t * (absorbed(x) * lit + _share(x) * glow)
+        hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
 
 
 def depths(density, toward, step: float, nodes) -> None:

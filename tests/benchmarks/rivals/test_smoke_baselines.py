@@ -8,13 +8,13 @@ from builders.smoke_samples import small_pool
 
 from benchmarks.rivals.smoke import billboard, coarse, flip_book
 from wlm.fluid.volume import DensityVolume, save_volume
-from wlm.smoke.baking import bake
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import HeldOut, score
-from wlm.smoke.learn.dataset import fixed_cameras, pool_of_volume
-from wlm.smoke.learn.settings import DatasetSettings
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.planes import GUIDES, PLANES, encode_lightmaps
+from wlm.smoke.march.fine import bake
+from wlm.smoke.network.dataset import fixed_cameras, pool_of_volume
+from wlm.smoke.network.planes import GUIDES, PLANES, encode_lightmaps
+from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import CameraSettings, make_camera
 
 

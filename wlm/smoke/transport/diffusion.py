@@ -14,10 +14,10 @@ import warp as wp
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import to_warp
-from wlm.smoke.marching import medium_of
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.transport.lighting import Depths, Marching
 from wlm.smoke.transport.lights import AnyLight, PointLight, in_voxels
-from wlm_kernels.smoke import diffusion, fluence
+from wlm_kernels.smoke import diffusion
 
 CELLS = 32
 """Of a grid of diffusion, along the longest edge."""
@@ -147,7 +147,7 @@ class CoarseSmoke:
             return light
         extinction, source, out = (to_warp(part) for part in (self.extinction, source.contiguous(), light))
         three = wp.vec3(*albedos, *[0.0] * (3 - len(albedos)))
-        fluence.spread(self.medium, extinction, source, wp.vec3(*self.edges), three, len(albedos), out)
+        diffusion.spread(self.medium, extinction, source, wp.vec3(*self.edges), three, len(albedos), out)
         return light
 
     def seen(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -164,9 +164,8 @@ class CoarseSmoke:
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
         if len(light):
-            march, arrays = scene.march, (to_warp(part) for part in (light, out, thin))
-            settings = (march.step, march.cutoff, wp.vec3(*self.edges))
-            diffusion.gather(scene.medium, scene.view, *settings, *arrays, bricks=scene.bricks)
+            arrays = (to_warp(part) for part in (light, out, thin))
+            diffusion.gather(scene.medium, scene.view, scene.march, wp.vec3(*self.edges), *arrays)
         return out, thin
 
     def lit(self, scene: Marching, depths: Depths, out: torch.Tensor) -> None:
@@ -178,7 +177,7 @@ class CoarseSmoke:
             out: float32 tensor [X, Y, Z], written.
         """
         cell = wp.vec3(*self.edges)
-        diffusion.leave(scene.medium, depths, cell, scene.march.step, to_warp(out), bricks=scene.bricks)
+        diffusion.stop(scene.medium, depths, cell, scene.march.step, to_warp(out))
 
     def around(self, scene: Marching, place: Sequence[float], radius: float, out: torch.Tensor) -> None:
         """Adds what cells stop of the light that comes straight from a point light.
@@ -191,7 +190,7 @@ class CoarseSmoke:
         step = max(0.5, min(self.edges) / 8)
         power = 16.0 * math.pi**2 / math.prod(self.edges)
         cell = wp.vec3(*self.edges)
-        diffusion.shoot(scene.medium, wp.vec3(*place), radius, step, cell, power, to_warp(out), bricks=scene.bricks)
+        diffusion.shoot(scene.medium, wp.vec3(*place), radius, step, cell, power, to_warp(out))
 
 
 def _shares(voxels: int, cells: int, device: torch.device) -> torch.Tensor:

@@ -17,11 +17,11 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera
-from wlm.smoke.marching import medium_of
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
-from wlm_kernels.smoke import march_lights
-from wlm_kernels.smoke.march import Medium, View, occupied
+from wlm_kernels.smoke import depth_lattice, march_lights
+from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March
 
 _CLOSE, _FINEST = 0.1, 0.25  # optical depth between nodes, and voxels
@@ -157,7 +157,7 @@ def light_smoke(
         return light_in(scene, volume, camera, lights)
 
 
-Depths = tuple[march_lights.Lattice, wp.array]
+Depths = tuple[depth_lattice.Lattice, wp.array]
 """Optical depths to a light and to the opposite one, at the nodes of a lattice."""
 
 
@@ -169,22 +169,20 @@ class Marching:
     view: View
     march: March
     shadow: float
-    bricks: wp.array
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
-        """Optical depths to a light: see `march_lights.reach`."""
-        return march_lights.reach(self.medium, place, radius, self.march, bricks=self.bricks)
+        """Optical depths to a light, see `depth_lattice.reach`."""
+        return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
-        """Light scattered once: see `march_lights.light`; `out` is float32 [2, H, W], of a point light [1, H, W]."""
-        arguments = (depths, self.march, self.shadow, to_warp(out))
-        march_lights.light(self.medium, self.view, *arguments, bricks=self.bricks)
+        """Light scattered once, see `march_lights.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
+        march_lights.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
-    def seen(self) -> torch.Tensor:
+    def unlit(self) -> torch.Tensor:
         """Transparency, emission and depth, [3, H, W]."""
         size = (len(march_lights.PLANES), self.view.height, self.view.width)
         out = torch.empty(size, device=wp.device_to_torch(self.medium.density.device))
-        march_lights.seen(self.medium, self.view, self.march, to_warp(out), bricks=self.bricks)
+        march_lights.unlit(self.medium, self.view, self.march, to_warp(out))
         return out
 
 
@@ -192,8 +190,7 @@ class Marching:
 def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0) -> Iterator[Marching]:
     """Opens a march, on the smoke's device; arguments as for `light_smoke`."""
     with stream(device_name(volume.device)):
-        medium = medium_of(volume)
-        yield Marching(medium, camera.view(volume), march, shadow, occupied(medium))
+        yield Marching(medium_of(volume).in_bricks(), camera.view(volume), march, shadow)
 
 
 def light_in(
@@ -219,6 +216,6 @@ def light_in(
             planes[0, n] /= volume.voxel**2
         if visit is not None:
             visit(n, depths)
-    transparency, emission, depth = scene.seen()
+    transparency, emission, depth = scene.unlit()
     hot = emission if volume.temperature is not None else None
     return LitSmoke(tuple(lights), *planes, transparency, hot, depth, camera, scene.march)

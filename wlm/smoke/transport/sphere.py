@@ -13,10 +13,9 @@ from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.features import orders_march
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import half_sphere
-from wlm.smoke.transport.orders import scatter
+from wlm.smoke.transport.orders import orders_march, scatter
 from wlm_kernels.smoke.settings import March
 
 _ROUNDS = 100  # of the descent to maps that aren't negative: one is then within 1e-4 of the least squares

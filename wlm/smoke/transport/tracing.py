@@ -13,12 +13,13 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, free_memory, stream, to_warp, torch_memory
+from wlm.interop import device_name, free_memory, stream, to_warp
 from wlm.smoke.camera import Camera
+from wlm.smoke.march.launch import medium_of
 from wlm.smoke.transport.lights import AnyLight, Environment, checked_albedo, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
-from wlm_kernels.smoke.march import Medium, View
+from wlm_kernels.smoke.march import View
 
 HIGHEST = 100_000
 """Scatterings after which a path ends whatever is left of its light."""
@@ -156,9 +157,7 @@ def trace(
     colour = checked_albedo(albedo)
     device = device_name(volume.device)
     with stream(device):
-        density, temperature = volume.arrays()
-        factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
-        medium = Medium(density, *factors, empty=torch_memory(volume.device))
+        medium = medium_of(volume)
         densest = float(volume.density.max()) * medium.extinction
         if not densest <= _DENSEST:
             raise WlmError(f"expected voxels of an optical depth of at most {_DENSEST:g}, found one of {densest:.4g}")

@@ -1,0 +1,337 @@
+"""Folders for engines: few files, whose shaders and scripts compile or parse by what pip and Debian have."""
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.atlas_meshes import charts, sheet
+from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import random_model as random_atlas
+from builders.checks import error_of
+from builders.layered_sets import random_layers
+from builders.shader_runs import run_glsl, run_hlsl
+from builders.synthetic import random_model as random_lightmap
+
+from wlm.atlas import exporter
+from wlm.atlas.exact import decode64
+from wlm.atlas.mips import make_tail
+from wlm.export import ENGINES, export
+from wlm.export.engines.atlas import export_atlas
+from wlm.formats.light import read_light
+from wlm.inspection import inspect
+
+ALL = (4, 3, 2, 1, 4, 0)
+
+
+def atlas_folder(folder, kind, stored="half", mesh=None):
+    mesh = sheet() if mesh is None else mesh
+    model = random_atlas(mesh, kind, stored)
+    exporter.export(model, folder, mesh)
+    return model, exporter.read_folder(folder)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_large_lightmap_has_few_files(engine, tmp_path):
+    model = random_lightmap((3, 4) * 32, columns=8, times=(0.0, 12.0))
+    paths = export(model, tmp_path / "out", engine)
+    assert {path.name for path in paths} == set(os.listdir(tmp_path / "out")) and len(paths) <= 12
+    assert paths[-1].name == "bundle.json"
+    assert 5 <= len((tmp_path / "out" / "README.md").read_text().splitlines()) <= 20
+    assert not re.search(r"@[A-Z]+@", "".join(path.read_text() for path in paths if path.suffix in TEXTS))
+
+
+TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".py"}
+
+
+def test_one_engines_files_take_the_place_of_anothers(tmp_path):
+    folder = tmp_path / "out"
+    (folder).mkdir()
+    export(random_lightmap(ALL), folder, "three")
+    (folder / "mine.txt").write_text("x")
+    for engine in (*ENGINES[1:], ENGINES[0]):
+        paths = export(random_lightmap((2, 1, 2, 0)), folder, engine)
+        assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
+    _, output = atlas_folder(tmp_path / "made", "tiles")
+    for engine in (*ENGINES, "raw"):
+        paths = export_atlas(output, tmp_path / "atlas", engine)
+        assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
+        info = json.loads(paths[-1].read_text())
+        assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "atlas"))
+        assert info["uv_set"] == 0
+
+
+def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
+    """Of a model with mips too: their texture goes with the shader that reads it."""
+    mesh = sheet()
+    model = random_atlas(mesh, MIXED)
+    model = dataclasses.replace(model, tail=make_tail(mesh, "bc6h"))
+    exporter.export(model, tmp_path / "made", mesh)
+    output = exporter.read_folder(tmp_path / "made")
+    for engine in (*ENGINES, "raw"):
+        paths = export_atlas(output, tmp_path / "out", engine)
+        info = json.loads(paths[-1].read_text())
+        text = "".join(path.read_text() for path in paths if path.suffix in TEXTS - {".md", ".cs"})
+        assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks|tail)\b", text)) == set(info["textures"])
+    assert info["textures"]["tail"]["file"] == "tail.dds"
+    assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
+
+
+def test_sheets_of_light_have_a_folder_each(tmp_path):
+    """What a project can have only once is written once, and assets named after the model have the sheet's name."""
+    model, out = random_layers(), tmp_path / "out"
+    places = set()
+    for engine in ("unity", "three", "unreal", "godot"):
+        paths = export(model, out, engine)
+        assert {path for path in out.rglob("*") if path.is_file()} == set(paths) and paths[-1] == out / "bundle.json"
+        index = json.loads(paths[-1].read_text())
+        assert index["parts"] == ["sheet_00", "sheet_03"]
+        atlases = {each["part"]: each["atlas"] for each in index["sheets"]}
+        assert [atlases[part] for part in index["parts"]] == ["a", "b"]
+        shared = [path.relative_to(out).as_posix() for path in paths if path.suffix == ".cs"]
+        assert shared == (["WlmLightmap.cs"] if engine == "unity" else [])
+        for part in index["parts"]:
+            light = next(
+                own for sheet, own in model.sheets.items() if sheet.atlas == atlases[part] and not sheet.linear
+            )
+            alone = {path.name: path for path in export(light, tmp_path / f"alone-{engine}", engine)}
+            same = [name for name in alone if Path(name).suffix in (".bytes", ".dds", ".bin", ".tga", ".exr")]
+            for name in same:
+                assert (out / part / name).read_bytes() == alone[name].read_bytes(), name
+            assert same
+            for name in ("WlmLightmap.shader", "wlm_lightmap.py"):
+                if name in alone:
+                    text = (out / part / name).read_text()
+                    places.add(re.search(r'^(Shader|PLACE =) "(.*)"', text, re.MULTILINE)[0])
+    assert len(places) == 4
+    (finding,) = inspect(out)
+    assert "wlm export wrote" in finding.what
+
+
+KEY = """
+import { readFile } from "node:fs/promises";
+globalThis.document = { baseURI: import.meta.url };
+globalThis.fetch = async (url) => {
+  const bytes = await readFile(new URL(url)).catch(() => null);
+  if (bytes === null) return { ok: false, status: 404 };
+  const arrayBuffer = () => bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
+  return { ok: true, arrayBuffer, text: () => bytes.toString(), json: () => JSON.parse(bytes) };
+};
+const { loadAtlas } = await import("./atlas.mjs"), material = {};
+(await loadAtlas("bundle.json", { DataTexture: class {} })).apply(material);
+console.log(material.customProgramCacheKey());
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
+def test_atlases_of_one_lightmap_share_no_program_of_three(tmp_path):
+    """three.js compiles once for each key: under one key one atlas would be drawn with the other's shader."""
+    keys, sources = set(), set()
+    for kind in ("tiles", "plain"):
+        folder, (_, output) = tmp_path / f"out-{kind}", atlas_folder(tmp_path / kind, kind)
+        export_atlas(output, folder, "three")
+        shutil.copy(folder / "atlas.js", folder / "atlas.mjs")
+        (folder / "key.mjs").write_text(KEY)
+        done = subprocess.run(["node", "key.mjs"], cwd=folder, capture_output=True, text=True, check=True)
+        keys.add(done.stdout)
+        sources.add(output.model.source)
+    assert len(sources) == 1 and len(keys) == 2
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
+def test_a_file_that_three_cannot_load_is_named(tmp_path):
+    _, output = atlas_folder(tmp_path / "made", "plain")
+    export_atlas(output, tmp_path / "out", "three")
+    (tmp_path / "out" / "atlas.js").rename(tmp_path / "out" / "atlas.mjs")
+    (tmp_path / "out" / "atlas.glsl").unlink()
+    (tmp_path / "out" / "key.mjs").write_text(KEY)
+    done = subprocess.run(["node", "key.mjs"], cwd=tmp_path / "out", capture_output=True, text=True)
+    assert done.returncode and "atlas.glsl: 404" in done.stderr
+
+
+def test_what_cannot_be_exported_for_an_engine(tmp_path):
+    assert "engine: expected one of three" in error_of(export, random_lightmap(), tmp_path / "a", "cry")
+    layers = random_layers()
+    layers.sheets = {sheet: model for sheet, model in layers.sheets.items() if sheet.linear}
+    assert "expected a layer of light" in error_of(export, layers, tmp_path / "a", "three")
+    _, output = atlas_folder(tmp_path / "made", "plain", "astc")
+    assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
+    assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
+    assert {path.name for path in export_atlas(output, tmp_path / "a", "godot")} > {"colour.exr"}
+    assert {path.name for path in export_atlas(output, tmp_path / "a", "raw")} > {"colour.ktx2"}
+    assert "another folder" in error_of(export_atlas, output, output.folder, "godot")
+    (tmp_path / "made" / "colour.exr").unlink()
+    assert "colour.exr: no such file; compress again" in error_of(export_atlas, output, tmp_path / "b", "godot")
+    assert sorted(os.listdir(tmp_path)) == ["a", "made"]
+
+
+def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
+    model, output = atlas_folder(tmp_path / "made", "plain", "bc6h")
+    assert model.texels.shape == (18, 23, 3)
+    export_atlas(output, tmp_path / "out", "three")
+    np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels)
+    export_atlas(output, tmp_path / "out", "raw")
+    assert (tmp_path / "out" / "colour.dds").read_bytes() == (tmp_path / "made" / "colour.dds").read_bytes()
+
+
+def compiled(text, folder, *words):
+    if shutil.which("glslangValidator") is None:
+        pytest.skip("no glslangValidator: install glslang-tools")
+    (folder / "shader.comp").write_text(text)
+    words = ["glslangValidator", "-V", *words, "-o", "shader.spv", "shader.comp"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+def test_godots_passes_compile(kinds, tmp_path):
+    model = random_lightmap(kinds)
+    export(model, tmp_path / "out", "godot")
+    text = (tmp_path / "out" / "lightmap.glsl").read_text()
+    versions, _, text = text.partition("#[compute]\n")
+    assert re.findall(r'(\w+) = "(.*)";', versions) == [("decode", "#define WLM_DECODE"), ("fill", "#define WLM_FILL")]
+    for name in ("WLM_DECODE", "WLM_FILL"):
+        compiled(text.strip().replace("#VERSION_DEFINES", f"#define {name}"), tmp_path)
+    script = (tmp_path / "out" / "wlm_lightmap.gd").read_text()
+    names = json.loads(re.search(r"NAMES: Array\[String\] = (.*)", script)[1])
+    bound = re.findall(r"^#define WLM_LIGHTMAP_(\w+)_BINDING (\d+)$", text, re.MULTILINE)
+    assert [name.lower() for name, _ in bound] == names and [int(i) for _, i in bound] == list(range(len(names)))
+    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
+    from gdtoolkit.parser import parser
+
+    parser.parse(script)
+
+
+def as_glsl(text):
+    """A shader of Godot as GLSL: without its hints, its render modes and its own names."""
+    text = re.sub(r"^shader_type .*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^(uniform [^:;]*?) : [^;=]*?( =[^;]*)?;", r"\1\2;", text, flags=re.MULTILINE)
+    names = "vec3 ALBEDO, EMISSION; vec2 UV, UV2;\n"
+    return names + text
+
+
+@pytest.mark.parametrize("kind", [*KINDS, MIXED])
+def test_godots_atlas_shows_its_light(kind, tmp_path):
+    """Run as GLSL, with the EXRs as Godot imports them: in floats."""
+    model, output = atlas_folder(tmp_path / "made", kind, mesh=charts())
+    export_atlas(output, tmp_path / "out", "godot")
+    text = as_glsl((tmp_path / "out" / "atlas.gdshader").read_text())
+    uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
+    if model.method == "tiles":
+        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    bound = {path.stem: read_light(path)[0] for path in (tmp_path / "out").glob("*.exr")}
+    bound = {f"wlm_atlas_{name}": np.float32(np.pad(v[..., :3], ((0, 0), (0, 0), (0, 1)))) for name, v in bound.items()}
+    bound |= {"u_points": np.pad(uv, ((0, 0), (0, 2)))[None], "albedo": np.full((1, 1, 4), 255, np.uint8)}
+    main = "UV = vec2(0.5); UV2 = texelFetch(u_points, pixel, 0).xy; fragment(); light = vec4(EMISSION, 1.0);"
+    found = run_glsl(f"uniform sampler2D u_points;\n{text}", main, (1, len(uv)), bound)[0, :, :3]
+    allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
+    np.testing.assert_allclose(found, decode64(model, uv), rtol=0, atol=allowed)
+
+
+def test_godots_lit_surface_mixes_two_hours(tmp_path):
+    export(random_lightmap(), tmp_path, "godot")
+    text = as_glsl((tmp_path / "lit.gdshader").read_text())
+    maps = {"wlm_early": np.full((1, 1, 4), 1.0, np.float32), "wlm_late": np.full((1, 1, 4), 3.0, np.float32)}
+    maps["albedo"] = np.full((1, 1, 4), 51, np.uint8)
+    main = "UV = UV2 = vec2(0.5); fragment(); light = vec4(EMISSION, 1.0);"
+    found = run_glsl(text, main, (1, 1), maps, uniforms={"wlm_share": 0.25})
+    np.testing.assert_allclose(found[0, 0, :3], 0.2 * 1.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
+def test_unitys_passes_compile(kinds, tmp_path):
+    model = random_lightmap(kinds)
+    export(model, tmp_path / "unity", "unity")
+    shader = (tmp_path / "unity" / "WlmLightmap.shader").read_text()
+    shared = re.search(r"HLSLINCLUDE(.*?)ENDHLSL", shader, re.DOTALL)[1]
+    included = (tmp_path / "unity" / "WlmLightmap.hlsl").read_text()
+    shared = re.sub(r"^ *#pragma.*$", "", shared, flags=re.MULTILINE).replace('#include "WlmLightmap.hlsl"', included)
+    passes = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)
+    assert len(passes) == 3
+    for each in passes:
+        compiled(shared + each, tmp_path, "-D", "-S", "frag", "-e", "frag", "--auto-map-bindings")
+    compiled(shared + passes[0], tmp_path, "-D", "-S", "vert", "-e", "vert", "--auto-map-bindings")
+
+
+# Constants and functions of Unity, to run a pass as a function.
+RUN = """
+static const float4 _MainTex_ST = float4(1, 1, 0, 0), _Color = float4(1, 1, 1, 1);
+static const float _WlmShare = 0.25, _WlmDown = WLM_DOWN;
+float4 UnityObjectToClipPos(float4 p) { return p; }
+#define TRANSFORM_TEX(uv, name) (uv * name##_ST.xy + name##_ST.zw)
+#define tex2D(s, uv) float4(0.5, 0.5, 0.5, 1.0)
+"""
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_light_has_its_top_where_unity_has_it(down, tmp_path):
+    """The picture's top row at v = 1, the last row of a texture of Unity; or at v = 0."""
+    export(random_lightmap(), tmp_path, "unity")
+    text = re.findall(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmLightmap.shader").read_text(), re.DOTALL)[2]
+    named = "Texture2D<float4> _WlmEarly;\nTexture2D<float4> _WlmLate;\n"
+    text = f"#define WLM_DOWN {down}\n{named}{RUN}{text}"
+    early, late = np.random.default_rng(0).random((2, 5, 4, 4)).astype(np.float32)
+    maps = {"_WlmEarly": early, "_WlmLate": late}
+    found = run_hlsl(text, "frag(float4(float2(pixel) + 0.5, 0.0, 1.0))", (5, 4), maps, tmp_path)
+    expected = 0.75 * early + 0.25 * late
+    np.testing.assert_allclose(found, expected if down else expected[::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("down", [0, 1])
+def test_unitys_surface_shows_its_light(down, tmp_path):
+    """At UVs whose v an importer turned round, and at glTF's own."""
+    model, output = atlas_folder(tmp_path / "made", "plain", mesh=charts())
+    export_atlas(output, tmp_path / "out", "unity")
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "out" / "WlmAtlas.shader").read_text(), re.DOTALL)[1]
+    text = re.sub(r"^ *(#pragma|#include \"UnityCG|sampler2D|float4 _MainTex_ST).*$", "", text, flags=re.MULTILINE)
+    text = text.replace('#include "WlmAtlas.hlsl"', "\n" + (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
+    head = "#define WLM_DOWN 0\n" + "#define WLM_V_DOWN\n" * down + "Texture2D<float4> u_points;\n"
+    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
+    given = uv if down else np.float32([0, 1]) + np.float32([1, -1]) * uv
+    colour = np.concatenate([model.texels, np.ones_like(model.texels[..., :1])], 2).astype(np.float16)
+    bound = {"u_points": np.pad(given, ((0, 0), (0, 2)))[None], "wlm_atlas_colour": colour}
+    place = "u_points.Load(int3(pixel, 0)).xy"
+    shown = f"frag(vert(float4(0, 0, 0, 1), float2(0.5, 0.5), {place}))"
+    found = run_hlsl(head + RUN + text, shown, (1, len(uv)), bound, tmp_path)[0, :, :3]
+    np.testing.assert_allclose(found, 0.5 * decode64(model, uv), atol=3.0 / 512)
+
+
+UNITY = """
+cbuffer unity { float4x4 unity_all; };
+float4 UnityObjectToClipPos(float4 p) { return mul(unity_all, p); }
+#define TRANSFORM_TEX(uv, name) (uv * name##_ST.xy + name##_ST.zw)
+Texture2D _MainTexture; SamplerState sampler_MainTexture;
+#define tex2D(s, uv) _MainTexture.Sample(sampler_MainTexture, uv)
+"""
+
+
+@pytest.mark.parametrize("kind", [*KINDS, MIXED])
+def test_unitys_surface_compiles(kind, tmp_path):
+    _, output = atlas_folder(tmp_path / "made", kind)
+    export_atlas(output, tmp_path / "out", "unity")
+    shader = (tmp_path / "out" / "WlmAtlas.shader").read_text()
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)[1]
+    text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
+    text = text.replace('#include "WlmAtlas.hlsl"', (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
+    text = UNITY + text.replace('#include "UnityCG.cginc"', "")
+    for first in ("", "#define WLM_FIRST_UV\n"):
+        for stage, entry in (("frag", "frag"), ("vert", "vert")):
+            compiled(first + text, tmp_path, "-D", "-S", stage, "-e", entry, "--auto-map-bindings")
+
+
+def test_unitys_components_parse(tmp_path):
+    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
+    from tree_sitter import Language, Parser
+
+    export(random_lightmap(), tmp_path / "lightmap", "unity")
+    _, output = atlas_folder(tmp_path / "made", "tiles")
+    export_atlas(output, tmp_path / "atlas", "unity")
+    for path in (tmp_path / "lightmap" / "WlmLightmap.cs", tmp_path / "atlas" / "WlmAtlas.cs"):
+        tree = Parser(Language(sharp.language())).parse(path.read_bytes())
+        assert not tree.root_node.has_error, path

@@ -1,0 +1,449 @@
+"""Pages in a browser: the light that they decode is that of Python, and their controls change the picture."""
+
+import base64
+import dataclasses
+import io
+import re
+
+import numpy as np
+import pytest
+import torch
+from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets
+from builders.synthetic import random_model
+from PIL import Image
+
+import wlm
+from wlm.atlas.model import unpack_entries
+from wlm.export import write_page
+from wlm.formats.gltf import document_from_arrays
+from wlm.formats.gltf_writer import write_glb
+from wlm.lightmap.data import from_arrays
+from wlm.lightmap.tiles import TileKind
+from wlm.smoke.camera import Camera
+from wlm.smoke.data import write_six_way
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.shading import Light
+
+TIMES = (0.0, 6.25, 12.0, 18.5, 23.9)
+
+
+def numbers(page, script: str) -> np.ndarray:
+    """The float32 numbers that a script gives."""
+    text = page.evaluate(
+        f"""(async () => {{
+            const {{kind}} = await wlm, bytes = new Uint8Array((await ({script})).buffer.slice(0));
+            let text = '';
+            for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+            return btoa(text);
+        }})()"""
+    )
+    return np.frombuffer(base64.b64decode(text), np.float32)
+
+
+def picture(page) -> np.ndarray:
+    """What is on the canvas, after the next frame."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return np.asarray(Image.open(io.BytesIO(page.locator("#view").screenshot())).convert("RGB")).astype(int)
+
+
+def told(page) -> str:
+    """What the panel says of the pointer's place, after the next frame."""
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return "   ".join(page.locator("#panel .told span").all_inner_texts())
+
+
+def light_of(text: str, name: str) -> np.ndarray:
+    """A light that the panel tells."""
+    return np.array([float(x) for x in re.search(rf"{name} (\S+) (\S+) (\S+)", text).groups()])
+
+
+def texel_of(text: str) -> tuple[int, int]:
+    return tuple(map(int, re.match(r"texel (\d+), (\d+)   UV ", text).groups()))
+
+
+def figure(page, name: str) -> str:
+    """What the panel's table says beside a name."""
+    return page.locator(f"#panel > table tr:has(td:text-is('{name}')) td:last-child").inner_text()
+
+
+@pytest.fixture(scope="module")
+def lightmaps():
+    """A dynamic, a static, a constant and an empty tile."""
+    frames = np.zeros((5, 256, 256, 3), np.float32)
+    frames[:, :128, :128] = small_sets.moving_light().frames
+    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
+    mask = np.ones((256, 256), bool)
+    mask[128:, 128:] = mask[50:60, 90:200] = mask[::16, ::8] = False
+    return from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four tiles")
+
+
+@pytest.fixture(scope="module")
+def model(lightmaps):
+    return wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(static_budget_db=20.0))
+
+
+def _long(*values: object) -> object:
+    """Of the long run alone: a page takes seconds."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("unpacked", "interpolation"), [(False, "radiance"), _long(True, "radiance"), _long(False, "network")]
+)
+def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpolation):
+    assert sorted(model.kind.tolist()) == [0, 1, 2, 3]
+    model = dataclasses.replace(model, profile=model.profile.override({"interpolation": interpolation}))
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    page = show(tmp_path / "page.html", unpacked=unpacked)
+    decoder, gamma = model.decoder(), model.profile.gamma
+    for time in TIMES:
+        expected = decoder.frame(time)
+        seen = numbers(page, f"kind.read({time})").reshape(256, 256, 4)[..., :3]
+        bound = expected.max() ** (1 / gamma)
+        apart = np.abs(np.maximum(seen, 0.0) ** (1 / gamma) - expected ** (1 / gamma)) / bound
+        assert apart.max() < 2 / 255
+
+
+@pytest.mark.parametrize(
+    ("unpacked", "interpolation"), [_long(False, "radiance"), (True, "radiance"), _long(True, "network")]
+)
+def test_frames_of_all_modes_and_video_decode_as_in_python(tmp_path, show, unpacked, interpolation):
+    model = random_model((4, 1, 2, 4, 5, 6), times=(0.0, 7.5, 19.0), interpolation=interpolation)
+    model.save(tmp_path / "frames.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "frames.wlm"])
+    page = show(tmp_path / "page.html", unpacked=unpacked)
+    decoder = model.decoder()
+    for time in (7.5, 21.0):
+        expected = decoder.frame(time)
+        seen = numbers(page, f"kind.read({time})").reshape(*expected.shape[:2], 4)[..., :3]
+        # The map is of half floats.
+        assert np.abs(seen - expected).max() < 2**-10 * expected.max()
+
+
+def test_the_hour_and_the_exposure_change_the_picture(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(5))")
+    before = picture(page)
+    assert before.max() > 100
+    page.evaluate("wlm.then(({kind}) => kind.read(11))")
+    assert np.abs(picture(page) - before).max() > 20
+    page.keyboard.press("]")
+    brighter = picture(page)
+    assert brighter.mean() > before.mean()
+    page.keyboard.press("t")
+    assert np.abs(picture(page) - brighter).max() > 5
+    page.keyboard.press("h")
+    assert page.locator("#panel.folded").count() == 1
+    fold = page.locator("header button")
+    assert fold.get_attribute("aria-label") == "unfold the panel (H)" and fold.inner_text() == "+"
+
+
+def test_the_original_its_error_and_the_wipe(tmp_path, show):
+    lightmaps = small_sets.moving_light(hours=(0.0, 1.0, 2.0), period=None)
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "one.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "one.wlm"], original=tmp_path / "set")
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(1))")
+    decoded = picture(page)
+    page.get_by_role("button", name="original", exact=True).click()
+    original = picture(page)
+    middle = decoded.shape[1] // 2
+    assert np.abs(decoded - original).mean() > 1
+    page.get_by_role("button", name="split").click()
+    page.evaluate("document.getElementById('wipe').style.visibility = 'hidden'")
+    split = picture(page)
+    np.testing.assert_array_equal(split[:, : middle - 2], original[:, : middle - 2])
+    np.testing.assert_array_equal(split[:, middle + 2 :], decoded[:, middle + 2 :])
+    page.get_by_role("button", name="error", exact=True).click()
+    assert np.abs(picture(page) - decoded).max() > 50
+
+
+@pytest.mark.parametrize("touch", [_long(False), True])
+def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, touch):
+    model.save(tmp_path / "four.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"], original=tmp_path / "set", hours=5)
+    page = show(tmp_path / "page.html", touch=touch)
+    point = page.touchscreen.tap if touch else page.mouse.move
+    box, hour, decoder = page.locator("#view").bounding_box(), lightmaps.times[2], model.decoder()
+    page.evaluate(f"wlm.then(({{kind}}) => kind.read({hour}))")
+    assert told(page) == "point at the picture to read a texel"
+    middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    for x, y, kind in ((-100, -60, "dynamic"), (60, -100, "static"), (-100, 60, "constant"), (60, 60, "empty")):
+        point(*(middle + [x, y]))
+        text = told(page)
+        column, row = texel_of(text)
+        # The picture's 256 texels are square, and fill the shorter side but for a margin.
+        expected = 128 + np.array([x, y]) * 256 * 1.08 / min(box["width"], box["height"])
+        assert np.abs([column + 0.5, row + 0.5] - expected).max() < 1
+        u, v = map(float, re.search(r"UV (\S+) (\S+)", text).groups())
+        assert np.abs(np.array([u, v]) * 256 - expected).max() < 0.1
+        number = row // 128 * 2 + column // 128
+        assert f"tile {number} ({kind})" in text and TileKind(model.kind[number]).name.lower() == kind
+        gamma, radiance = model.profile.gamma, decoder.frame(hour)
+        apart = light_of(text, "decoded") ** (1 / gamma) - radiance[row, column] ** (1 / gamma)
+        assert np.abs(apart).max() < 2 / 255 * radiance.max() ** (1 / gamma)
+        if kind != "empty":
+            original = lightmaps.frames[2][row, column]
+            assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
+    if not touch:
+        # What is outside of the mask has no error, though the original was filled there and the decoded light is 0.
+        page.get_by_role("button", name="error", exact=True).click()
+        seen = picture(page)
+        rows, columns = (size // 2 + np.arange(5, 100) for size in seen.shape[:2])
+        assert np.abs(seen[rows][:, columns] - 76.5).max() < 1 and seen[rows - 105][:, columns - 105].max() > 50
+        page.get_by_role("button", name="decoded", exact=True).click()
+    point(*(middle - 100))
+    before = told(page)
+    page.evaluate(f"wlm.then(({{kind}}) => kind.read({hour + 1}))")
+    after = told(page)
+    assert after.startswith(before.split("decoded")[0]) and after != before and "original" not in after
+    point(box["x"] + 2, middle[1])
+    assert told(page) == "point at the picture to read a texel"
+
+
+@pytest.mark.parametrize("kind", atlas_models.KINDS)
+def test_a_texel_of_an_atlas(kind, tmp_path, show):
+    """A cube of six charts, and one inside that is never seen."""
+    mesh = atlas_meshes.charts()
+    model = atlas_models.random_model(mesh, kind)
+    wlm.atlas.export(model, tmp_path / "cube", mesh)
+    _, light = atlas_meshes.write_files(tmp_path, mesh)
+    write_page(tmp_path / "page.html", [tmp_path / "cube"], original=light)
+    page = show(tmp_path / "page.html")
+    box, exposure = page.locator("#view").bounding_box(), page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
+    shown, decoder, seen = picture(page), model.decoder(), set()
+    for x, y in ((0.5, 0.35), (0.4, 0.6), (0.6, 0.6), (0.45, 0.4), (0.55, 0.7)):
+        x, y = int(x * box["width"]), int(y * box["height"])
+        page.mouse.move(box["x"] + x + 0.5, box["y"] + y + 0.5)
+        text = told(page)
+        column, row = texel_of(text)
+        seen.add((row // 24, column // 16))
+        decoded = light_of(text, "decoded")
+        if len(model.uv):
+            # Read where the pixel reads it; elsewhere it is that of the texel.
+            code = np.clip(decoded * exposure, 0, 1)
+            code = np.where(code <= 0.0031308, 12.92 * code, 1.055 * code ** (1 / 2.4) - 0.055)
+            assert np.abs(shown[y, x] - 255 * code).max() <= 4
+        else:
+            place = torch.tensor([[(column + 0.5) / 64, (row + 0.5) / 48]], dtype=torch.float32)
+            assert np.abs(decoded - decoder.read(place).numpy()[0]).max() < 2 / 255 * 3
+        original = mesh.filled[row, column]
+        assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
+        if kind == "tiles":
+            wide, high, left, top = map(int, re.search(r"(\d+) × (\d+) texels at (\d+), (\d+)", text).groups())
+            entry = model.lut[min(row // 7, len(model.lut) - 1), min(column // 7, len(model.lut[0]) - 1)]
+            first, size, _ = unpack_entries(entry, model.first_block_code)
+            assert [left, top] == first.tolist() and [wide, high] == size.tolist()
+        assert ("tile" in text) == (kind == "tiles")
+    assert len(seen) == 3 and (1, 2) not in seen, "three sides of the cube, and nothing of what is inside"
+
+
+@pytest.fixture
+def compared(tmp_path, show):
+    """A page of a day with its original at 0, 8 and 16 h, of which the lower half belongs to no chart."""
+    mask = np.ones((128, 128), bool)
+    mask[64:] = False
+    lightmaps = small_sets.moving_light(hours=(0.0, 8.0, 16.0), mask=mask)
+    wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(tmp_path / "day.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    Image.fromarray(mask).save(tmp_path / "set" / "mask.png")
+    write_page(tmp_path / "page.html", [tmp_path / "day.wlm"], original=tmp_path / "set")
+    return show(tmp_path / "page.html")
+
+
+def wait_for(page, condition: str) -> None:
+    """Waits until a script says yes of `kind`, for ten seconds."""
+    page.evaluate(f"""wlm.then(async ({{kind}}) => {{
+        const end = performance.now() + 10000;
+        while (!({condition})) {{
+            if (performance.now() > end) throw new Error('expected {condition}, found ' + [kind.time, kind.shown]);
+            await new Promise(requestAnimationFrame);
+        }}
+    }})""")
+
+
+def wait_for_hour(page, hour: float) -> None:
+    wait_for(page, f"kind.shown === {hour} && kind.time === {hour}")
+
+
+def test_arrows_go_from_original_to_original_where_one_is_seen(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("ArrowRight")
+    wait_for_hour(compared, 8.25)
+    assert figure(compared, "PSNR at this hour") == "–"
+    compared.keyboard.press("4")
+    for key, hour in (("", 8.0), ("ArrowRight", 16.0), ("ArrowRight", 0.0), ("ArrowLeft", 16.0)):
+        if key:
+            compared.keyboard.press(key)
+        wait_for_hour(compared, hour)
+        assert figure(compared, "PSNR at this hour").endswith(" dB")
+    assert figure(compared, "originals at") == "0:00, 8:00, 16:00"
+    # A slider that has the focus moves by the same steps.
+    compared.locator("input").first.focus()
+    compared.keyboard.press("ArrowRight")
+    wait_for_hour(compared, 0.0)
+
+
+def test_a_played_day_is_compared_at_the_originals_hours(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("3")
+    compared.evaluate("""wlm.then(({kind}) => {
+        window.seen = [];
+        const draw = kind.surface.draw.bind(kind.surface);
+        kind.surface.draw = (...all) => { window.seen.push(kind.shown); draw(...all); };
+    })""")
+    compared.get_by_role("button", name="play").click()
+    wait_for(compared, "new Set(window.seen).size > 1")
+    # After a click on the button the space bar still plays and pauses.
+    compared.keyboard.press(" ")
+    assert compared.get_by_role("button", name="play").count() == 1
+    assert set(compared.evaluate("window.seen")) <= {0.0, 8.0, 16.0}
+    compared.keyboard.press("1")
+    compared.keyboard.press(" ")
+    wait_for(compared, "kind.shown % 8 !== 0")
+
+
+def test_texels_of_no_chart_have_no_error(compared):
+    wait_for_hour(compared, 8.0)
+    compared.keyboard.press("4")
+    seen = picture(compared)
+    height, middle = seen.shape[0], seen.shape[1] // 2
+    upper, lower = seen[height // 10 : height // 2 - 5, middle], seen[height // 2 + 5 : height - height // 10, middle]
+    assert (lower == 76).all() or (lower == 77).all()
+    assert np.abs(upper - 76).max() > 50
+
+
+def test_the_walls_of_a_room_are_seen_from_inside_alone(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    rooms.write_room(tmp_path / "room.glb")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"], mesh=tmp_path / "room.glb")
+    page = show(tmp_path / "page.html")
+    page.evaluate("wlm.then(({kind}) => kind.read(5))")
+    inside = picture(page)
+    page.keyboard.press("b")
+    outside = picture(page)
+    assert np.abs(inside - outside).max() > 20
+    page.keyboard.press("b")
+    np.testing.assert_array_equal(picture(page), inside)
+    # The whole box is in the picture, and fills it in one direction.
+    lit = np.argwhere((outside != outside[0, 0]).any(-1))
+    room = np.array(outside.shape[:2])
+    assert (lit.min(0) > 0).all() and (lit.max(0) < room - 1).all()
+    assert ((lit.max(0) - lit.min(0)) / room).max() > 0.8
+
+
+def test_the_help_tells_what_the_page_can_do(compared, tmp_path, show):
+    def told(page):
+        page.locator("summary").click()
+        return page.locator("details").inner_text()
+
+    text = told(compared)
+    for words in ("the hour", "play, pause", "decoded, original, split, error", "error factor", "fold this panel"):
+        assert words in text
+    mesh = atlas_meshes.sheet()
+    wlm.atlas.export(atlas_models.random_model(mesh, atlas_models.KINDS[0]), tmp_path / "sheet", mesh)
+    write_page(tmp_path / "atlas.html", [tmp_path / "sheet"])
+    text = told(show(tmp_path / "atlas.html"))
+    assert "exposure" in text and "turn the camera" in text
+    for words in ("hour", "frame", "play", "original", "error"):
+        assert words not in text
+
+
+@pytest.mark.parametrize("kind", atlas_models.KINDS)
+def test_atlases_read_as_in_python(kind, tmp_path, show):
+    mesh = atlas_meshes.sheet()
+    model = atlas_models.random_model(mesh, kind)
+    wlm.atlas.export(model, tmp_path / "sheet", mesh)
+    write_page(tmp_path / "page.html", [tmp_path / "sheet"])
+    page = show(tmp_path / "page.html")
+    uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
+    expected = model.decoder().read(torch.from_numpy(uv)).numpy()
+    seen = numbers(page, f"kind.read({uv.ravel().tolist()})").reshape(-1, 4)[:, :3]
+    assert np.abs(seen - expected).max() < 2 / 255 * expected.max()
+    assert picture(page).max() > 100
+    before = picture(page)
+    page.get_by_role("button", name="unwrapped").click()
+    assert np.abs(picture(page) - before).max() > 20
+
+
+@pytest.mark.parametrize("outputs", [27, _long(12), _long(48)])
+def test_probes_decode_as_in_python(outputs, tmp_path, show):
+    model = probe_models.random_model(count=12, probes=40, outputs=outputs, positions=True)
+    model.save(tmp_path / "probe.wlm")
+    position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]) + model.origin
+    document, _ = document_from_arrays(position, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
+    write_glb(tmp_path / "triangle.glb", document, [], 0)
+    write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], mesh=tmp_path / "triangle.glb")
+    page = show(tmp_path / "page.html")
+    live = ~model.dead
+    expected = model.decoder().decode(model.stored_positions()[live])[:, :27]
+    seen = numbers(page, "kind.read()").reshape(-1, 27)[:, : expected.shape[1]]
+    assert np.abs(seen - expected).max() < 3 / 255 * np.abs(expected).max()
+    assert picture(page).max() > 100
+
+
+def test_probes_of_a_transform_and_light_between_them_decode_as_in_python(tmp_path, show):
+    probes = probe_sets.synthetic(60, dead=5)
+    model = wlm.probe.compress(probes)
+    model.save(tmp_path / "probe.wlm")
+    wlm.probe.save_probes(tmp_path / "probes.npz", probes.position, probes.values)
+    corners = probes.position[probes.live][:3]
+    corners[2] += 0.3
+    document, _ = document_from_arrays(corners, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
+    write_glb(tmp_path / "triangle.glb", document, [], 0)
+    files = {"mesh": tmp_path / "triangle.glb", "original": tmp_path / "probes.npz"}
+    write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], **files)
+    page = show(tmp_path / "page.html")
+    decoder = model.decoder(position=probes.position)
+    for group, expected in enumerate([decoder.decode_probes()[probes.live], decoder.decode(corners)]):
+        seen = numbers(page, f"kind.read({group})").reshape(-1, 27)
+        # The page has half floats of them.
+        assert np.abs(seen - expected).max() < 2**-10 * np.abs(expected).max()
+    assert picture(page).max() > 100
+
+
+def test_smoke_is_shaded_as_in_python(tmp_path, show):
+    rows, columns = np.mgrid[:32, :32] / 32.0
+    maps = np.stack([0.1 + 0.1 * i + 0.2 * rows * columns for i in range(6)]).astype(np.float32)
+    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=32, width=32)
+    six = SixWay(torch.from_numpy(maps), torch.full((32, 32), 0.0), camera=camera)
+    for number in range(2):
+        write_six_way(tmp_path / f"{number}.exr", six)
+    write_page(tmp_path / "page.html", [tmp_path / "0.exr", tmp_path / "1.exr"], rate=10.0)
+    page = show(tmp_path / "page.html", width=700, height=400)
+    for toward in ((1.0, 0.0, 0.0), (-0.6, 0.0, 0.8), (0.0, 0.6, -0.8)):
+        page.evaluate(
+            f"wlm.then(({{kind}}) => {{ kind.toward = {list(toward)}; kind.draw(); kind.camera.changed(); }})"
+        )
+        exposure = page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
+        light = six.shade([Light(toward)]).numpy()[16, 16] * exposure
+        expected = 255 * (1.055 * min(light[0], 1.0) ** (1 / 2.4) - 0.055)
+        seen = picture(page)
+        at = seen[seen.shape[0] // 2, seen.shape[1] // 2]
+        assert np.abs(at - expected).max() <= 4
+    before = picture(page)
+    box = page.locator("#view").bounding_box()
+    page.mouse.move(box["x"] + 20, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 60, box["y"] + 220)
+    page.mouse.up()
+    assert np.abs(picture(page) - before).max() > 5
+
+
+def test_a_damaged_page_says_so(model, tmp_path, show):
+    model.save(tmp_path / "four.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    middle = text.index('id="content"') + 3000
+    letter = "A" if text[middle] != "A" else "B"
+    (tmp_path / "page.html").write_text(text[:middle] + letter + text[middle + 1 :], encoding="utf-8")
+    page = show(tmp_path / "page.html")
+    assert "damaged" in page.locator("#message").inner_text()
+    show.errors.clear()  # the page also throws it, for the console

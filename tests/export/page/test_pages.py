@@ -1,0 +1,181 @@
+"""Pages: what they carry, and what a page can't be made of."""
+
+import base64
+import json
+import re
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from builders import atlas_meshes, probe_models, small_sets
+from builders.contract import FILES
+from typer.testing import CliRunner
+
+import wlm
+from wlm.cli.app import app
+from wlm.errors import WlmError
+from wlm.export.page.html import Page
+from wlm.export.page.pages import make_page, write_page
+from wlm.formats.exr import write_exr
+from wlm.formats.shared_exponent import pack_rgb9e5
+from wlm.smoke.camera import Camera
+from wlm.smoke.data import write_six_way
+from wlm.smoke.lightmaps import SixWay
+
+
+def parts(path) -> tuple[dict, bytes]:
+    """The manifest of a page and its unpacked content."""
+    text = path.read_text(encoding="utf-8")
+    manifest, content = re.findall(r'<script id="(?:manifest|content)" type="[a-z/]+">(.*?)</script>', text, re.S)
+    return json.loads(manifest), zlib.decompress(base64.b64decode(content))
+
+
+def test_a_page_carries_its_arrays_whole(tmp_path):
+    arrays = {"a": np.arange(5, dtype=np.uint8), "b": np.linspace(0, 1, 7, dtype=np.float32), "none": np.zeros(0, "u1")}
+    page = Page("smoke", "a name", "", [("file", "5 bytes")], {"width": 3}, arrays)
+    assert page.write(tmp_path / "page.html") == (tmp_path / "page.html").stat().st_size
+    manifest, content = parts(tmp_path / "page.html")
+    assert manifest["width"] == 3 and manifest["bytes"] == len(content)
+    for name, values in arrays.items():
+        start, length = manifest["arrays"][name]
+        assert start % 16 == 0
+        np.testing.assert_array_equal(np.frombuffer(content[start : start + length], values.dtype), values)
+
+
+def test_a_name_is_text_and_never_a_script(tmp_path):
+    name = "</script><script>alert(1)</script> @CONTENT@ \u202e"
+    Page("smoke", name, name, [(name, name)], {}).write(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "alert(1)</script>" not in text
+    assert parts(tmp_path / "page.html")[0]["title"] == name
+
+
+def test_a_page_loads_nothing_from_elsewhere(tmp_path):
+    write_page(tmp_path / "page.html", [FILES / "lightmap.wlm"])
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|import\s|fetch\(|XMLHttp| src=", text)
+
+
+def test_shared_exponents_are_within_half_a_step():
+    random = np.random.default_rng(0)
+    light = random.random((4000, 3)) * 2.0 ** random.integers(-18, 16, (4000, 1))
+    light[:4] = [[0, 0, 0], [1e9, 0, 1], [65408, 65408, 65408], [1e-12, 0, 0]]
+    codes = pack_rgb9e5(light).astype(np.int64)
+    exponent = codes >> 27
+    back = np.stack([codes >> shift & 511 for shift in (0, 9, 18)], 1) * 2.0 ** (exponent - 24)[:, None]
+    expected = np.minimum(light, 65408.0)
+    assert (np.abs(back - expected) <= expected.max(1, keepdims=True) / 512 + 2.0**-25).all()
+
+
+def test_frames_of_the_original_are_spread_over_the_day(tmp_path):
+    lightmaps = small_sets.moving_light()
+    wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(tmp_path / "city.wlm")
+    folder = tmp_path / "set"
+    small_sets.write_set(folder, lightmaps)
+    reports = []
+    page = make_page([tmp_path / "city.wlm"], original=folder, hours=3, progress=reports.append)
+    assert page.manifest["reference"]["times"] == [lightmaps.times[i] for i in (0, 2, 4)]
+    assert page.manifest["time"] == lightmaps.times[2] and reports[-1].done == reports[-1].total == 3
+    assert ((page.arrays["mask"] > 0) == lightmaps.mask).all()
+    assert sorted(name for name in page.arrays if name.startswith("original")) == [f"original_{i}" for i in range(3)]
+    with pytest.raises(WlmError, match="--hours"):
+        make_page([tmp_path / "city.wlm"], original=folder, hours=0)
+    small_sets.write_set(tmp_path / "half", small_sets.moving_light(height=64))
+    with pytest.raises(WlmError, match="expected lightmaps of 128x128, found 128x64"):
+        make_page([tmp_path / "city.wlm"], original=tmp_path / "half")
+
+
+def test_what_has_no_page_is_said_in_one_line(tmp_path):
+    probe_models.random_model(positions=False).save(tmp_path / "probe.wlm")
+    probe_models.random_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
+    probes = tmp_path / "probes.npz"
+    np.savez(probes, position=np.zeros((2, 3)))
+    write_exr(tmp_path / "day.exr", np.ones((4, 4, 3), np.float32))
+    for files, options, said in (
+        ([], {}, "found none"),
+        ([tmp_path / "absent.wlm"], {}, "absent.wlm"),
+        ([FILES / "smoke.wlm"], {}, "no picture of its own"),
+        ([FILES / "atlas-tiles.wlm"], {}, "expected the folder"),
+        ([FILES / "lightmap.wlm", FILES / "lightmap.wlm"], {}, "expected one file"),
+        ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
+        ([FILES / "lightmap.wlm"], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
+        ([tmp_path / "probe.wlm"], {}, "--original"),
+        ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
+        ([tmp_path], {}, "wlm view shows inputs"),
+        ([tmp_path / "day.exr"], {}, "day.exr: expected a .wlm"),
+        ([probes], {}, "probes.npz: expected a .wlm"),
+        ([FILES / "lightmap.wlm"], {"original": probes}, "probes.npz: expected a set.json or a folder"),
+        ([tmp_path / "absent.exr"], {}, "absent.exr: no such file or folder"),
+    ):
+        with pytest.raises(WlmError, match=re.escape(said)) as caught:
+            make_page(files, **options)
+        assert "\n" not in str(caught.value)
+
+
+def test_the_scores_of_a_page_are_those_of_evaluate(tmp_path):
+    lightmaps = small_sets.moving_light()
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "city.wlm")
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    page = make_page([tmp_path / "city.wlm"], original=tmp_path / "set", hours=3)
+    expected = wlm.lightmap.evaluate(model, lightmaps, metrics=("psnr",)).psnr_by_time[[0, 2, 4]]
+    np.testing.assert_allclose(page.manifest["reference"]["psnr"], expected)
+    probes = probe_models.random_model(positions=True)
+    probes.save(tmp_path / "probe.wlm")
+    values = np.random.default_rng(0).random((probes.probes, 9, 3), np.float32)
+    values[probes.dead] = 0.0
+    np.savez(tmp_path / "probes.npz", position=probes.stored_positions(), sh=values)
+    page = make_page([tmp_path / "probe.wlm"], original=tmp_path / "probes.npz")
+    score = wlm.probe.evaluate(probes, wlm.probe.load(tmp_path / "probes.npz")).psnr
+    assert dict(page.figures)["PSNR of coefficients"] == f"{score:.2f} dB"
+
+
+def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):
+    lightmaps = small_sets.moving_light(hours=(0.0, 6.0))
+    model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
+    model.save(tmp_path / "city.wlm")
+    lightmaps.frames[1] = 0.0
+    small_sets.write_set(tmp_path / "set", lightmaps)
+    write_page(tmp_path / "page.html", [tmp_path / "city.wlm"], original=tmp_path / "set")
+    scores = parts(tmp_path / "page.html")[0]["reference"]["psnr"]
+    assert scores[0] > 0 and scores[1] is None
+
+
+def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
+    probe_models.random_model(probes=50, dead=0, positions=True).save(tmp_path / "live.wlm")
+    assert make_page([tmp_path / "live.wlm"]).manifest["probe"]["count"] == 50
+
+
+def test_a_tampered_file_makes_no_page(tmp_path):
+    content = bytearray((FILES / "lightmap.wlm").read_bytes())
+    content[-1] ^= 1
+    (tmp_path / "bad.wlm").write_bytes(content)
+    with pytest.raises(WlmError, match="damaged"):
+        write_page(tmp_path / "page.html", [tmp_path / "bad.wlm"])
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_frames_of_smoke_are_of_one_size(tmp_path):
+    for name, size in (("a", 8), ("b", 4)):
+        camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)
+        planes = torch.rand(7, size, size)
+        write_six_way(tmp_path / f"{name}.exr", SixWay(planes[:6], planes[6], camera=camera))
+    with pytest.raises(WlmError, match="expected 8x8 pixels as the first frame, found 4x4"):
+        make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
+    with pytest.raises(WlmError, match="--rate"):
+        make_page([tmp_path / "a.exr"], rate=0.0)
+    assert make_page([tmp_path / "a.exr"]).title == "a"
+    (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes())
+    folder, files = make_page([tmp_path]), make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
+    assert folder.manifest == files.manifest and folder.title == files.title == tmp_path.name
+
+
+def test_the_command_writes_a_page_of_a_folder(tmp_path):
+    mesh = atlas_meshes.sheet()
+    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0))
+    wlm.atlas.export(model, tmp_path / "sheet", mesh)
+    result = CliRunner().invoke(app, ["web", str(tmp_path / "sheet"), "-o", str(tmp_path / "page.html")])
+    assert result.exit_code == 0, result.output
+    manifest, _ = parts(tmp_path / "page.html")
+    assert manifest["kind"] == "atlas" and dict(manifest["figures"])["profile"] == "tiny"

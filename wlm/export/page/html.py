@@ -1,0 +1,98 @@
+"""One HTML file: our script and style, a manifest, and arrays that zlib packed and base64 made text of."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any, Literal
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_write
+from wlm.formats.geometry import Geometry
+
+_ALIGNMENT = 16  # bytes, of an array in the content
+_COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js", "reading.js")
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What a page shows.
+
+    Attributes:
+        kind: `lightmap`, `atlas`, `probe` or `smoke`: whose script it runs.
+        title: Above the panel, and of the browser's window.
+        note: A sentence below it; may be empty.
+        figures: Names and texts of the panel's table.
+        manifest: JSON values for the script.
+        arrays: By name; bytes are carried as they are.
+        scripts: Texts of further scripts that the kind's own needs.
+    """
+
+    kind: str
+    title: str
+    note: str
+    figures: Sequence[tuple[str, str]]
+    manifest: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    scripts: Sequence[str] = ()
+
+    def write(self, path: str | os.PathLike[str]) -> int:
+        """Writes the page, whole or not at all.
+
+        Returns:
+            The file's size, bytes.
+
+        Raises:
+            WlmError: A number of the manifest isn't finite, or the file can't be written.
+        """
+        content, places = bytearray(), {}
+        for name, values in self.arrays.items():
+            part = np.ascontiguousarray(values).tobytes()
+            content += bytes(-len(content) % _ALIGNMENT)
+            places[name] = [len(content), len(part)]
+            content += part
+        manifest = {
+            "kind": self.kind,
+            "title": self.title,
+            "note": self.note,
+            "figures": [list(figure) for figure in self.figures],
+            **self.manifest,
+            "arrays": places,
+            "bytes": len(content),
+        }
+        try:
+            # No "<" in a script: a name could otherwise end it.
+            text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+        except ValueError as error:
+            raise WlmError(f"{self.title}: cannot be shown: a number is NaN or infinite") from error
+        pieces = {
+            "TITLE": html.escape(self.title),
+            "STYLE": _asset("page.css"),
+            "MANIFEST": text,
+            "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
+            "SCRIPT": "\n".join([*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]),
+        }
+        # Cut first, then filled: what goes in may hold a mark too.
+        first, *rest = _asset("page.html").split("@")
+        page = [first, *(pieces.get(part, part) for part in rest)]
+        return atomic_write(path, "".join(page).encode())
+
+
+def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays of triangles by the names that the script knows, and for the manifest the box that its camera sees."""
+    parts = {"position": geometry.position, "triangles": geometry.triangle, "uv": geometry.uv}
+    low, high = geometry.box
+    box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up), "inward": geometry.is_room}
+    return {name: values for name, values in parts.items() if values is not None}, box
+
+
+def _asset(name: str) -> str:
+    return (resources.files("wlm.export.page") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")

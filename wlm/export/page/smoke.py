@@ -1,0 +1,75 @@
+"""The page of six-way lightmaps of smoke."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.export.page.html import Page
+from wlm.smoke.camera import DIRECTIONS
+from wlm.smoke.data import read_six_way
+from wlm.smoke.lightmaps import SixWay
+from wlm.system import Meter, OnProgress
+
+_WHITE = 0.8  # of the screen, where the brightest lightmap is
+
+
+def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
+    """Makes the page of six-way lightmaps.
+
+    Args:
+        paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
+        rate: Frames a second.
+        progress: Called about twice a second.
+
+    Raises:
+        WlmError: A file can't be read or is of another size, or the rate isn't above 0.
+    """
+    if not 0 < rate < float("inf"):
+        raise WlmError(f"--rate: expected a number above 0, got {rate}")
+    arrays: dict[str, np.ndarray] = {}
+    most, hot, sizes = [], False, []
+    meter = Meter(progress, "read", len(paths))
+    for i, path in enumerate(paths):
+        frame = read_six_way(path)
+        hot |= frame.emission is not None
+        sizes.append("{2}x{1}".format(*frame.lightmaps.shape))
+        if sizes[i] != sizes[0]:
+            raise WlmError(f"{path}: expected {sizes[0]} pixels as the first frame, found {sizes[i]}")
+        planes, scales = _planes(frame)
+        # sRGB-like codes of 8 bits: what a flip book has.
+        codes = np.round(np.sqrt(planes) * 255.0).astype(np.uint8).transpose(1, 2, 0)
+        arrays[f"first_{i}"], arrays[f"second_{i}"] = codes[..., :4], codes[..., 4:]
+        most.append(scales)
+        if meter.due(len(most)):
+            meter.report(len(most))
+    height, width = frame.lightmaps.shape[1:]
+    shown = [*DIRECTIONS, "opacity"] + ["emission"] * hot
+    manifest = {
+        "width": width,
+        "height": height,
+        "exposure": _WHITE / max(scales[0] for scales in most),
+        "smoke": {"frames": len(paths), "planes": shown, "most": most, "rate": rate},
+    }
+    figures = [
+        ("files", f"{sum(path.stat().st_size for path in paths):,} bytes"),
+        ("frames", f"{len(paths)}"),
+        ("lightmaps", f"{width} × {height} texels"),
+        ("brightest texel", f"{max(scales[0] for scales in most):.3g}"),
+    ]
+    title = paths[0].stem if len(paths) == 1 else paths[0].resolve().parent.name
+    note = "Six-way lightmaps of smoke. Drag over the picture: the light follows the pointer."
+    return Page("smoke", title, note, figures, manifest, arrays)
+
+
+def _planes(frame: SixWay) -> tuple[np.ndarray, list[float]]:
+    """The eight planes in [0, 1], and by what to multiply the lightmaps, the opacity and the emission."""
+    lightmaps = frame.lightmaps.numpy().clip(0.0, None)
+    opacity = np.ones_like(lightmaps[0]) if frame.transparency is None else 1.0 - frame.transparency.numpy()
+    glow = np.zeros_like(lightmaps[0]) if frame.emission is None else frame.emission.numpy().clip(0.0, None)
+    scales = [max(float(lightmaps.max()), 1e-12), 1.0, max(float(glow.max()), 1e-12)]
+    planes = np.concatenate([lightmaps / scales[0], opacity.clip(0.0, 1.0)[None], glow[None] / scales[2]])
+    return planes, scales

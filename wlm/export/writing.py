@@ -1,0 +1,143 @@
+"""`export`: a model as a folder of files for other programs, or as a kit for one engine.
+
+Both are written from the model's `Bundle`. The folder's index, `bundle.json`, holds the bundle's document at its top
+level, and beside it:
+
+    format, version     "wlm-bundle" and its number
+    system, name        as of the bundle
+    engine              the engine of a kit; null for a raw folder
+    shader              file of the shader; null for a collection
+    textures            by name: file, format, width, height, layers of an array (0: no array), mips
+    buffers, reference  by name: file, dtype, shape
+    parts               names of subfolders, one for each part of a collection, with an index of their own
+    files               all files of the folder, except the index
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+from wlm.bundle import FORMAT, INDEX_FILE, RESERVED, Bundle
+from wlm.errors import WlmError
+from wlm.export.bundles import bundle_of
+from wlm.export.engines.kit import ENGINES
+from wlm.export.files import write_buffer, write_reference, write_texture
+from wlm.formats.folder import compact_json, made_parents, read_index, staged
+from wlm.shading import ENDINGS, check_language, translate
+
+_VERSION = 1
+_KITS = {
+    "lightmap": "wlm.export.engines.lightmap",
+    "atlas": "wlm.export.engines.atlas",
+    "probe": "wlm.export.engines.probe",
+    "smoke": "wlm.export.engines.smoke",
+}
+"""Modules whose `write_kit` writes a bundle of a system for an engine."""
+
+
+def export(
+    model: Any,
+    folder: str | os.PathLike[str],
+    engine: str | None = None,
+    *,
+    shader: str = "glsl",
+    exact: bool = False,
+    device: str = "cpu",
+    **options: Any,
+) -> list[Path]:
+    """Writes a model as a folder: raw textures, buffers and a shader, or a kit for an engine.
+
+    All files are written beside the folder and moved in together, the index `bundle.json` last. An earlier export is
+    replaced; other files stay.
+
+    Args:
+        model: A lightmap, atlas or probe model, a flip book of smoke, or any object with a method `bundle`; or the
+            `Bundle` itself.
+        folder: The folder; made if it does not exist.
+        engine: One of `wlm.export.ENGINES`; None for the raw folder.
+        shader: Language of the raw folder's shader, one of `wlm.export.LANGUAGES`.
+        exact: Whether the raw folder's shader fetches texels and mixes them in floats instead of using the filter.
+        device: Device that decodes the reference, "cpu" or "cuda:0" for example.
+        options: Options of the kit: keyword arguments of `write_kit` in the system's module of `wlm.export.engines`.
+
+    Returns:
+        The files written, the index last.
+
+    Raises:
+        WlmError: Unknown engine, language or device; an option that has no meaning here; the folder holds other files
+            or cannot be written; a number of the model is not finite; or a texture is larger than GPUs accept.
+    """
+    check_language(shader)
+    if engine is not None and engine not in ENGINES:
+        raise WlmError(f"engine: expected one of {', '.join(ENGINES)}, got {engine!r}")
+    if engine is not None and (exact or shader != "glsl"):
+        raise WlmError(f"engine {engine}: shader and exact have no meaning for a kit, whose language is the engine's")
+    folder = Path(folder)
+    with made_parents(folder), staged(folder, INDEX_FILE, FORMAT) as staging:
+        bundle = bundle_of(model, device)
+        if engine is None:
+            _check_options(options, (), "a raw folder")
+            _write_raw(bundle, staging, shader, exact)
+        else:
+            _write_kit(bundle, staging, engine, options)
+    return [folder / name for name in (*read_index(folder / INDEX_FILE)["files"], INDEX_FILE)]
+
+
+def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None:
+    entries: dict[str, Any] = {"engine": None, "shader": None}
+    if bundle.shader:
+        if exact and not bundle.exact:
+            raise WlmError(f"{bundle.name}: exact has no meaning here: the shader uses no texture filter")
+        entries["shader"] = bundle.system + ENDINGS[language]
+        text = translate(bundle.shader, language, [bundle.exact] if exact else [])
+        (folder / entries["shader"]).write_bytes(text.encode())
+    entries["textures"] = {name: write_texture(folder, name, each) for name, each in bundle.textures.items()}
+    entries["buffers"] = {name: write_buffer(folder, name, each) for name, each in bundle.buffers.items()}
+    entries["reference"] = {name: write_reference(folder, name, each) for name, each in bundle.reference.items()}
+    for name, content in bundle.files.items():
+        (folder / name).write_bytes(content)
+    for name, part in bundle.parts.items():
+        (folder / name).mkdir()
+        _write_raw(part, folder / name, language, exact)
+    _write_index(bundle, folder, entries | {"parts": list(bundle.parts)})
+
+
+def _write_kit(bundle: Bundle, folder: Path, engine: str, options: dict[str, Any]) -> None:
+    """Writes the kit of a bundle, or of each of its parts that are light, in a subfolder each."""
+    if not bundle.parts:
+        if bundle.system not in _KITS:
+            raise WlmError(f"{bundle.name}: there is no kit for {engine}; expected the raw folder")
+        write_kit = import_module(_KITS[bundle.system]).write_kit
+        _check_options(options, tuple(signature(write_kit).parameters)[3:], f"{bundle.system} and {engine}")
+        _write_index(bundle, folder, {"engine": engine} | write_kit(bundle, folder, engine, **options))
+        return
+    parts = {name: part for name, part in bundle.parts.items() if "values" not in part.document}
+    if not parts:
+        raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found other values")
+    for name, part in parts.items():
+        (folder / name).mkdir()
+        _write_kit(part, folder / name, engine, options)
+        for script in (folder / name).glob("*.cs"):
+            # A Unity project can hold a class only once.
+            os.replace(script, folder / script.name)
+    _write_index(bundle, folder, {"engine": engine, "parts": list(parts)})
+
+
+def _check_options(options: Iterable[str], known: Sequence[str], where: str) -> None:
+    for name in options:
+        if name not in known:
+            raise WlmError(f"{name}: has no meaning for {where}")
+
+
+def _write_index(bundle: Bundle, folder: Path, entries: dict[str, Any]) -> None:
+    if wrong := RESERVED & set(bundle.document):
+        raise ValueError(f"document: expected none of the reserved keys, got {', '.join(sorted(wrong))}")
+    head = {"format": FORMAT, "version": _VERSION, "system": bundle.system, "name": bundle.name}
+    try:
+        text = compact_json(head | entries | dict(bundle.document))
+    except ValueError as error:
+        raise WlmError(f"{bundle.name}: cannot export: a number is NaN or infinite") from error
+    (folder / INDEX_FILE).write_bytes(text.encode())

@@ -1,0 +1,297 @@
+"""The shader of a six-way flip book: where a frame lies, its light from a direction or a point, its motion."""
+
+import math
+
+from wlm.bundle import sampler
+from wlm.shading import LANGUAGES, translate
+from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
+from wlm.smoke.flipbook.book import Book
+from wlm.smoke.flipbook.motion import ZERO, mip_levels
+from wlm.smoke.shading import Ramp
+
+_TEXT = """\
+// Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
+// (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; lights weigh by squares, as in engines.)
+// For GLSL 3.30, GLSL ES 3.00 and later; include it below #version.
+// Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
+//
+//     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
+//     and over lights at a point, of way = wlm_smoke_point(place, size, depth, position, radius),
+//             of intensity / (4 pi) * way.w * wlm_smoke_light(first, second, way.xyz)
+//     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
+
+// The texture's coordinates of a frame, from 0 on, at a place on the billboard: (0, 0) its top left, (1, 1) its bottom
+// right.
+vec2 wlm_smoke_uv(vec2 place, float frame)
+{{
+    float cell = clamp(floor(frame), 0.0, {last:.1f});
+    float row = floor((cell + 0.5) / {columns:.1f});
+    float column = cell - {columns:.1f} * row;
+    float x = column + {inset_x} + place.x * {share_x};
+    float y = row + {inset_y} + place.y * {share_y};
+    return vec2(x / {columns:.1f}, y / {rows:.1f});
+}}
+
+// The light of irradiance 4 pi from a direction, of length 1, from the smoke to the light: x to the billboard's right,
+// y up, z to the viewer.
+float wlm_smoke_light(vec4 first, vec4 second, vec3 toward)
+{{
+    float x = toward.x > 0.0 ? {right} : {left};
+    float y = toward.y > 0.0 ? {top} : {bottom};
+    float z = toward.z > 0.0 ? {front} : {back};
+    return (toward.x * toward.x * x + toward.y * toward.y * y + toward.z * toward.z * z) * {factor};
+}}
+
+// Of a light at a point the direction from the smoke at a place, of length 1, and the falloff, its irradiance there
+// over its intensity: an engine's own may stand for that. The size is the billboard's width and height; the position is
+// from its middle, x to its right, y up, z to the viewer, in the unit of the size; within the radius, in that unit too,
+// the falloff is as at it. The depth is how far the smoke lies before the billboard, in its heights: 0 is flat.
+vec4 wlm_smoke_point(vec2 place, vec2 size, float depth, vec3 position, float radius)
+{{
+    vec3 smoke = vec3((place.x - 0.5) * size.x, (0.5 - place.y) * size.y, depth * size.y);
+    vec3 way = position - smoke;
+    float far = max(dot(way, way), {nearest});
+    return vec4(way / sqrt(far), 1.0 / max(far, radius * radius));
+}}
+
+float wlm_smoke_alpha(vec4 first, vec4 second)
+{{
+    return {alpha};
+}}
+
+float wlm_smoke_emission(vec4 first, vec4 second)
+{{
+    return {emission};
+}}
+
+// The level for textureLod, of how many texels a pixel of the screen is wide: {levels} at most, beyond which
+// frames show their neighbours.
+float wlm_smoke_level(float texels)
+{{
+    return clamp(log2(max(texels, 1.0)), 0.0, {levels:.1f});
+}}
+"""
+
+_DEPTH = """
+// The depth for wlm_smoke_point, of the depth texture's texel at wlm_smoke_uv; that is linear too.
+float wlm_smoke_depth(vec4 texel)
+{{
+    return (texel.x - {zero}) * {reach};
+}}
+"""
+
+_MOTION = """
+// Between two frames, at a share of 0 to 1 of the way from one to the next, both textures are read twice and mixed:
+//
+//     vec2 way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(place, frame)));
+//     way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)));
+//     first = mix(texture(first, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)),
+//                 texture(first, wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0)), share)
+//
+// The motion from a frame to the next, on the billboard, of the motion texture's texel; that is linear too.
+vec2 wlm_smoke_motion(vec4 texel)
+{{
+    vec2 way = texel.xy - vec2({zero}, {zero});
+    return vec2(way.x * {reach}, way.y * -{reach});
+}}
+
+// Where the earlier frame shows what is at a place.
+vec2 wlm_smoke_before(vec2 place, vec2 motion, float share)
+{{
+    return clamp(place - motion * share, vec2(0.0, 0.0), vec2(1.0, 1.0));
+}}
+
+// Where the later frame does.
+vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
+{{
+    return clamp(place + motion * (1.0 - share), vec2(0.0, 0.0), vec2(1.0, 1.0));
+}}
+"""
+
+_NEAREST = 1e-12  # squared distance to a light below which it counts the same
+
+
+def smoke_shader(
+    language: str,
+    layout: str,
+    *,
+    rows: int,
+    columns: int,
+    count: int,
+    size: tuple[int, int],
+    padding: int = 0,
+    gain: float = 1.0,
+    hot: bool = True,
+    motion: float | None = None,
+    depth: float | None = None,
+) -> str:
+    """Writes the shader of a flip book.
+
+    Args:
+        language: One of `wlm.shading.LANGUAGES`.
+        layout: One of `wlm.smoke.camera.LAYOUTS`.
+        rows, columns, count: Of cells, and of frames in them.
+        size: Height and width of a frame in pixels, without padding.
+        padding: Pixels around it.
+        gain: The factor on the light in the textures.
+        hot: Whether they have a channel of emission.
+        motion, depth: The scales of its textures of motion and of depth; None: it has none.
+
+    Raises:
+        ValueError: No such language or layout.
+    """
+    if language not in LANGUAGES or layout not in LAYOUTS:
+        known = f"{', '.join(LANGUAGES)} and of {', '.join(LAYOUTS)}"
+        raise ValueError(f"expected one of {known}, got {language!r} and {layout!r}")
+    places = {
+        name: f"{texture}.{letter}"
+        for texture, names in zip(("first", "second"), LAYOUTS[layout], strict=True)
+        for name, letter in zip(names, "rgba", strict=True)
+    }
+    height, width = (n + 2 * padding for n in size)
+    alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
+    text = _TEXT.format(
+        layout=layout,
+        rows=rows,
+        columns=columns,
+        count=count,
+        last=count - 1,
+        inset_x=_literal(padding / width),
+        inset_y=_literal(padding / height),
+        share_x=_literal(size[1] / width),
+        share_y=_literal(size[0] / height),
+        factor=_literal(1.0 / gain),
+        nearest=_literal(_NEAREST),
+        levels=mip_levels(*size, padding),
+        alpha=alpha,
+        emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
+        **places,
+    )
+    if depth is not None:
+        text += _DEPTH.format(zero=_literal(ZERO), reach=_literal(2.0 * depth))
+    if motion is not None:
+        text += _MOTION.format(zero=_literal(ZERO), reach=_literal(2.0 * motion))
+    return translate(text, language)
+
+
+def _literal(number: float) -> str:
+    """A number that GLSL ES too takes for a float."""
+    text = f"{number:.9g}"
+    return text if "." in text or "e" in text else f"{text}.0"
+
+
+_READ = """
+// Both textures' texels at a place of the billboard: (0, 0) its top left, (1, 1) its bottom right. The time is in
+// frames from 0 on, between two of which both are mixed; texels: how many of a frame a pixel of the screen is wide.
+void wlm_smoke_texels(vec2 place, float time, float texels, out vec4 first, out vec4 second)
+{{
+    float frame = clamp(floor(time), 0.0, {last:.1f});
+    float share = clamp(time - frame, 0.0, 1.0);
+    float mip = wlm_smoke_level(texels);
+{between}
+    first = mix(textureLod(WLM_SMOKE_FIRST_MAP, early, mip), textureLod(WLM_SMOKE_FIRST_MAP, late, mip), share);
+    second = mix(textureLod(WLM_SMOKE_SECOND_MAP, early, mip), textureLod(WLM_SMOKE_SECOND_MAP, late, mip), share);
+}}
+
+// The light that the smoke throws to the viewer under a light of an irradiance, as of `toward` of wlm_smoke_light.
+vec3 wlm_smoke_lit(vec4 first, vec4 second, vec3 toward, vec3 irradiance)
+{{
+    return irradiance * (wlm_smoke_light(first, second, toward) * {share});
+}}
+
+// The same under a sky of one radiance all round: the mean of the six lightmaps.
+vec3 wlm_smoke_sky(vec4 first, vec4 second, vec3 radiance)
+{{
+    vec3 x = vec3(1.0, 0.0, 0.0);
+    vec3 y = vec3(0.0, 1.0, 0.0);
+    vec3 z = vec3(0.0, 0.0, 1.0);
+    float sum = wlm_smoke_light(first, second, x) + wlm_smoke_light(first, second, -x);
+    sum += wlm_smoke_light(first, second, y) + wlm_smoke_light(first, second, -y);
+    sum += wlm_smoke_light(first, second, z) + wlm_smoke_light(first, second, -z);
+    return radiance * (sum / 6.0);
+}}
+
+// The light that the smoke gives off itself.
+vec3 wlm_smoke_glow(vec4 first, vec4 second)
+{{
+{glow}
+}}
+
+// All of it under one light and the sky, and in the fourth place the opacity: pixel = rgb + behind * (1 - opacity).
+vec4 wlm_smoke_pixel(vec2 place, float time, float texels, vec3 toward, vec3 irradiance, vec3 sky)
+{{
+    vec4 first;
+    vec4 second;
+    wlm_smoke_texels(place, time, texels, first, second);
+    vec3 light = wlm_smoke_lit(first, second, toward, irradiance) + wlm_smoke_sky(first, second, sky);
+    return vec4(light + wlm_smoke_glow(first, second), wlm_smoke_alpha(first, second));
+}}
+"""
+
+_FADE = """\
+    vec2 early = wlm_smoke_uv(place, frame);
+    vec2 late = wlm_smoke_uv(place, frame + 1.0);"""
+# The motion of what is here at this time, which was elsewhere in the first frame.
+_MOVE = """\
+    vec4 here = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(place, frame), mip);
+    vec2 start = wlm_smoke_before(place, wlm_smoke_motion(here), share);
+    vec4 there = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(start, frame), mip);
+    vec2 way = wlm_smoke_motion(there);
+    vec2 early = wlm_smoke_uv(wlm_smoke_before(place, way, share), frame);
+    vec2 late = wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0);"""
+
+
+def book_functions(book: Book, language: str = "glsl") -> str:
+    """Writes the functions of `smoke_shader` for a flip book, in one of `wlm.shading.LANGUAGES`."""
+    names = ("rows", "columns", "count", "size", "padding", "gain", "hot")
+    values = {name: getattr(book, name) for name in names}
+    return smoke_shader(language, book.layout, **values, motion=book.scale, depth=book.reach)
+
+
+def billboard_shader(book: Book, language: str = "glsl") -> str:
+    """Writes the shader of a flip book on a billboard.
+
+    Its textures are `wlm_smoke_first_map`, `wlm_smoke_second_map` and, with motion, `wlm_smoke_motion_map`.
+
+    Args:
+        book: The flip book.
+        language: One of `wlm.shading.LANGUAGES`.
+
+    Raises:
+        ValueError: No such language.
+    """
+    if language not in LANGUAGES:
+        raise ValueError(f"expected one of {', '.join(LANGUAGES)}, got {language!r}")
+    textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
+    text = _READ.format(
+        last=book.count - 1,
+        between=_FADE if book.motion is None else _MOVE,
+        share=f"{0.25 / math.pi:.9g}",
+        glow=_glow(book.ramp) if book.hot else "    return vec3(0.0, 0.0, 0.0);",
+    )
+    return translate(f"{book_functions(book)}\n{textures}{text}", language)
+
+
+def _glow(ramp: Ramp | None) -> str:
+    """The colour of an emission: each mix leaves what the ones before gave, or takes its own stop's colour whole."""
+    lines = ["float emission = wlm_smoke_emission(first, second);"]
+    if ramp is None:
+        lines.append("return vec3(emission, emission, emission);")
+    else:
+        lines.append(f"vec3 colour = {_colour(ramp.colours[0])};")
+        for low, high, colour in zip(ramp.stops, ramp.stops[1:], ramp.colours[1:], strict=False):
+            share = f"clamp((emission - {_number(low)}) * {_number(1.0 / (high - low))}, 0.0, 1.0)"
+            lines.append(f"colour = mix(colour, {_colour(colour)}, {share});")
+        lines.append("return colour;")
+    return "\n".join("    " + line for line in lines)
+
+
+def _colour(colour: tuple[float, float, float]) -> str:
+    return f"vec3({', '.join(map(_number, colour))})"
+
+
+def _number(number: float) -> str:
+    """A number that GLSL ES too takes for a float, in brackets below 0."""
+    text = f"{number:.9g}"
+    text = text if "." in text or "e" in text else f"{text}.0"
+    return f"({text})" if number < 0 else text

@@ -1,0 +1,95 @@
+"""Six-way lightmaps of smoke by a fine march: single scattering without noise, and with its own error beside it.
+
+The paper's references are one bounce by path tracing, 512 samples a pixel (section 5). One bounce is an integral, which
+is computed here as such. The camera must be orthographic, as the lightmaps are.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from wlm.fluid.volume import DensityVolume
+from wlm.interop import device_name, stream
+from wlm.smoke.camera import Camera, unit
+from wlm.smoke.lightmaps import SixWay, StepError
+from wlm.smoke.march.launch import run
+from wlm_kernels.smoke import march_six
+from wlm_kernels.smoke.settings import March
+
+
+def bake(
+    volume: DensityVolume,
+    camera: Camera,
+    *,
+    step: float = 0.5,
+    g: float = 0.0,
+    supersample: int = 1,
+    estimate: bool = True,
+) -> SixWay:
+    """Makes the lightmaps, the transparency and, of hot smoke, the emission (eq. 4).
+
+    Args:
+        volume: The smoke.
+        camera: Orthographic. Smoke behind its plane or outside the image isn't seen and still casts its shadow.
+        step: The longest step, in voxels, along rays and to the lights. Samples lie in their steps' middles.
+        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
+        supersample: Rays along a pixel's edge, whose mean is the pixel; 1: the ray through its centre.
+        estimate: Whether to march in steps of twice the length too, for the error: half as much work again.
+
+    Returns:
+        The lightmaps on the smoke's device.
+
+    Raises:
+        ValueError: A setting is out of its range, or the camera is in perspective.
+    """
+    if supersample < 1:
+        raise ValueError(f"supersample: expected at least 1, got {supersample}")
+    with stream(device_name(volume.device)):
+        fine = _planes(volume, camera, March(step=step, g=g), supersample)
+        error = None
+        if estimate:
+            coarse = _planes(volume, camera, March(step=2.0 * step, g=g), supersample)
+            difference = (fine - coarse).double()
+            energy = float(fine[:6].double().square().mean())
+            error = StepError(
+                float(difference[:6].abs().max()),
+                (float(difference[:6].square().mean()) / energy) ** 0.5 if energy > 0 else 0.0,
+                float(difference[march_six.TRANSPARENCY].abs().max()),
+            )
+    hot = fine[march_six.EMISSION] if volume.temperature is not None else None
+    return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, camera, error=error)
+
+
+def lit(
+    volume: DensityVolume,
+    camera: Camera,
+    toward: Sequence[float] | np.ndarray,
+    *,
+    step: float = 0.5,
+    g: float = 0.0,
+) -> torch.Tensor:
+    """Smoke under one light from any direction, of irradiance 4 pi, which six-way shading approximates.
+
+    Each sample of each ray marches to the light: slow, and independent of `bake`, so that it serves as its check.
+
+    Args:
+        volume: The smoke, of albedo 1.
+        camera: Any.
+        toward: [3], the direction to the light in the world, of any length but 0.
+        step: In voxels.
+        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
+
+    Returns:
+        float32 [H, W].
+
+    Raises:
+        ValueError: The direction has no length, or a setting is out of its range.
+    """
+    return run(march_six.lit, volume, camera, (), unit(toward), March(step=step, g=g))
+
+
+def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
+    """Lightmaps, transparency and emission, [8, H, W]."""
+    out = run(march_six.six_way, volume, camera.finer(supersample), (8,), march)
+    return out if supersample == 1 else torch.nn.functional.avg_pool2d(out[None], supersample)[0]

@@ -1,0 +1,99 @@
+"""Marches over a volume, on its device and in torch's memory."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
+
+import torch
+
+from wlm.fluid.volume import DensityVolume
+from wlm.interop import StepGraph, device_name, stream, to_warp, torch_memory
+from wlm.smoke.camera import Camera
+from wlm_kernels.smoke.march import Medium
+
+
+def run(
+    launch: Callable[..., None],
+    volume: DensityVolume,
+    camera: Camera,
+    planes: tuple[int, ...],
+    *arguments: Any,
+    **options: Any,
+) -> torch.Tensor:
+    """Runs a march.
+
+    Args:
+        launch: `launch(medium, view, *arguments, out, **options)`, of `wlm_kernels.smoke`.
+        volume: The smoke.
+        camera: The view.
+        planes: Sizes of the result before those of the image.
+        arguments, options: Passed on; lengths in voxels.
+
+    Returns:
+        float32 [*planes, H, W] on the smoke's device.
+    """
+    with stream(device_name(volume.device)):
+        size = (*planes, camera.height, camera.width)
+        out = torch.empty(size, dtype=torch.float32, device=volume.device)
+        launch(medium_of(volume), camera.view(volume), *arguments, to_warp(out), **options)
+    return out
+
+
+def medium_of(volume: DensityVolume) -> Medium:
+    """The smoke as marches take it, inside `wlm.interop.stream`."""
+    density, temperature = volume.arrays()
+    factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
+    return Medium(density, *factors, empty=torch_memory(volume.device))
+
+
+_Made = TypeVar("_Made")
+
+
+class VolumeGraph(Generic[_Made]):
+    """A function of smoke, captured as a graph on CUDA and replayed; on the CPU it is called.
+
+    It reads a copy of the smoke, since that of a solver moves. Its results lie where they lay before: each call
+    overwrites those of the last.
+    """
+
+    def __init__(self, work: Callable[[DensityVolume], _Made], device: str, warmup: int = 2) -> None:
+        """Makes it.
+
+        Args:
+            work: Waits for nothing on the device: `wlm.smoke.march`, `transport.light_smoke` and `transport.scatter`
+                with a camera and directional lights do not.
+            device: As `wlm.interop.check_device` returns it.
+            warmup: Calls before it is captured, in which kernels are loaded.
+        """
+        self._work = work
+        self._device = device
+        self._volume: DensityVolume | None = None
+        self._made: _Made | None = None
+        self._step = StepGraph(self._make, device, warmup=warmup)
+
+    def __call__(self, volume: DensityVolume) -> _Made:
+        """What is made of smoke.
+
+        Raises:
+            ValueError: Its shape, place or factors aren't those of the first.
+        """
+        with stream(self._device):
+            if self._volume is None:
+                heat = None if volume.temperature is None else torch.empty_like(volume.temperature)
+                self._volume = replace(volume, density=torch.empty_like(volume.density), temperature=heat)
+            if _kind(volume) != _kind(self._volume):
+                raise ValueError(f"volume: expected {_kind(self._volume)} as before, got {_kind(volume)}")
+            self._volume.density.copy_(volume.density)
+            if volume.temperature is not None:
+                self._volume.temperature.copy_(volume.temperature)
+        self._step()
+        return self._made
+
+    def _make(self) -> None:
+        self._made = self._work(self._volume)
+
+
+def _kind(volume: DensityVolume) -> tuple:
+    """What a graph takes as given."""
+    place = (volume.voxel, tuple(volume.origin), volume.extinction, volume.emission)
+    return (volume.shape, volume.density.dtype, volume.temperature is not None, *place)

@@ -1,0 +1,338 @@
+"""Samples, simulated on the device while a network trains (neural-six-way-lightmaps, sections 4.4 and 5).
+
+The paper stores 25,200 images of 14 sequences. Here nothing is stored: a pool is a function of its settings, a seed and
+a round. Scenes are drawn, simulated and rendered from several sides. A sample is two successive frames, each with its
+guiding map and its lightmaps, and the motion between them. Images show smoke alone: obstacles shape it and are left out
+(section 5).
+
+The paper's sizes, 400^3 voxels, 512^2 pixels and steps of 10 voxels, are more than learning needs. Lengths are shares
+of the box, so that a smaller grid shows the same: the guiding map's step is 1/40 of its edge, and so is the density
+from which smoke counts as a surface. A trained network's guiding maps must be made with its own
+`DatasetSettings.look`.
+
+=======================================  =============================================================
+an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn in its place
+`ATTEMPTS` such scenes in a row          error
+a frame with almost no smoke             a small random share of these is kept
+=======================================  =============================================================
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.fluid.solver import Solver
+from wlm.fluid.volume import load_volume
+from wlm.interop import check_device, no_collection, stream
+from wlm.smoke.camera import Camera
+from wlm.smoke.march.fine import bake
+from wlm.smoke.march.motion import motion
+from wlm.smoke.network.planes import GUIDES, PLANES, encode_lightmaps, render_guide
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.scenes import draw_scene, generator
+from wlm.smoke.network.settings import EDGE, PERIOD, DatasetSettings
+from wlm.smoke.scene import CameraSettings, Scene, make_camera
+from wlm.smoke.simulation import make_solver, volume_of
+from wlm.system import Meter, OnProgress
+
+ATTEMPTS = 8
+"""Scenes drawn for one sequence before it is given up."""
+
+STAGES = ("simulate", "guide", "reference", "motion")
+"""Stages whose seconds are counted."""
+
+_EXTENT = 1.1  # edge of a fixed view's image over the box's edge
+_EARLY = 0.35  # of the warmup, for sources that soon stop
+_BRIGHT = 0.99  # quantile of a volume's non-empty voxels that stands for its density
+
+
+def make_pool(
+    settings: DatasetSettings, *, seed: int, round: int = 0, device: str = "cpu", progress: OnProgress | None = None
+) -> Pool:
+    """Makes the samples of one training round, from sequences that no other round has.
+
+    Args:
+        settings: How samples are made.
+        seed: Seed of all rounds, at least 0.
+        round: Number of the round, from 0.
+        device: "cpu", "cuda" or "cuda:N".
+        progress: Called after each sequence with the figures "samples", "skipped" scenes, "dropped" samples without
+            smoke, and the seconds of each of `STAGES`.
+
+    Returns:
+        At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
+        device.
+
+    Raises:
+        WlmError: The memory isn't enough, or scene after scene is unstable.
+    """
+    return _Maker(settings, seed, False, device).pool(round * settings.sequences, settings.sequences, progress)
+
+
+def make_validation(
+    settings: DatasetSettings,
+    device: str = "cpu",
+    *,
+    test: bool = False,
+    scale: float = 1.0,
+    progress: OnProgress | None = None,
+) -> Pool:
+    """Makes samples of sequences that no round has, each pair seen from every fixed view.
+
+    Args:
+        settings, device, progress: As for `make_pool`.
+        test: Use `test_seed`, which is held out from model selection.
+        scale: Factor on the extinction of the same smoke, 0.5 and 2 in the paper's ablation.
+
+    Raises:
+        WlmError: As `make_pool`.
+    """
+    seed = settings.test_seed if test else settings.validation_seed
+    return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)
+
+
+def pool_of_volume(
+    path: str | os.PathLike[str],
+    settings: DatasetSettings,
+    *,
+    device: str = "cpu",
+    extinction: float | None = None,
+    emission: float = 1.0,
+) -> Pool:
+    """Makes samples of any volume, one from each fixed view: a test on smoke from elsewhere.
+
+    Args:
+        path: A `.npz`, `.nvdb` or `.vdb` volume, as `load_volume` reads it.
+        settings: Views and march; the volume's longest edge counts as the box's.
+        device: "cpu", "cuda" or "cuda:N".
+        extinction: Extinction of density 1, per unit of length; None: such that its dense smoke is as opaque as a
+            scene's.
+        emission: Emission of temperature 1, per unit of length.
+
+    Returns:
+        The samples. There is one frame: both of a sample are equal, the motion is 0, and so is the sequence.
+
+    Raises:
+        WlmError: As `load_volume`; or the volume is empty and no extinction is given.
+    """
+    volume = load_volume(path, extinction=1.0, emission=emission, device=check_device(device))
+    if extinction is None:
+        density = volume.density[volume.density > 0]
+        if not len(density):
+            raise WlmError(f"{path}: density: expected smoke to choose an extinction by, found none")
+        edge = volume.voxel * max(volume.shape)
+        extinction = settings.extinction / (edge * float(np.quantile(density.float().cpu().numpy(), _BRIGHT)))
+    volume = replace(volume, extinction=extinction)
+    cameras = fixed_cameras(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
+    guides, targets = [], []
+    for number, camera in enumerate(cameras):
+        guides.append(render_guide(volume, camera, settings.guide, settings.look(volume.shape, number)).half())
+        targets.append(encode_lightmaps(bake(volume, camera, step=settings.reference_step, estimate=False)).half())
+    pairs = [torch.stack([torch.stack(parts)] * 2, 1) for parts in (guides, targets)]
+    still = torch.zeros((len(cameras), 2, *pairs[0].shape[-2:]), dtype=torch.float16, device=pairs[0].device)
+    return Pool(*pairs, still, torch.zeros(len(cameras), dtype=torch.int64, device=pairs[0].device))
+
+
+def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
+    """The fixed views of a box, all of one extent."""
+    first = CameraSettings(extent=_EXTENT * float(np.max(size)), resolution=settings.resolution)
+    turns = settings.arc / settings.views * np.arange(settings.views)
+    return [make_camera(first.turned(float(turn)), origin, size) for turn in turns]
+
+
+class _Shot(NamedTuple):
+    """A view of a frame pair: camera, factor on the extinction, seed of the first frame's jitter."""
+
+    camera: Camera
+    scale: float
+    seed: int
+
+
+class _Maker:
+    """Makes the pools of one set: training, validation or test."""
+
+    def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0) -> None:
+        self._settings, self._seed, self._validation, self._scale = settings, seed, validation, scale
+        self._device = check_device(device)
+        self._clock = _Clock(self._device)
+
+    def pool(self, first: int, count: int, progress: OnProgress | None) -> Pool:
+        """The samples of consecutive sequences."""
+        meter = Meter(progress, "dataset", count)
+        pools: list[Pool] = []
+        samples = skipped = dropped = 0
+        for number in range(first, first + count):
+            pool, unstable, empty = self._sequence(number)
+            pools.append(pool)
+            samples, skipped, dropped = samples + len(pool), skipped + unstable, dropped + empty
+            if progress is not None:
+                meter.report(len(pools), samples=samples, skipped=skipped, dropped=dropped, **self._clock.seconds())
+        return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
+
+    def _sequence(self, number: int) -> tuple[Pool, int, int]:
+        """A sequence's samples, the number of unstable scenes before it, and the number of samples dropped."""
+        for attempt in range(ATTEMPTS):
+            index = number * ATTEMPTS + attempt
+            settings = self._sequence_settings(index)
+            scene = draw_scene(settings, self._seed, index, validation=self._validation)
+            random = generator(self._validation, self._seed, index, 1)
+            solver = make_solver(scene, device=self._device)
+            try:
+                with stream(self._device):
+                    guides, targets, moved = self._render(settings, scene, solver, random)
+                solver.check()
+            except WlmError as error:
+                # Memory was checked by `make_solver`, so this can only be an unstable flow.
+                problem = str(error)  # its traceback would keep the solver in memory
+                continue
+            if not all(bool(torch.isfinite(part).all()) for part in (guides, targets, moved)):
+                problem = "NaN or infinity in its images"
+                continue
+            # Negative in validation and test: never a training sequence's.
+            label = -1 - index if self._validation else index
+            sequence = torch.full((len(guides),), label, dtype=torch.int64, device=guides.device)
+            pool = Pool(guides, targets, moved, sequence)
+            covered = pool.covered().cpu().numpy()
+            kept_at_random = random.random(len(covered)) < self._settings.kept_empty
+            keep = np.flatnonzero((covered > self._settings.least_coverage) | kept_at_random)
+            return pool.take(torch.from_numpy(keep).to(pool.device)), attempt, len(pool) - len(keep)
+        raise WlmError(f"{ATTEMPTS} scenes in a row were unstable, the last with: {problem}")
+
+    def _sequence_settings(self, index: int) -> DatasetSettings:
+        """The settings with a training sequence's random number of cells."""
+        settings = self._settings
+        if settings.least_cells is None or self._validation:
+            return settings
+        low, high = np.log(settings.least_cells), np.log(settings.cells)
+        cells = np.exp(generator(self._validation, self._seed, index, 2).uniform(low, high))
+        return settings.model_copy(update={"cells": round(float(cells))})
+
+    def _render(
+        self, settings: DatasetSettings, scene: Scene, solver: Solver, random: np.random.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Simulates a scene and renders its pairs: guides, targets and motion of a `Pool`."""
+        clock, simulation = self._clock, _Simulation(scene, solver)
+        views = settings.views if self._validation else settings.views_a_frame
+        size = (settings.frames * views, 2)
+        pixels = (settings.resolution, settings.resolution)
+        half = {"dtype": torch.float16, "device": self._device}
+        guides = torch.empty((*size, len(GUIDES[settings.guide]), *pixels), **half)
+        targets = torch.empty((*size, len(PLANES), *pixels), **half)
+        moved = torch.empty((*size, *pixels), **half)
+        early = _EARLY if any(source.stop is not None for source in scene.sources) else 1.0
+        with clock("simulate"):
+            simulation.advance(settings.lattice_steps(early * settings.warmup * random.uniform(0.6, 1.6)))
+        for pair in range(settings.frames):
+            shots = self._shots(scene, random)
+            for frame in range(2):
+                if pair or frame:
+                    with clock("simulate"):
+                        simulation.advance(settings.steps if frame else settings.lattice_steps(settings.apart))
+                smoke = volume_of(scene, solver)
+                for number, shot in enumerate(shots, pair * views):
+                    volume = replace(smoke, extinction=smoke.extinction * shot.scale)
+                    with clock("guide"):
+                        march = settings.look(volume.shape, shot.seed + frame)
+                        guides[number, frame] = render_guide(volume, shot.camera, settings.guide, march)
+                    with clock("reference"):
+                        six = bake(volume, shot.camera, step=settings.reference_step, estimate=False)
+                        targets[number, frame] = encode_lightmaps(six)
+                    if frame:
+                        with clock("motion"):
+                            reach = scene.grid.cell * settings.steps
+                            moved[number] = motion(volume, solver.velocity, shot.camera, reach=reach)
+        return guides, targets, moved
+
+    def _shots(self, scene: Scene, random: np.random.Generator) -> list[_Shot]:
+        """The views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
+        settings = self._settings
+        if self._validation:
+            seeds = random.integers(2**30, size=settings.views)
+            cameras = fixed_cameras(settings, scene.grid.origin, scene.grid.size)
+            return [_Shot(camera, self._scale, int(seed)) for camera, seed in zip(cameras, seeds, strict=True)]
+        shots = []
+        turn = random.uniform(0.0, 360.0)
+        for number in range(settings.views_a_frame):
+            rise = np.tan(np.radians(settings.elevation * random.uniform(-1.0, 1.0)))
+            extent = EDGE * random.uniform(*settings.zoom)
+            view = CameraSettings(toward=(0.0, float(rise), 1.0), extent=extent, resolution=settings.resolution)
+            view = view.turned(turn + 360.0 * number / settings.views_a_frame + random.uniform(-20.0, 20.0))
+            low, high = np.log(settings.density_scales)
+            scale = float(np.exp(random.uniform(low, high)))
+            camera = make_camera(view, scene.grid.origin, scene.grid.size)
+            shots.append(_Shot(camera, scale, int(random.integers(2**30))))
+        return shots
+
+
+class _Simulation:
+    """Advances a solver, on a GPU by replaying a graph, and switches a scene's sources on and off in time."""
+
+    def __init__(self, scene: Scene, solver: Solver) -> None:
+        self._solver, self._period = solver, PERIOD * scene.smoke.substeps
+        # In the order of the solver's sources.
+        always: list[Callable[[float], bool]] = [lambda time: True] * len(scene.inlets)
+        self._sources = list(zip(solver.sources, [*always, *(s.active for s in scene.sources)], strict=True))
+        self._seconds, self._done = scene.step, 0
+        moving = any(obstacle.path.moves for obstacle in solver.obstacles)
+        self._graphs = solver.device.is_cuda and not moving
+        self._graph: wp.Graph | None = None
+
+    def advance(self, steps: int) -> None:
+        """Advances by air steps, a multiple of what a graph holds."""
+        for _ in range(steps // self._period):
+            now = self._done * self._seconds
+            active = tuple(source for source, is_active in self._sources if is_active(now))
+            if active != self._solver.sources:
+                self._solver.sources, self._graph = active, None
+            self._step()
+            self._done += self._period
+
+    def _step(self) -> None:
+        # The first steps load the kernels' modules, which a capture must not.
+        if not self._graphs or not self._done:
+            self._solver.step(PERIOD)
+            return
+        if self._graph is None:
+            with no_collection(), wp.ScopedCapture(self._solver.device) as capture:
+                self._solver.step(PERIOD)
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+
+class _Clock:
+    """Seconds of alternating stages; on a GPU by the stream's events, without waiting for it."""
+
+    def __init__(self, device: str) -> None:
+        self._cuda = device != "cpu"
+        self._spans: list[tuple[str, Any, Any]] = []
+        self._total = dict.fromkeys(STAGES, 0.0)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        begin = self._now()
+        yield
+        self._spans.append((stage, begin, self._now()))
+
+    def seconds(self) -> dict[str, float]:
+        """Totals by stage; waits for the device."""
+        for stage, begin, end in self._spans:
+            if self._cuda:
+                end.synchronize()
+            self._total[stage] += begin.elapsed_time(end) / 1000.0 if self._cuda else end - begin
+        self._spans.clear()
+        return dict(self._total)
+
+    def _now(self) -> Any:
+        if not self._cuda:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event

@@ -1,0 +1,70 @@
+"""A trained network as ONNX, for engines."""
+
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from wlm.formats.atomic import atomic_path
+from wlm.formats.hdr_blocks import need
+from wlm.smoke.model import SmokeModel
+from wlm.smoke.network.planes import GUIDES
+from wlm.smoke.network.unet import SixWayNetwork
+
+_OPSET = 20
+
+
+def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
+    """Writes a network as ONNX for one image size: `guide` [1, C, H, W] to `lightmaps` [1, 8, H, W], float32.
+
+    Both are encoded planes, as `wlm.smoke.network.planes` defines them; the lightmaps aren't clamped.
+
+    Args:
+        model: The network.
+        path: The file, whole or not at all.
+        height, width: H and W.
+
+    Returns:
+        The size of the file, bytes.
+
+    Raises:
+        ValueError: A size below 1.
+        WlmError: The extra `onnx` isn't installed, or the file can't be written.
+    """
+    if height < 1 or width < 1:
+        raise ValueError(f"expected at least one pixel, got {height} x {width}")
+    for package in ("onnx", "onnxscript"):
+        need(package, "onnx")
+    # A copy: the exporter changes what it traces.
+    network = SixWayNetwork(model.settings)
+    network.load_state_dict(model.network.state_dict())
+    guide = torch.zeros(1, len(GUIDES[model.settings.guide]), height, width)
+    with atomic_path(path) as temporary, warnings.catch_warnings(), _quiet(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network.eval(),
+            (guide,),
+            temporary,
+            input_names=["guide"],
+            output_names=["lightmaps"],
+            opset_version=_OPSET,
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+        return temporary.stat().st_size
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silences the exporter's notes on packages that these networks don't need."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

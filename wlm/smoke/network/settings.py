@@ -1,0 +1,300 @@
+"""Settings of the network's training: samples, losses, optimiser; and the units in which scenes are drawn."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from wlm.smoke.network.planes import GUIDES
+from wlm.system import Settings
+from wlm_kernels.smoke.settings import March
+
+EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
+"""The box's edge in metres; the fastest air in metres a second, and the same speed in cells per air step."""
+
+PERIOD = 2
+"""Solver steps that one CUDA graph holds: after two, the solver's buffers have swapped back."""
+
+GuideKind = Literal["paper", "front", "sides", "six"]
+"""Keys of `planes.GUIDES`."""
+
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+_Positive = Annotated[float, Field(gt=0.0)]
+_Range = tuple[_Positive, _Positive]
+
+
+class NetworkSettings(BaseModel):
+    """The network's shape.
+
+    Attributes:
+        width: Channels of the first level; each level has twice those of the one before, at half the resolution.
+        levels: Levels of the U-Net, the lowest included.
+        adapters: Whether each of the four groups of planes has a NAFBlock; otherwise all share one.
+        emission: Whether emission is predicted; otherwise it is 0.
+        guide: Kind of the guiding map.
+        depth: Whether the guide's depth, its last plane, is read.
+        stem: Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the
+            network at half the resolution, for a quarter of the work.
+        residual: Whether the filtered guide is added to the output.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int = Field(16, ge=8, le=64, multiple_of=8)
+    levels: int = Field(5, ge=2, le=6)
+    adapters: bool = True
+    emission: bool = True
+    guide: GuideKind = "paper"
+    depth: bool = True
+    stem: Literal[1, 2] = 1
+    residual: bool = True
+
+    @property
+    def channels(self) -> int:
+        """Planes of the guide that are read."""
+        return len(GUIDES[self.guide]) - (not self.depth)
+
+    @property
+    def multiple(self) -> int:
+        """Pixels: images are padded with zeros to multiples of this."""
+        return self.stem * 2 ** (self.levels - 1)
+
+
+class DatasetSettings(BaseModel):
+    """How samples are made. Lengths are shares of the box's edge; times are multiples of the time to cross it.
+
+    Attributes:
+        cells: Velocity cells along each edge of the box.
+        least_cells: Fewest cells of a training sequence, whose number is drawn log-uniformly between this and
+            `cells`: coarse grids give smooth smoke, of which a guiding map's steps miss less. None, and in
+            validation: always `cells`.
+        refine: Density voxels along the edge of a cell.
+        substeps: Air steps per smoke step; even, as CUDA graphs need it.
+        resolution: Pixels along an image's edges.
+        frames: Frame pairs taken from a sequence.
+        views, arc: Number of fixed views, spread evenly over `arc` degrees; the paper has 9 over 90.
+        views_a_frame: Random views of each training pair.
+        elevation: Largest angle of a random view above or below the horizontal, degrees.
+        zoom: Smallest and largest edge of a random view's image.
+        guide: Kind of guiding map.
+        guide_step: Ray step h of the guiding map; the paper's is 10 of 400 voxels.
+        guide_spacing: Distance of the nodes that hold the light from the sides, for guides with separate lights; None:
+            `guide_step`.
+        jitter: Share of a step by which a pixel's samples are shifted.
+        surface: Optical depth across the box, at one voxel's density, from which smoke counts as a surface.
+        reference_step: Step of the march that renders the target lightmaps, in voxels.
+        extinction: Optical depth of density 1 across the box.
+        density_scales: Smallest and largest random factor on the extinction.
+        sequences: Sequences of a round.
+        hot: Share of sequences with emission.
+        moving: Share of sequences with obstacles in which one moves; such a solver waits for the device at each step.
+        warmup: Mean time before a sequence's first pair.
+        interval: Time between the two frames of a pair, rounded to whole steps.
+        apart: Time between two pairs.
+        least_coverage: Share of the image below which a frame counts as almost empty.
+        kept_empty: Share of almost empty frames that are kept.
+        validation_sequences, validation_seed: The validation set, by which the best network is selected.
+        test_seed: Seed of an equally large test set, which is held out from model selection.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    cells: int = Field(50, ge=16, le=512)
+    least_cells: int | None = Field(None, ge=16, le=512)
+    refine: int = Field(4, ge=1, le=16)
+    substeps: int = Field(4, ge=2, le=16, multiple_of=2)
+    resolution: int = Field(256, ge=8, le=4096)
+    frames: int = Field(8, ge=1, le=1000)
+    views: int = Field(9, ge=1, le=360)
+    arc: float = Field(90.0, gt=0.0, le=360.0)
+    views_a_frame: int = Field(3, ge=1, le=64)
+    elevation: float = Field(20.0, ge=0.0, le=89.0)
+    zoom: _Range = (0.65, 1.2)
+    guide: GuideKind = "paper"
+    guide_step: _Positive = 1.0 / 40.0
+    guide_spacing: _Positive | None = None
+    jitter: _Share = 1.0
+    surface: float = Field(4.0, ge=0.0)
+    reference_step: _Positive = 1.0
+    extinction: _Positive = 25.0
+    density_scales: _Range = (0.5, 2.0)
+    sequences: int = Field(14, ge=1, le=10000)
+    hot: _Share = 0.25
+    moving: _Share = 0.1
+    warmup: float = Field(1.3, ge=0.0, le=100.0)
+    interval: _Positive = 0.01
+    apart: float = Field(0.12, ge=0.0, le=100.0)
+    least_coverage: _Share = 0.02
+    kept_empty: _Share = 0.05
+    validation_sequences: int = Field(4, ge=1, le=1000)
+    validation_seed: int = Field(2026, ge=0)
+    test_seed: int = Field(2027, ge=0)
+
+    @model_validator(mode="after")
+    def _check(self) -> "DatasetSettings":
+        if self.least_cells is not None and self.least_cells > self.cells:
+            raise PydanticCustomError("range", "least_cells: expected at most cells")
+        for name in ("zoom", "density_scales"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise PydanticCustomError("range", "{name}: expected the least before the most", {"name": name})
+        if self.test_seed == self.validation_seed:
+            raise PydanticCustomError("seed", "test_seed: expected another than validation_seed")
+        if self.guide == "paper" and self.guide_spacing is not None:
+            raise PydanticCustomError("spacing", "guide_spacing: expected none with the paper's guide, found one")
+        return self
+
+    @property
+    def steps(self) -> int:
+        """Air steps between the two frames of a pair, at least one CUDA graph's."""
+        return max(self.lattice_steps(self.interval), PERIOD * self.substeps)
+
+    @property
+    def pixels(self) -> tuple[float, float]:
+        """Fewest and most pixels along the box's edge in training images."""
+        low, high = self.zoom
+        return self.resolution / high, self.resolution / low
+
+    def lattice_steps(self, crossings: float) -> int:
+        """Converts a time to air steps, rounded to whole CUDA graphs."""
+        graph = PERIOD * self.substeps
+        return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
+
+    def look(self, shape: Sequence[int], seed: int = 0) -> March:
+        """The march of a guiding map through a grid.
+
+        Args:
+            shape: Voxels along x, y, z.
+            seed: Of the jitter.
+        """
+        longest = max(shape)
+        spacing = None if self.guide_spacing is None else self.guide_spacing * longest
+        threshold = self.surface / longest
+        return March(self.guide_step * longest, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
+
+
+class LossSettings(BaseModel):
+    """Weights of eq. 10, of which the paper gives none. A part of weight 0 isn't computed; one must be above 0.
+
+    Attributes:
+        mse: Weight of the reconstruction.
+        srgb: Whether the reconstruction compares light in sRGB, as eq. 7 does; otherwise linear light, in which errors
+            in dark places count for less.
+        temporal: Weight of the temporal part, for which a batch is half as many pairs of frames.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    mse: float = Field(1.0, ge=0.0)
+    srgb: bool = True
+    temporal: float = Field(0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> "LossSettings":
+        if not self.parts:
+            raise PydanticCustomError("weights", "expected mse or temporal above 0, found 0 for both")
+        return self
+
+    @property
+    def pairs(self) -> bool:
+        """Whether a step needs both frames of a sample."""
+        return self.temporal > 0
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that are computed."""
+        return tuple(name for name in ("mse", "temporal") if getattr(self, name) > 0)
+
+
+class TrainSettings(BaseModel):
+    """The optimisation.
+
+    Attributes:
+        rounds: Number of pools, one after the other.
+        steps: Steps per round.
+        batch: Frames per step; with a temporal loss, twice the number of pairs.
+        rate: Adam's highest learning rate; the paper's is 1e-3.
+        floor: Share of `rate` at the end of half a cosine.
+        warmup: Steps over which the rate rises from 0.
+        average: Decay of the running mean of the weights, which is what is validated and saved.
+        mirror: Random mirrors of samples: left to right ("sides"), and upside down too ("both"). Both are exact: the
+            planes of opposite lights are exchanged.
+        half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
+        graph: Whether CUDA replays a step from a graph.
+        crop: Edge in pixels of the random crop, which contains smoke, that a step learns from; None: whole images.
+        validate_every: Rounds between validations; the last round is always validated.
+        losses: Weights of the loss's parts.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    rounds: int = Field(20, ge=1)
+    steps: int = Field(1000, ge=1)
+    batch: int = Field(12, ge=2, multiple_of=2)
+    rate: float = Field(1e-3, gt=0.0, le=1.0)
+    floor: float = Field(0.01, ge=0.0, le=1.0)
+    warmup: int = Field(100, ge=0)
+    average: float = Field(0.999, ge=0.0, lt=1.0)
+    mirror: Literal["none", "sides", "both"] = "sides"
+    half: bool = True
+    graph: bool = True
+    crop: int | None = Field(None, ge=16, multiple_of=16)
+    validate_every: int = Field(1, ge=1)
+    losses: LossSettings = LossSettings()
+
+    @property
+    def total(self) -> int:
+        """Steps of all rounds."""
+        return self.rounds * self.steps
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step, from 0."""
+        rise = min(1.0, (step + 1) / (self.warmup + 1))
+        return rise * self.rate * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * step / self.total)))
+
+
+class Profile(Settings):
+    """What `configs/smoke-network-*.yaml` hold.
+
+    Attributes:
+        name: Shown in reports.
+        network, training, dataset: Settings of the parts.
+    """
+
+    FILES: ClassVar[str] = "smoke-network"
+
+    network: NetworkSettings = NetworkSettings()
+    training: TrainSettings = TrainSettings()
+    dataset: DatasetSettings = DatasetSettings()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.network.guide != self.dataset.guide:
+            kinds = {"network": self.network.guide, "dataset": self.dataset.guide}
+            message = "dataset.guide: expected {network}, which network.guide is, found {dataset}"
+            raise PydanticCustomError("guide", message, kinds)
+        if (self.training.crop or 0) > self.dataset.resolution:
+            sizes = {"most": self.dataset.resolution, "crop": self.training.crop}
+            message = "training.crop: expected at most {most}, which dataset.resolution is, found {crop}"
+            raise PydanticCustomError("crop", message, sizes)
+        return self
+
+    def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
+        """As `Settings.override`, inside the parts too: `{"training": {"steps": 500}}` leaves their other settings.
+
+        Raises:
+            WlmError: Unknown or out of range.
+        """
+        return super().override(_merged(self.model_dump(), values), prefix) if values else self
+
+
+def _merged(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with some values replaced, in nested mappings too."""
+
+    def value_of(name: str) -> Any:
+        old, new = settings.get(name), values[name]
+        return _merged(old, new) if isinstance(old, Mapping) and isinstance(new, Mapping) else new
+
+    return {**settings, **{name: value_of(name) for name in values}}

@@ -1,0 +1,270 @@
+"""Optical depths towards lights at the nodes of a lattice, which all pixels share.
+
+For a light at infinity the lattice has lines that run towards the light. The optical depth between two neighbouring
+nodes of a line is marched once; sums along the line from both of its ends are the depths to the light and to the
+opposite light. This takes as many samples as there are nodes, where a march from each node would take a line of
+samples per node. A lattice has one pair of opposite lights along its first axis, or two pairs along its first and
+second axes. The lattice of a point light follows the grid's axes, and each node marches to the light separately, since
+no two of its rays are parallel.
+
+Units and sampling are those of `march`.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, sample, size_of, smoke_struct
+from wlm_kernels.smoke.settings import March
+
+MOST_NODES = 2**28
+"""Largest number of nodes: the lattice of a long thin box seen along a diagonal has far more nodes than the box has
+voxels."""
+
+_MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
+_AT_ONCE = wp.constant(8)  # nodes of a line that a thread adds up at a time
+_LEAST_SPACING = 0.25  # voxels between nodes
+_ROUNDING = 1e-6  # share by which a part may be longer than the step, so that rounding adds no part
+
+_Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
+
+
+@wp.struct
+class Lattice:
+    """Nodes at `origin` plus `low` plus multiples of `gap` along the rows of `axes`, in voxels.
+
+    A point light also has its `place` and the `radius` within which its irradiance is constant.
+    """
+
+    axes: wp.mat33
+    origin: wp.vec3
+    low: wp.vec3
+    gap: wp.vec3
+    place: wp.vec3
+    point: int
+    radius: float
+
+
+@wp.func
+def axis(lattice: Lattice, n: int) -> wp.vec3:
+    """Direction of an axis of the lattice."""
+    return wp.vec3(lattice.axes[n, 0], lattice.axes[n, 1], lattice.axes[n, 2])
+
+
+@wp.func
+def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
+    """Optical depths to the light and to the opposite light, trilinear between nodes."""
+    inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
+    return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
+
+
+@wp.func
+def _node(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
+    at = lattice.low + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), lattice.gap)
+    return lattice.origin + wp.transpose(lattice.axes) * at
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _add_up(
+    # in:
+    gaps: wp.array4d[float],
+    # out:
+    nodes: wp.array4d[wp.vec2],
+):
+    """Depths from each node of a line to both of its ends; the light is at the last node."""
+    pair, line, k = wp.tid()
+    first = pair == 0  # whether the line runs along the first axis
+    last = wp.where(first, nodes.shape[0], nodes.shape[1]) - 1
+    if line >= wp.where(first, nodes.shape[1], nodes.shape[0]):
+        return
+    ahead = float(0.0)
+    behind = float(0.0)
+    nodes[wp.where(first, last, line), wp.where(first, line, last), k, pair][0] = 0.0
+    nodes[wp.where(first, 0, line), wp.where(first, line, 0), k, pair][1] = 0.0
+    # From both ends, several nodes at a time: loads wait for the stores before them.
+    for begin in range(0, last, _AT_ONCE):
+        forth = _Several()
+        back = _Several()
+        for m in range(_AT_ONCE):
+            n = wp.min(begin + m, last - 1)
+            o = last - 1 - n
+            forth[m] = gaps[wp.where(first, n, line), wp.where(first, line, n), k, pair]
+            back[m] = gaps[wp.where(first, o, line), wp.where(first, line, o), k, pair]
+        for m in range(_AT_ONCE):
+            n = begin + m
+            if n < last:
+                behind += forth[m]
+                ahead += back[m]
+                o = last - 1 - n
+                nodes[wp.where(first, n + 1, line), wp.where(first, line, n + 1), k, pair][1] = behind
+                nodes[wp.where(first, o, line), wp.where(first, line, o), k, pair][0] = ahead
+
+
+@dataclass(frozen=True)
+class _Kernels:
+    measure: wp.Kernel
+    reach: wp.Kernel
+
+
+@functools.cache
+def depth_kernels(dtype: Any) -> _Kernels:
+    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
+    smoke_type = smoke_struct(dtype)
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def measure(
+        # in:
+        smoke: smoke_type,
+        lattice: Lattice,
+        parts: wp.vec2i,
+        # out:
+        gaps: wp.array4d[float],
+    ):
+        """Optical depth between a node and its neighbour along the axis of each pair of lights."""
+        i, j, k = wp.tid()
+        begin = _node(lattice, i, j, k)
+        size = size_of(smoke.density)
+        for pair in range(gaps.shape[3]):
+            tau = float(0.0)
+            if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[0], gaps.shape[1]) - 1:
+                along = axis(lattice, pair)
+                d = lattice.gap[pair] / float(parts[pair])
+                for n in range(parts[pair]):
+                    p = begin + (float(n) + 0.5) * d * along
+                    # Nodes of a turned lattice lie far outside the grid.
+                    low = wp.min(p) >= -0.5
+                    if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
+                        tau += d * sample(smoke, p)
+            gaps[i, j, k, pair] = smoke.extinction * tau
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def reach(
+        # in:
+        smoke: smoke_type,
+        lattice: Lattice,
+        step: float,
+        # out:
+        nodes: wp.array3d[wp.vec2],
+    ):
+        """Optical depth from a node to a point light."""
+        i, j, k = wp.tid()
+        p = _node(lattice, i, j, k)
+        away = wp.length(lattice.place - p)
+        toward = wp.normalize(lattice.place - p)
+        span = clip(size_of(smoke.density), p, toward)
+        first = wp.max(span[0], 0.0)
+        last = wp.min(span[1], away)
+        tau = float(0.0)
+        if last > first:
+            count = int(wp.ceil((last - first) / step))
+            d = (last - first) / float(count)
+            for n in range(count):
+                tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
+        nodes[i, j, k] = wp.vec2(smoke.extinction * tau, 0.0)
+
+    return _Kernels(measure, reach)
+
+
+def parts_of(length: float, step: float) -> int:
+    """Number of equal parts of a length that are no longer than a step, at least 1."""
+    return max(math.ceil(length / step - _ROUNDING), 1)
+
+
+def make_lattice(
+    shape: Sequence[int],
+    axes: Sequence[Sequence[float]],
+    spacing: float,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    most: int = MOST_NODES,
+) -> tuple[Lattice, tuple[int, ...]]:
+    """Makes a lattice over the grid's box and half a voxel around it.
+
+    Args:
+        shape: Voxels along x, y, z.
+        axes: The three axes, orthogonal and of length 1.
+        spacing: Largest distance between nodes in voxels; at least a quarter of a voxel is used.
+        origin: Origin of the lattice's coordinates, in voxels.
+        most: Largest number of gaps; the spacing grows until it suffices.
+
+    Returns:
+        The lattice, and its nodes along each axis.
+    """
+    extents = [sum((n + 1) * abs(a) for n, a in zip(shape, row, strict=True)) for row in axes]
+    spacing = max(spacing, _LEAST_SPACING)
+    while math.prod(gaps := [parts_of(extent, spacing) for extent in extents]) > most:
+        spacing *= 1.1
+    lattice = Lattice()
+    lattice.axes = wp.mat33(*(value for row in axes for value in row))
+    lattice.origin = wp.vec3(*origin)
+    lows = (
+        sum(min(-0.5 * a, (n + 0.5) * a) - o * a for n, o, a in zip(shape, origin, row, strict=True)) for row in axes
+    )
+    lattice.low = wp.vec3(*lows)
+    lattice.gap = wp.vec3(*(extent / n for extent, n in zip(extents, gaps, strict=True)))
+    return lattice, tuple(n + 1 for n in gaps)
+
+
+def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
+    """Computes the depths of lights at infinity.
+
+    Args:
+        medium: The smoke.
+        lattice, counts: From `make_lattice`.
+        pairs: Pairs of opposite lights: 1 along the first axis, 2 along the first and the second.
+        light_step: Longest step between two nodes, in voxels.
+
+    Returns:
+        vec2 [X, Y, Z, pairs], depths to the light at the end of an axis and to the opposite light.
+    """
+    parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
+    gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)
+    kernel = depth_kernels(medium.density.dtype).measure
+    wp.launch(kernel, tuple(counts), [medium.smoke, lattice, parts], [gaps], device=medium.device)
+    lines = max(counts[:2]) if pairs == 2 else counts[1]
+    wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
+    return nodes
+
+
+def spacing_of(march: March) -> tuple[float, float]:
+    """Largest distance between nodes, and longest step between them."""
+    spacing = march.step if march.spacing is None else march.spacing
+    return spacing, spacing if march.light_step is None else march.light_step
+
+
+def reach(medium: Medium, place: Sequence[float], radius: float | None, march: March) -> tuple[Lattice, wp.array]:
+    """Computes optical depths from the smoke to a light.
+
+    Args:
+        medium: The smoke.
+        place: Direction to a light at infinity, of length 1, or position of a point light in voxels.
+        radius: Radius of a point light in voxels, within which its irradiance is constant; None: light at infinity.
+        march: Its spacing and light_step; a point light has at most 2^24 nodes.
+
+    Returns:
+        A lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light. A point light has no
+        opposite light; its second depth is 0.
+    """
+    spacing, step = spacing_of(march)
+    shape = medium.density.shape
+    if radius is None:
+        lattice, counts = make_lattice(shape, _axes(place), spacing)
+        return lattice, add_up(medium, lattice, counts, 1, step).reshape(counts)
+    lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
+    lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
+    nodes = medium.buffer(counts, wp.vec2)
+    kernel = depth_kernels(medium.density.dtype).reach
+    wp.launch(kernel, counts, [medium.smoke, lattice, step], [nodes], device=medium.device)
+    return lattice, nodes
+
+
+def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
+    """The direction to a light, and two directions across it (Duff et al. 2017)."""
+    x, y, z = toward
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return [(x, y, z), (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)]
