@@ -8,7 +8,7 @@ import pytest
 import torch
 from builders.atlas_meshes import charts, constant, sheet, soft, triangle
 
-import wlm.atlas.layout
+import wlm.atlas.tiles.layout
 import wlm.atlas.model
 import wlm.atlas.weights
 from wlm.atlas.coverage import covered_texels
@@ -16,7 +16,7 @@ from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import compare
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
-from wlm.atlas.layout import layout, sizes_of
+from wlm.atlas.tiles.layout import layout, sizes_of
 from wlm.atlas.model import COLOUR_BITS, NO_BLOCKS, Profile, tile_counts, unpack_entries
 from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
@@ -29,8 +29,8 @@ NAMES = ("half", "standard", *CODECS)
 
 def psnr(model, mesh) -> float:
     """Of the texels in the mask."""
-    target = mesh.lightmap[mesh.mask].astype(np.float64)
-    error = Decoder(model).lightmap(mesh)[mesh.mask] - target
+    target = mesh.sheets[0].lightmap[mesh.sheets[0].mask].astype(np.float64)
+    error = Decoder(model).lightmap(mesh)[mesh.sheets[0].mask] - target
     return 10 * np.log10(np.ptp(target) ** 2 / np.mean(error**2))
 
 
@@ -38,10 +38,10 @@ def downsampled(mesh, share: float) -> float:
     """PSNR of the texels of a smaller lightmap at as many bits."""
     from benchmarks.rivals.atlas import downsampling
 
-    row, column = np.nonzero(mesh.mask)
-    uv = torch.tensor(np.stack([column + 0.5, row + 0.5], 1) / mesh.mask.shape[::-1], dtype=torch.float32)
+    row, column = np.nonzero(mesh.sheets[0].mask)
+    uv = torch.tensor(np.stack([column + 0.5, row + 0.5], 1) / mesh.sheets[0].mask.shape[::-1], dtype=torch.float32)
     decoded = downsampling(mesh, share).decoded(uv, torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3))
-    target = mesh.lightmap[mesh.mask].astype(np.float64)
+    target = mesh.sheets[0].lightmap[mesh.sheets[0].mask].astype(np.float64)
     return 10 * np.log10(np.ptp(target) ** 2 / np.mean((decoded.numpy() - target) ** 2))
 
 
@@ -51,18 +51,18 @@ def checked(model, mesh) -> np.ndarray:
     texel_bits = {"half": 64, "rgb9e5": 32, "mixed": 32}
     bits = rows * columns * texel_bits.get(model.colour, 0) or -(-rows // 4) * -(-columns // 4) * 128
     bits += len(model.blocks) * 128 * (model.colour == "mixed")
-    share = (bits + model.lut.size * 16) / (mesh.mask.size * 48)
+    share = (bits + model.lut.size * 16) / (mesh.sheets[0].mask.size * 48)
     assert share == pytest.approx(1.0 - model.compression_ratio) and share <= model.profile.budget
     assert model.texels.dtype == np.float16 and np.isfinite(model.texels).all() and (model.texels >= 0).all()
     if model.method == "tiles":
         first, size, blocks = unpack_entries(model.lut, model.first_block_code)
         last = np.where(blocks, model.block_texels.shape[1::-1], model.texels.shape[1::-1])
         assert (first + size <= last).all()
-        assert model.lut.shape[:2] == tile_counts(*mesh.mask.shape, model.profile.tile)
+        assert model.lut.shape[:2] == tile_counts(*mesh.sheets[0].mask.shape, model.profile.tile)
     else:
         assert not model.lut.size and not model.uv.size
     decoded = Decoder(model).lightmap(mesh)
-    assert np.isfinite(decoded).all() and not decoded[~mesh.mask].any()
+    assert np.isfinite(decoded).all() and not decoded[~mesh.sheets[0].mask].any()
     return decoded
 
 
@@ -97,7 +97,7 @@ def test_room_for_all_is_exact():
     mesh = sheet(height=36, width=43)
     model = compress(mesh, HALF, budget=1.8, views=0, border=1.0)
     decoded = checked(model, mesh)
-    np.testing.assert_allclose(decoded, mesh.lightmap, rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(decoded, mesh.sheets[0].lightmap, rtol=2e-3, atol=2e-3)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -106,7 +106,7 @@ def test_one_colour(name: str):
     mesh, exact = charts(constant(0.7, 0.2, 0.0)), name == "half"
     model = compress(mesh, name, **FEW, budget=0.3)
     error = {"rtol": 6e-4, "atol": 1e-6} if exact else {"rtol": 0.02, "atol": 2e-3}
-    np.testing.assert_allclose(checked(model, mesh)[mesh.mask], mesh.lightmap[mesh.mask], **error)
+    np.testing.assert_allclose(checked(model, mesh)[mesh.sheets[0].mask], mesh.sheets[0].lightmap[mesh.sheets[0].mask], **error)
     assert not exact or model.report["samples"] == model.report["tiles"] == model.report["constant tiles"]
 
 
@@ -137,7 +137,7 @@ def test_a_triangle_below_a_texel():
     image = np.full((16, 16, 3), 0.25, np.float32)
     mesh = from_arrays(np.insert(corner, 2, 0.0, 1), np.array([[0, 1, 2]]), corner, image, name="speck")
     decoded = checked(compress(mesh, HALF), mesh)
-    np.testing.assert_allclose(decoded[mesh.mask], 0.25)
+    np.testing.assert_allclose(decoded[mesh.sheets[0].mask], 0.25)
 
 
 @pytest.mark.parametrize("name", ["half", "cascade"])
@@ -155,10 +155,10 @@ def test_charts_that_overlap_have_no_area_or_one_texel(name: str):
     image = np.stack([1 + np.sin(4 * column), 1 + np.cos(3 * row), 1 + column * row], 2).astype(np.float32)
     mesh = from_arrays(position, np.concatenate([faces + 4 * i for i in range(4)]), uv, image)
     text = " ".join(mesh.warnings)
-    assert "their UVs overlap" in text and "without area" in text and mesh.mask[32, 32]
+    assert "their UVs overlap" in text and "without area" in text and mesh.sheets[0].mask[32, 32]
     extra = {"steps": 20, "resolution": 64} if name == "cascade" else {"budget": 0.5}
     decoded = Decoder(compress(mesh, name, views=2, **extra)).lightmap(mesh)
-    error = np.abs(decoded - image)[mesh.mask]
+    error = np.abs(decoded - image)[mesh.sheets[0].mask]
     assert error.max() < 0.5 and np.sqrt(np.square(error).mean()) < 0.05
 
 
@@ -167,7 +167,7 @@ def test_small_lightmaps(texels: tuple[int, int]):
     """Of one tile, or of tiles a texel high; less than a tile is better as it is."""
     mesh = sheet(soft, *texels)
     model = compress(mesh, HALF, budget=2.0, fallback=True)
-    np.testing.assert_allclose(checked(model, mesh), mesh.lightmap, atol=3e-3)
+    np.testing.assert_allclose(checked(model, mesh), mesh.sheets[0].lightmap, atol=3e-3)
     assert model.method == "plain" or texels != (4, 4)
 
 
@@ -183,7 +183,7 @@ def test_bright_light(name: str, brightest: float):
     model = compress(mesh, name, **FEW)
     decoded = checked(model, mesh)
     assert psnr(model, mesh) > 30.0
-    assert decoded.max() == pytest.approx(mesh.lightmap.max(), rel=0.1)
+    assert decoded.max() == pytest.approx(mesh.sheets[0].lightmap.max(), rel=0.1)
 
 
 def test_a_spike_stays_in_its_tile():
@@ -204,15 +204,15 @@ def test_parts_that_no_view_shows_stay_in_range(views: int):
     profile = HALF.override({"views": views})
     weight = weights(FineGrid(mesh, "cpu"), profile, 0).numpy()
     decoded = checked(compress(mesh, profile), mesh)
-    low, high = mesh.lightmap[mesh.mask].min(), mesh.lightmap[mesh.mask].max()
-    assert decoded[mesh.mask].min() >= low - 0.3 * (high - low) and decoded.max() <= high + 0.3 * (high - low)
+    low, high = mesh.sheets[0].lightmap[mesh.sheets[0].mask].min(), mesh.sheets[0].lightmap[mesh.sheets[0].mask].max()
+    assert decoded[mesh.sheets[0].mask].min() >= low - 0.3 * (high - low) and decoded.max() <= high + 0.3 * (high - low)
     # The chart within lies in the lower row, third from the left.
-    row, column = np.nonzero(mesh.mask)
+    row, column = np.nonzero(mesh.sheets[0].mask)
     within = (row >= 48) & (column >= 64) & (column < 96)
-    error = np.abs(decoded - mesh.lightmap).mean(2)[row, column]
+    error = np.abs(decoded - mesh.sheets[0].lightmap).mean(2)[row, column]
     assert error[within].mean() < 0.1 * (high - low)
     coarse = weight.reshape(96, 2, 128, 2).sum((1, 3))[row, column]
-    centre = covered_texels(mesh.uv, mesh.triangle, 96, 128)[row, column] > 0
+    centre = covered_texels(mesh.sheets[0].uv, mesh.sheets[0].triangle, 96, 128)[row, column] > 0
     assert (coarse[centre] > 0).all() and centre.mean() > 0.9
     if views:
         assert coarse[within].mean() < 0.2 * coarse[~within].mean()
@@ -238,7 +238,7 @@ def test_weights_follow_the_views_and_the_borders():
 @pytest.mark.parametrize("profile", ["standard", "cascade"])
 def test_the_coverage_by_triangles_is_computed_once(profile, monkeypatch):
     """Of quarters of texels and of texels; the comparison with a plain lightmap shares the fit's grid."""
-    calls, names = [], ("covered_on", "covered_on", "mesh_charts", "texel_triangles")
+    calls, names = [], ("covered_on", "covered_on", "sheet_charts", "texel_triangles")
 
     def counted(name):
         function = getattr(wlm.atlas.weights, name)
@@ -326,7 +326,7 @@ def test_tiles_in_a_large_texture_of_blocks(monkeypatch):
     mesh = sheet(height=90, width=70)
     small = compress(mesh, "bc6h", **FEW)
     assert small.first_block_code == NO_BLOCKS
-    for module in (wlm.atlas.layout, wlm.atlas.model):
+    for module in (wlm.atlas.tiles.layout, wlm.atlas.model):
         monkeypatch.setattr(module, "MOST_SIZE", 32)
     large = compress(mesh, "bc6h", **FEW)
     assert large.first_block_code == 0 and max(large.texels.shape) > 32
@@ -398,7 +398,7 @@ def test_on_every_device(device: str):
 
 def test_light_that_a_small_budget_loses_is_said():
     mesh = sheet()
-    lightmap = mesh.lightmap.copy()
+    lightmap = mesh.sheets[0].lightmap.copy()
     lightmap[20, 20] = 1e4
     report = compress(replace(mesh, lightmap=lightmap), "half", views=0, budget=0.02).report
     first, second = report["lost light"]

@@ -13,17 +13,17 @@ from builders.gltf_scene import Thing, box, write_scene
 import wlm
 from wlm.atlas.data import from_arrays
 from wlm.atlas.scene import sharing
-from wlm.atlas.scene.data import load_scene, scene_of
-from wlm.atlas.scene.decode import Decoder
-from wlm.atlas.scene.description import read_description
-from wlm.atlas.scene.detail import peaks_of, scales, variation
-from wlm.atlas.scene.evaluation import compare_scene, evaluate_scene
-from wlm.atlas.scene.exact import decode64
+from wlm.atlas.data import load_scene, scene_of
+from wlm.atlas.decode import Decoder
+from wlm.atlas.listing import read_listing
+from wlm.atlas.shared.weights import peaks_of, scales, variation
+from wlm.atlas.evaluation import compare_scene, evaluate_scene
+from wlm.atlas.exact import decode64
 from wlm.atlas.scene.exporter import export_scene, read_scene
-from wlm.atlas.scene.fit import compress_scene
-from wlm.atlas.scene.mixture import find_mixtures, moments
-from wlm.atlas.scene.model import SceneProfile, pack_tiles, unpack_tiles
-from wlm.atlas.scene.seen import scene_weights
+from wlm.atlas.shared.fit import compress_scene
+from wlm.atlas.shared.mixture import find_mixtures, moments
+from wlm.atlas.model import SceneProfile, pack_tiles, unpack_tiles
+from wlm.atlas.shared.weights import scene_weights
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.formats.exr import write_exr
 
@@ -140,9 +140,9 @@ def test_mips(scene, model, device):
     row, column = np.mgrid[:12, :12].reshape(2, -1)
     uv = torch.from_numpy(np.stack([(column + 0.5) / 12, (row + 0.5) / 12], 1).astype(np.float32)).to(device)
     for number, sheet in enumerate(scene.sheets):
-        mask = sheet.mesh.mask.reshape(12, 4, 12, 4).sum((1, 3))
+        mask = sheet.mesh.sheets[0].mask.reshape(12, 4, 12, 4).sum((1, 3))
         for state, frame in enumerate(sheet.frames):
-            means = (frame * sheet.mesh.mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3)) / mask.clip(min=1)[
+            means = (frame * sheet.mesh.sheets[0].mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3)) / mask.clip(min=1)[
                 ..., None
             ]
             which = torch.full((144,), number, device=device)
@@ -176,7 +176,7 @@ def test_states_count_by_what_they_would_lose(scene):
     varied = scene_of([each.mesh for each in scene.sheets], frames)
     peak = peaks_of(varied)
     varies = variation(varied, peak, "cpu")
-    unit = scales(varies, [each.mesh.mask for each in scene.sheets]) * peak
+    unit = scales(varies, [each.mesh.sheets[0].mask for each in scene.sheets]) * peak
     assert unit[1] == pytest.approx(0.5 * unit[0], rel=1e-2) and unit[2] > 3.0 * unit[0]
 
 
@@ -289,7 +289,7 @@ def test_instances_with_a_rectangle_each(tmp_path, convention):
     assert scene.states == ("day", "night") and scene.uv_set == 1 and sheet.frames.shape == (2, SIDE, SIDE, 3)
     assert [(each.label, each.scale_offset[2:]) for each in scene.objects] == [("left", (0, 0)), ("right", (0.5, 0))]
     uv = box((0, 0, 0), (2, 2, 2))[2] * [0.5, 0.75]
-    np.testing.assert_allclose(np.sort(sheet.mesh.uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
+    np.testing.assert_allclose(np.sort(sheet.mesh.sheets[0].uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
     assert len(scene.blocker) == 12  # the rock has no lightmap
     model = compress_scene(scene, views=1, budget=0.3)
     paths = export_scene(model, tmp_path / "out", scene)
@@ -322,7 +322,7 @@ def test_materials_own_lightmaps(tmp_path):
     scene = load_scene(path)
     assert [each.scale_offset for each in scene.objects] == [(1, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
     assert scene.sheets[0].name == "baked" and scene.states == ("light",)
-    inside = scene.sheets[0].mesh.mask
+    inside = scene.sheets[0].mesh.sheets[0].mask
     np.testing.assert_allclose(scene.sheets[0].frames[0][inside], 2 * lights(0)[0][inside], rtol=1e-3)
 
 
@@ -344,7 +344,7 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
     godot = {"convention": "godot", "objects": [{"path": "a", "uv_scale": [1, 2]}]}
     assert "objects[0].uv_scale: expected 4 numbers, found [1, 2]" in told(**godot)
     lists.write_text(json.dumps({"lightmaps": [{"time_hours": 6, "file": "day.exr"}], "mesh": "scene.glb"}))
-    assert read_description(lists).states == ("6 h",)
+    assert read_listing(lists).states == ("6 h",)
     write_exr(tmp_path / "small.exr", lights(0)[0][:20])
     assert "small.exr: expected 48x48 texels as the sheet's other lightmaps, found 48x20" in told(
         sheets=[{"files": ["day.exr", "small.exr"]}]

@@ -10,7 +10,7 @@ from wlm.atlas import layout as allocation
 from wlm.atlas import tiles as grid
 from wlm.atlas.colour import quantise, stored
 from wlm.atlas.decode import Decoder
-from wlm.atlas.layout import Size
+from wlm.atlas.tiles.layout import Size
 from wlm.atlas.model import (
     FIRST_BLOCK_CODE,
     MOST_SIZE,

@@ -21,7 +21,7 @@ def baked(uv: np.ndarray, dilated: bool = False) -> np.ndarray:
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE
     level = 1.0 + np.floor(3 * column) + 3 * np.floor(2 * row)  # of the chart's cell
     light = (level * (1.0 + 0.2 * np.sin(9 * column) * np.cos(7 * row)))[..., None] * [1.0, 0.8, 0.6]
-    return light if dilated else light * mesh.mask[..., None]
+    return light if dilated else light * mesh.sheets[0].mask[..., None]
 
 
 def shifted(uv: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
     scene = write_scene(tmp_path / "a.gltf", things)
     write_exr(tmp_path / "a.exr", baked(uv))
     mesh = load(scene, tmp_path / "a.exr")
-    assert [part.primitive.label for part in mesh.parts] == ["crate"]
+    assert [part.primitive.label for part in mesh.sheets[0].parts] == ["crate"]
     assert mesh.warnings == (
         "a: 2 meshes lie on each other in TEXCOORD_0: the lightmap fits crate best; the others are left out",
     )
@@ -79,8 +79,8 @@ def test_strays_in_gutters_change_nothing():
         dirty = light.copy()
         dirty[tuple(gap[::5].T)] = value
         mesh = from_arrays(position, triangle, uv, dirty)
-        np.testing.assert_array_equal(mesh.lightmap[inside], clean.lightmap[inside])
-        assert mesh.filled.max() <= clean.filled.max() and mesh.warnings == ()
+        np.testing.assert_array_equal(mesh.sheets[0].lightmap[inside], clean.lightmap[inside])
+        assert mesh.sheets[0].lightmap.max() <= clean.filled.max() and mesh.warnings == ()
 
 
 def test_specks_in_a_chart_are_replaced_and_lamps_are_not():
@@ -89,7 +89,7 @@ def test_specks_in_a_chart_are_replaced_and_lamps_are_not():
     light[20, 10:14] = 60000.0  # thin
     light[60:63, 12:15] = 500.0  # a lamp
     mesh = from_arrays(position, triangle, uv, light)
-    assert mesh.lightmap[20, 10:14].max() < 8.0 and mesh.lightmap[61, 13].min() == 500.0
+    assert mesh.sheets[0].lightmap[20, 10:14].max() < 8.0 and mesh.sheets[0].lightmap[61, 13].min() == 500.0
     assert mesh.warnings == ("array: lightmap: 4 texels in specks far above all other light: replaced",)
 
 

@@ -10,10 +10,10 @@ from reference import cascade as reference
 
 from wlm import interop
 from wlm.atlas import cascade
-from wlm.atlas.cascade import Textures, fit_cascade, initial, tune
-from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.cascade.fit import Textures, fit_cascade, initial, tune
+from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.model import Profile
-from wlm.atlas.pack import pack, regenerate
+from wlm.atlas.cascade.pack import pack, regenerate
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
@@ -29,7 +29,7 @@ def _profile(**settings) -> Profile:
     return Profile(**{"name": "test", "method": "cascade", **defaults, **settings})
 
 
-def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
+def _box(gain: float = 1.0, light=None) -> LightmappedScene:
     """A box, each face a chart of two triangles with an edge of shadow in it; 2 x 3 faces in a map of 40 x 60."""
     corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     position, uv, triangle = [], [], []
@@ -47,18 +47,18 @@ def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
     return from_arrays(np.concatenate(position), np.array(triangle), np.concatenate(uv), gain * light)
 
 
-def _error(mesh: LightmappedMesh, uv: np.ndarray, colour: np.ndarray, lut: np.ndarray) -> float:
+def _error(mesh: LightmappedScene, uv: np.ndarray, colour: np.ndarray, lut: np.ndarray) -> float:
     """Mean error over the surface in units of the mean radiance, in float64 by the reference."""
     random = np.random.default_rng(9)
-    triangle = random.integers(0, len(mesh.triangle), 4000)
+    triangle = random.integers(0, len(mesh.sheets[0].triangle), 4000)
     weights = random.dirichlet([1, 1, 1], 4000)[:, None]
-    old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.uv[mesh.triangle], uv))
-    want = reference.bilinear(exact(mesh.filled), old)
+    old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv))
+    want = reference.bilinear(exact(mesh.sheets[0].lightmap), old)
     got = reference.sample(exact(colour), exact(lut) if lut.size else None, new)
     return float((got - want).abs().mean() / want.mean())
 
 
-def _start(mesh: LightmappedMesh, profile: Profile) -> tuple[np.ndarray, Textures]:
+def _start(mesh: LightmappedScene, profile: Profile) -> tuple[np.ndarray, Textures]:
     packed = pack(mesh, None, profile.scale)
     return packed.uv, initial(*regenerate(mesh, packed), profile)
 
@@ -109,14 +109,14 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
         grads = [grad.cpu().numpy() for grad in step._grads]
         after = step.textures()
 
-    clip = torch.tensor(clip_positions(normalised(mesh.position, mesh.triangle), sphere_views(profile.steps, 5)[0]))
-    raster = ops_raster.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
+    clip = torch.tensor(clip_positions(normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), sphere_views(profile.steps, 5)[0]))
+    raster = ops_raster.rasterize(clip, torch.tensor(mesh.sheets[0].triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
-    old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.uv[mesh.triangle], uv))
-    unit = mesh.lightmap[mesh.mask].mean()
+    old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv))
+    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
     leaves = [exact(before.colour / unit, grad=True), exact(before.lut, grad=True)]
-    want = reference.bilinear(exact(mesh.filled / unit), old)
+    want = reference.bilinear(exact(mesh.sheets[0].lightmap / unit), old)
     image = torch.zeros(48, 48, 3, dtype=torch.float64)
     image[hit] = reference.sample(leaves[0], leaves[1] if lut_scale else None, new) - want
     reference.image_loss(image, profile.gradient).backward()
@@ -171,7 +171,7 @@ def test_rates_that_fall():
     mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)
     uv, start = _start(mesh, profile)
     step = cascade._Step(mesh, uv, start, profile, 0, "cpu")
-    unit = mesh.lightmap[mesh.mask].mean()
+    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
     before = step.textures().colour
     step()
     assert np.abs(step.textures().colour - before).max() / unit == pytest.approx(profile.colour_rate, rel=1e-3)
@@ -239,7 +239,7 @@ def test_triangles_that_are_not_active():
     uv = np.concatenate([box.uv, [[0.5, 0.5]] * 3])
     position = np.concatenate([box.position, [[-2, -2, 1.5], [2, -2, 1.5], [0, 2, 1.5]]])
     mesh = from_arrays(position, np.concatenate([box.triangle, [[24, 25, 26]]]), uv, box.lightmap, box.mask)
-    assert mesh.active.sum() == 12
+    assert mesh.sheets[0].active.sum() == 12
     for space in ("views", "uv"):
         model = fit_cascade(mesh, None, _profile(space=space), 0, Stages("cpu"))
         assert model.report["groups"] == 12 and np.isfinite(model.uv).all()

@@ -47,15 +47,15 @@ def test_each_level_is_the_lightmap_made_smaller(pair, device):
     mesh, model = pair
     decoder = model.decoder(device)
     for octaves, side in ((2, 4), (3, 8), (4, 16)):
-        want = means(mesh.lightmap, side)
+        want = means(mesh.sheets[0].lightmap, side)
         row, column = np.mgrid[: want.shape[0], : want.shape[1]].reshape(2, -1)
         uv = np.stack([(column + 0.5) / want.shape[1], (row + 0.5) / want.shape[0]], 1).astype(np.float32)
         points = torch.from_numpy(uv).to(device)
         light = decoder.read(points, torch.full((len(uv),), float(octaves), device=device)).cpu().numpy()
         error = np.square(light - want.reshape(-1, 3)).mean()
-        assert -10 * np.log10(error / np.ptp(mesh.lightmap) ** 2) > 36.0
+        assert -10 * np.log10(error / np.ptp(mesh.sheets[0].lightmap) ** 2) > 36.0
     beyond = decoder.read(points[:1], torch.full((1,), 99.0, device=device)).cpu().numpy()
-    np.testing.assert_allclose(beyond[0], mesh.lightmap.mean((0, 1)), rtol=0.02)
+    np.testing.assert_allclose(beyond[0], mesh.sheets[0].lightmap.mean((0, 1)), rtol=0.02)
 
 
 def test_there_is_no_step(pair, device):
@@ -71,7 +71,7 @@ def test_there_is_no_step(pair, device):
 def test_gaps_do_not_count(device):
     """A texel at a chart's border is the mean of those in the chart; black gaps would halve it."""
     mesh = charts(lambda place: np.full((*place.shape[:-1], 3), 0.5), height=96, width=128)
-    assert not mesh.mask.all()
+    assert not mesh.sheets[0].mask.all()
     tail = Tail(make_tail(mesh, "bc6h", device), 96, 128, "bc6h", device)
     uv = torch.rand((500, 2), generator=torch.Generator().manual_seed(0)).to(device)
     light = tail.read(uv, torch.linspace(2, 7, 500, device=device))
@@ -82,7 +82,7 @@ def test_the_bits_are_counted_and_the_file_keeps_them(pair, tmp_path):
     mesh, model = pair
     assert 8 * model.tail.size == tail_bits(64, 96)
     bare = dataclasses.replace(model, tail=model.tail[:0])
-    share = tail_bits(64, 96) / (48 * mesh.mask.size)
+    share = tail_bits(64, 96) / (48 * mesh.sheets[0].mask.size)
     assert bare.compression_ratio - model.compression_ratio == pytest.approx(share)
     assert 0.28 < 1.0 - model.compression_ratio <= 0.3
     model.save(tmp_path / "a.wlm")
@@ -111,14 +111,14 @@ def test_the_shader_compiles(kind, tmp_path):
 def test_a_margin_is_not_read(device):
     """Of a lightmap whose quarter isn't of whole blocks, the tail reads what it does of one that is."""
     mesh = sheet(height=50, width=70)
-    levels = tail_light(mesh.lightmap, mesh.mask)
+    levels = tail_light(mesh.sheets[0].lightmap, mesh.sheets[0].mask)
     blocks = np.concatenate([encode(light, "bc6h", weight)[0] for light, weight in levels])
-    np.testing.assert_allclose(levels[0][0][:12, :17], means(mesh.lightmap[:48, :68], 4), rtol=1e-5)
+    np.testing.assert_allclose(levels[0][0][:12, :17], means(mesh.sheets[0].lightmap[:48, :68], 4), rtol=1e-5)
     tail = Tail(blocks, 50, 70, "bc6h", device)
     row, column = np.mgrid[:12, :17].reshape(2, -1)
     uv = np.stack([(4 * column + 2) / 70, (4 * row + 2) / 50], 1).astype(np.float32)
     light = tail.read(torch.from_numpy(uv).to(device), torch.full((len(uv),), 2.0, device=device)).cpu().numpy()
-    want = means(mesh.lightmap[:48, :68], 4).reshape(-1, 3)
+    want = means(mesh.sheets[0].lightmap[:48, :68], 4).reshape(-1, 3)
     assert np.sqrt(np.square(light - want).mean()) < 0.02 * np.ptp(want)
 
 

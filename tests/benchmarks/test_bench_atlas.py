@@ -12,7 +12,7 @@ from benchmarks import write_json
 from benchmarks.atlas import PANELS, plotted, run, run_rivals, run_rows
 from benchmarks.atlas_inputs import Lightmap, load
 from benchmarks.rivals.atlas import single_colour
-from wlm.atlas.data import LightmappedMesh, write_mesh
+from wlm.atlas.data import LightmappedScene, write_mesh
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
@@ -157,15 +157,15 @@ def test_no_room_for_a_rival_or_a_table():
     assert not any(row.figures for row in missing) and "psnr" in rows[0].figures
 
 
-def _files(folder, mesh: LightmappedMesh, *names: str, masked: bool = False) -> None:
+def _files(folder, mesh: LightmappedScene, *names: str, masked: bool = False) -> None:
     from PIL import Image
 
     folder.mkdir()
-    write_mesh(folder / "mesh.glb", mesh, mesh.uv[mesh.triangle])
+    write_mesh(folder / "mesh.glb", mesh, mesh.sheets[0].uv[mesh.sheets[0].triangle])
     for i, name in enumerate(names):
-        write_exr(folder / f"{name}.exr", image(soft, *mesh.mask.shape) * (i + 1))
+        write_exr(folder / f"{name}.exr", image(soft, *mesh.sheets[0].mask.shape) * (i + 1))
     if masked:
-        Image.fromarray(mesh.mask.astype(np.uint8) * 255).save(folder / "mask.png")
+        Image.fromarray(mesh.sheets[0].mask.astype(np.uint8) * 255).save(folder / "mask.png")
 
 
 def test_folders(tmp_path):

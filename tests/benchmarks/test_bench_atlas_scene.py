@@ -14,8 +14,8 @@ from benchmarks import Panel
 from benchmarks.atlas_scene import run
 from benchmarks.rivals.scene_parts import scene_parts
 from benchmarks.scene_inputs import LEAST_TEXELS, cut, load
-from wlm.atlas.scene.evaluation import compare_scene
-from wlm.atlas.scene.fit import compress_scene
+from wlm.atlas.evaluation import compare_scene
+from wlm.atlas.shared.fit import compress_scene
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
@@ -80,8 +80,8 @@ def test_objects_keep_their_light(scene):
         light = texture(torch.from_numpy(whole.sheets[0].frames[state]), torch.from_numpy(own).float())
         expected = texture(torch.from_numpy(frame), torch.from_numpy(before).float())
         torch.testing.assert_close(light, expected, rtol=0, atol=2e-3)
-    sizes = [sum(sheet.mesh.mask.sum() for sheet in each.sheets) for each in (whole, scene)]
-    assert 0.2 < sizes[1] / sizes[0] < 0.4 and scene.sheets[1].mesh.mask.sum() >= LEAST_TEXELS
+    sizes = [sum(sheet.mesh.sheets[0].mask.sum() for sheet in each.sheets) for each in (whole, scene)]
+    assert 0.2 < sizes[1] / sizes[0] < 0.4 and scene.sheets[1].mesh.sheets[0].mask.sum() >= LEAST_TEXELS
     assert scene.sheets[0].frames.mean() == pytest.approx(whole.sheets[0].frames.mean(), rel=0.05)
 
 
@@ -125,7 +125,7 @@ def test_rows(scene, rows):
 
 def test_parts_are_lightmaps_of_their_own(scene):
     """Each part is read by its sheet and state, those that tiles don't fit are plain, and more bits are less error."""
-    ones = [np.ones([2 * side for side in sheet.mesh.mask.shape]) for sheet in scene.sheets]
+    ones = [np.ones([2 * side for side in sheet.mesh.sheets[0].mask.shape]) for sheet in scene.sheets]
     few, many = (scene_parts(scene, ones, share * scene.source_bits) for share in (0.01, 0.12))
     assert [len(each) for each in many.models] == [2, 2] and {m.method for s in few.models for m in s} == {"plain"}
     assert many.bits == pytest.approx(0.12 * scene.source_bits, rel=0.15)

@@ -6,12 +6,12 @@ import json
 import numpy as np
 import torch
 from builders.gltf_scene import Thing, write_scene
-
-from wlm.atlas.scene.data import load_scene
-from wlm.atlas.scene.decode import Decoder
 from wlm.atlas.scene.exporter import export_scene
-from wlm.atlas.scene.fit import compress_scene
-from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, ENTRY
+
+from wlm.atlas.data import load_scene
+from wlm.atlas.decode import Decoder
+from wlm.atlas.model import COARSE_BITS, COUNT_BITS, ENTRY
+from wlm.atlas.shared.fit import compress_scene
 from wlm.formats.exr import write_exr
 
 STATES = ("dawn", "noon", "night")

@@ -19,7 +19,7 @@ from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 import wlm
 from benchmarks.rows import read_json
 from wlm.atlas.exporter import geometry, read_folder
-from wlm.atlas.scene.description import read_description
+from wlm.atlas.listing import read_description
 from wlm.bake.geometry import read_geometry
 from wlm.bake.settings import LightmapSettings
 from wlm.config import load_settings

@@ -22,9 +22,9 @@ from builders.synthetic import random_model as random_lightmap
 from wlm import probe
 from wlm.atlas.colour import quantise
 from wlm.atlas.exact import decode64
-from wlm.atlas.scene.decode import Decoder as SceneDecoder
+from wlm.atlas.decode import Decoder as SceneDecoder
 from wlm.atlas.scene.exporter import factor_texels, sheet_texels
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
+from wlm.atlas.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
 from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError

@@ -33,7 +33,7 @@ def test_a_decoder_gets_the_corners_weights():
     mesh = charts()
 
     def place(uv, number, weight):
-        corner = torch.from_numpy(mesh.uv[mesh.triangle].astype(np.float32))[number.long()]
+        corner = torch.from_numpy(mesh.sheets[0].uv[mesh.sheets[0].triangle].astype(np.float32))[number.long()]
         interpolated = (corner * weight[:, :, None]).sum(1)
         np.testing.assert_allclose(interpolated.numpy(), uv.numpy(), atol=1e-6)
         return torch.ones(len(uv), 3)

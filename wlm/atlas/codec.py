@@ -190,6 +190,8 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
     height, width = header.sizes[0]
     if len(header.sizes) != len(header.sheets) or not (shared or len(header.sheets) == len(header.states) == 1):
         raise ValueError("setting sheets: expected one sheet and one state, or shared tiles")
+    if {each.sheet for each in header.objects} != set(range(len(header.sheets))):
+        raise ValueError(f"setting objects: expected a node for each of {len(header.sheets)} sheets")
     if header.separate and not shared:
         raise ValueError("setting separate: expected shared tiles")
     if (second is None) == (header.colour == "mixed") or any(side % BLOCK_SIDE for side in second or ()):

@@ -13,7 +13,7 @@ from wlm.atlas.data import from_arrays
 from wlm.atlas.display import screen_exposure
 from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import FILTERS, resize
-from wlm.atlas.views import mesh_views, visible_uv
+from wlm.atlas.views import scene_views, visible_uv
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
@@ -33,7 +33,7 @@ def _sheet(lightmap, mask=None):
 
 def _read(rival, mesh):
     """What the rival decodes to at the lightmap's texels, float64 [H, W, 3]; for meshes whose triangles don't count."""
-    height, width = mesh.mask.shape
+    height, width = mesh.sheets[0].mask.shape
     y, x = np.mgrid[:height, :width] + 0.5
     uv = torch.tensor(np.stack([x / width, y / height], -1).reshape(-1, 2), dtype=torch.float32)
     nothing = torch.zeros(len(uv), dtype=torch.int32), torch.zeros(len(uv), 3)
@@ -189,7 +189,7 @@ def test_faces_of_one_colour_become_a_texel_each():
     light[: HEIGHT // 2, : WIDTH // 3] = waves()[: HEIGHT // 2, : WIDTH // 3]
     mesh = lit_cube(2, light)
     one_left = single_colour(mesh, threshold=1e-4, **SEEN)
-    kept = np.count_nonzero(mesh.mask[: HEIGHT // 2, : WIDTH // 3])
+    kept = np.count_nonzero(mesh.sheets[0].mask[: HEIGHT // 2, : WIDTH // 3])
     assert one_left.bytes == (4 + kept) * 6
     assert compare(mesh, {"it": one_left.decoded}, views=6, resolution=64)["it"].psnr > 70.0
     assert single_colour(mesh, threshold=10.0, floor=-math.inf).bytes == 6
@@ -201,9 +201,9 @@ def test_the_error_of_shared_colours_is_bounded(threshold):
     mesh = lit_cube(6)
     result = single_colour(mesh, threshold=threshold, floor=-math.inf)
     assert 0.0 < share_of(result, mesh) < 1.0
-    weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.triangle))
-    uv = torch.tensor((mesh.uv[mesh.triangle] * weight[..., None]).sum(1), dtype=torch.float32)
-    original = raster.texture(torch.tensor(fill_gaps(mesh.lightmap, mesh.mask)), uv)
+    weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.sheets[0].triangle))
+    uv = torch.tensor((mesh.sheets[0].uv[mesh.sheets[0].triangle] * weight[..., None]).sum(1), dtype=torch.float32)
+    original = raster.texture(torch.tensor(fill_gaps(mesh.sheets[0].lightmap, mesh.sheets[0].mask)), uv)
     decoded = result.decoded(uv, torch.arange(len(uv), dtype=torch.int32), torch.tensor(weight))
     factor = screen_exposure(mesh)
     error = ((decoded * factor).sqrt() - (original * factor).sqrt()).abs()
@@ -217,10 +217,10 @@ def test_triangles_that_were_wrong_keep_their_texels():
 
     def worst(rival):
         values = []
-        for visible, _, uv in visible_uv(mesh, mesh_views(mesh, SEEN["views"], 1), SEEN["resolution"], "cpu"):
+        for visible, _, uv in visible_uv(mesh, scene_views(mesh, SEEN["views"], 1), SEEN["resolution"], "cpu"):
             hit = visible >= 0
             decoded = rival.decoded(uv[hit], visible[hit], uv[hit])
-            original = raster.texture(torch.tensor(mesh.filled), uv[hit])
+            original = raster.texture(torch.tensor(mesh.sheets[0].lightmap), uv[hit])
             squares = float(((decoded * factor).sqrt() - (original * factor).sqrt()).double().square().sum())
             values.append(-10.0 * math.log10(squares / (3 * SEEN["resolution"] ** 2)))
         return min(values)
@@ -308,4 +308,4 @@ def test_astc_keeps_the_lightmaps_size_where_it_can():
     mesh = lit_cube(2)
     rivals = {share: best_astc(mesh, share) for share in (0.17, 0.14, 0.12, 0.09, 0.02)}
     assert [rival.name for rival in rivals.values()] == ["astc4x4", "astc5x4", "astc5x5", "astc6x6", "astc12x12"]
-    assert all(rival.size == mesh.mask.shape for share, rival in rivals.items() if share > 0.02)
+    assert all(rival.size == mesh.sheets[0].mask.shape for share, rival in rivals.items() if share > 0.02)
