@@ -9,11 +9,11 @@ from kernels.compare import close, exact
 from reference import cascade as reference
 
 from wlm import interop
-from wlm.atlas import cascade
-from wlm.atlas.cascade.fit import Textures, fit_cascade, initial, tune
+from wlm.atlas.cascade import fit as cascade
+from wlm.atlas.cascade import pack as packing
+from wlm.atlas.cascade.fit import Textures, fit_cascade, initial
 from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.model import Profile
-from wlm.atlas.cascade.pack import pack, regenerate
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
@@ -22,6 +22,18 @@ from wlm.ops.views import clip_positions, normalised, sphere_views
 pytest.importorskip("uvunwrap")
 
 SIDE = 16  # texels of a face of the box
+
+
+def pack(scene: LightmappedScene, *rest) -> packing.Packed:
+    return packing.pack(scene.sheets[0], *rest)
+
+
+def regenerate(scene: LightmappedScene, *rest) -> tuple[np.ndarray, np.ndarray]:
+    return packing.regenerate(scene.sheets[0], *rest)
+
+
+def tune(scene: LightmappedScene, *rest, **options) -> Textures:
+    return cascade.tune(scene.sheets[0], *rest, **options)
 
 
 def _profile(**settings) -> Profile:
@@ -109,11 +121,16 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
         grads = [grad.cpu().numpy() for grad in step._grads]
         after = step.textures()
 
-    clip = torch.tensor(clip_positions(normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), sphere_views(profile.steps, 5)[0]))
+    clip = torch.tensor(
+        clip_positions(normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), sphere_views(profile.steps, 5)[0])
+    )
     raster = ops_raster.rasterize(clip, torch.tensor(mesh.sheets[0].triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
-    old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv))
+    old, new = (
+        (weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0]
+        for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv)
+    )
     unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
     leaves = [exact(before.colour / unit, grad=True), exact(before.lut, grad=True)]
     want = reference.bilinear(exact(mesh.sheets[0].lightmap / unit), old)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference import patches as reference
 
-from wlm.atlas import cluster as clustering
+from wlm.atlas.cascade import cluster as clustering
 from wlm.atlas.cascade.cluster import Clusters, cluster
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import ORDERS, SIZES

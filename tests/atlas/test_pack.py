@@ -7,16 +7,24 @@ import numpy as np
 import pytest
 from builders.atlas_models import grouped
 
-from wlm.atlas import pack as packing
+from wlm.atlas.cascade import pack as packing
+from wlm.atlas.cascade.pack import Packed
 from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.fit import compress
-from wlm.atlas.cascade.pack import Packed, pack, regenerate
 from wlm.errors import WlmError
 from wlm_kernels.atlas.patches import ORDERS
 
 pytest.importorskip("uvunwrap")
 
 SIZE = (40, 64)  # H, W
+
+
+def pack(scene: LightmappedScene, *rest) -> Packed:
+    return packing.pack(scene.sheets[0], *rest)
+
+
+def regenerate(scene: LightmappedScene, *rest) -> tuple[np.ndarray, np.ndarray]:
+    return packing.regenerate(scene.sheets[0], *rest)
 
 
 def _mesh(triangles: list, lightmap: np.ndarray | None = None, position: np.ndarray | None = None) -> LightmappedScene:
@@ -198,7 +206,8 @@ def test_regenerated_colours():
     """A lightmap that is linear in x and y is the same under the new UVs, up to the charts' borders and beyond."""
     y, x = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5, indexing="ij")
     lightmap = np.stack([x, y, x + 2 * y], -1).astype(np.float32) / 100
-    mesh = from_arrays(*(lambda m: (m.position, m.triangle, m.uv))(_mesh(_many(4))), lightmap, np.ones(SIZE, bool))
+    (own,) = _mesh(_many(4)).sheets
+    mesh = from_arrays(own.position, own.triangle, own.uv, lightmap, np.ones(SIZE, bool))
     packed = pack(mesh, None, 0.7)
     rendered, mask = regenerate(mesh, packed)
     readers = _read_by(packed)

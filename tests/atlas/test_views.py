@@ -81,7 +81,9 @@ def test_normalised_whatever_the_place_and_size():
     position, triangle, uv = corners(1)
     for scale, shift in ((1.0, 0.0), (1e-6, 0.0), (250.0, [3.0, -7.0, 1000.0])):
         mesh = from_arrays(position * [1.0, 0.5, 0.25] * scale + shift, triangle, uv, waves())
-        np.testing.assert_allclose(normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), position * [1.0, 0.5, 0.25], atol=1e-6)
+        np.testing.assert_allclose(
+            normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), position * [1.0, 0.5, 0.25], atol=1e-6
+        )
 
 
 def test_each_face_from_its_own_side(device):

@@ -1,34 +1,35 @@
-"""Scenes: many meshes, several states, one table and one texture."""
+"""Many meshes and several states: one lookup texture and one or two colour textures."""
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from builders.checks import assert_same, error_of
+from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 
 import wlm
-from wlm.atlas.data import from_arrays
-from wlm.atlas.scene import sharing
-from wlm.atlas.data import load_scene, scene_of
+from wlm.atlas.data import LightmappedScene, from_arrays, join, load
 from wlm.atlas.decode import Decoder
-from wlm.atlas.listing import read_listing
-from wlm.atlas.shared.weights import peaks_of, scales, variation
-from wlm.atlas.evaluation import compare_scene, evaluate_scene
+from wlm.atlas.evaluation import compare, evaluate
 from wlm.atlas.exact import decode64
-from wlm.atlas.scene.exporter import export_scene, read_scene
-from wlm.atlas.shared.fit import compress_scene
+from wlm.atlas.fit import compress, open_checkpoint
+from wlm.atlas.listing import read_listing
+from wlm.atlas.model import FIRST_BLOCK_CODE, Profile, pack_tiles, unpack_tiles
+from wlm.atlas.shader import glsl
+from wlm.atlas.shared import curves, sharing
 from wlm.atlas.shared.mixture import find_mixtures, moments
-from wlm.atlas.model import SceneProfile, pack_tiles, unpack_tiles
-from wlm.atlas.shared.weights import scene_weights
-from wlm.atlas.scene.shader import scene_glsl
+from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
 from wlm.formats.exr import write_exr
 
 SIDE = 48
 QUICK = {"views": 2, "budget": 0.08}
+
+
+def _with(sheet, light: np.ndarray) -> LightmappedScene:
+    """A sheet's triangles under other lightmaps."""
+    return from_arrays(sheet.position, sheet.triangle, sheet.uv, light, sheet.mask, sheet.name)
 
 
 def lights(shift: float, states: int = 3) -> np.ndarray:
@@ -44,13 +45,12 @@ def lights(shift: float, states: int = 3) -> np.ndarray:
 def scene():
     """A room with two crates, three states."""
     parts = [box((0, 0, 0), (6, 3, 5), inward=True), box((1, 0, 1), (2, 1, 2)), box((4, 0, 3), (4.2, 0.2, 3.2))]
-    meshes = [from_arrays(*part, lights(i)[0], name=f"part {i}") for i, part in enumerate(parts)]
-    return scene_of(meshes, [lights(i) for i in range(3)], name="room")
+    return join([from_arrays(*part, lights(i), name=f"part {i}") for i, part in enumerate(parts)], "room")
 
 
 @pytest.fixture(scope="module")
 def model(scene):
-    return compress_scene(scene, **QUICK)
+    return compress(scene, **QUICK)
 
 
 def test_light_of_two_sources_has_two_components():
@@ -74,7 +74,7 @@ def test_one_table_and_one_texture_for_all(scene, model):
     assert set(model.report["components"]) <= {"1", "2", "3"} and len(model.states) == 3
     assert 0.85 <= model.compression_ratio < 0.95 and model.lut.shape[0] * model.lut.shape[1] < 3 * 8 * 8
     assert sum(model.report["components"].values()) == sum(model.report["tiles"])
-    report = evaluate_scene(model, scene, views=3, resolution=48)
+    report = evaluate(model, scene, views=3, resolution=48)
     assert report.views == 6 and report.inside_views == 3 and report.eye_height == pytest.approx(0.35 * 3)
     assert report.psnr > 35.0 and report.around_psnr > 35.0 and report.inside_psnr > 35.0
     assert len(report.psnr_by_state) == len(report.peaks) == 3 and min(report.peaks) > 0.5
@@ -98,69 +98,42 @@ def test_the_kernel_reads_what_the_reference_does(scene, model, device):
     np.testing.assert_allclose(decoder.lightmap(1, 0.5), middle, rtol=1e-4, atol=1e-2)
 
 
-def test_a_file_holds_all(tmp_path, scene, model):
-    model.save(tmp_path / "a.wlm")
-    again = wlm.load(tmp_path / "a.wlm")
-    assert_same(dataclasses.replace(again, report={}), dataclasses.replace(model, report={}))
-
-
 def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
     """Phones have no blocks."""
-    plain = compress_scene(scene, "rgb9e5", **QUICK)
+    plain = compress(scene, "standard", colour="rgb9e5", **QUICK)
     assert model.colour == "mixed" and model.report["tiles of blocks"] > 0
     assert plain.colour == "rgb9e5" and not plain.block_texels.size and not plain.report["tiles of blocks"]
-    assert "wlm_scene_blocks" in scene_glsl(model) and "wlm_scene_blocks" not in scene_glsl(plain)
-
-
-@pytest.mark.parametrize(
-    ("name", "means"),
-    [
-        ("atlas-scene", [0.60438323, 0.86818969, 1.13199604]),  # one mixture, a layer for each component
-        ("atlas-scene-mixed", [0.26424402, 0.60012102, 0.93599224]),
-        ("atlas-scene-coarse", [0.26860335, 0.70232235, 0.89431477]),
-        ("atlas-scene-apart", [0.7223999, 0.6742418, 0.0]),
-    ],
-)
-def test_kept_files(name, means, device):
-    """They hold what they did for the version that wrote them."""
-    model = wlm.load(Path(__file__).parents[1] / "files" / f"{name}.wlm")
-    random = np.random.default_rng(0)
-    uv, sheet = random.random((2000, 2)).astype(np.float32), random.integers(0, len(model.sheets + model.levels), 2000)
-    points = torch.from_numpy(uv).to(device), torch.from_numpy(sheet).to(device)
-    light = np.stack([model.decoder(device).read(*points, state).cpu().numpy() for state in range(3)])
-    assert light.mean((1, 2)) == pytest.approx(means, rel=1e-5)
-    np.testing.assert_allclose(light[2], decode64(model, uv, sheet, 2), rtol=1e-3, atol=1e-3)
+    assert "wlm_scene_blocks" in glsl(model) and "wlm_scene_blocks" not in glsl(plain)
 
 
 def test_mips(scene, model, device):
     """Smaller levels: means of charts, in the budget, without a step from one to the next."""
-    bare, model = model, compress_scene(scene, views=1, budget=0.3, mips=True)
+    bare, model = model, compress(scene, views=1, budget=0.3, mips=True)
     assert model.compression_ratio >= 0.7 and [each.width for each in model.levels] == [12, 6, 3, 1] * 3
     decoder = model.decoder(device)
     row, column = np.mgrid[:12, :12].reshape(2, -1)
     uv = torch.from_numpy(np.stack([(column + 0.5) / 12, (row + 0.5) / 12], 1).astype(np.float32)).to(device)
     for number, sheet in enumerate(scene.sheets):
-        mask = sheet.mesh.sheets[0].mask.reshape(12, 4, 12, 4).sum((1, 3))
-        for state, frame in enumerate(sheet.frames):
-            means = (frame * sheet.mesh.sheets[0].mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3)) / mask.clip(min=1)[
-                ..., None
-            ]
+        mask = sheet.mask.reshape(12, 4, 12, 4).sum((1, 3))
+        for state, frame in enumerate(sheet.lightmaps):
+            sums = (frame * sheet.mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3))
+            means = sums / mask.clip(min=1)[..., None]
             which = torch.full((144,), number, device=device)
             light = decoder.read(uv, which, state, torch.full((144,), 2.0, device=device)).cpu().numpy()
-            rest = (light.reshape(12, 12, 3) - means)[mask[..., 0] > 0]
+            rest = (light.reshape(12, 12, 3) - means)[mask > 0]
             assert np.sqrt(np.square(rest).mean()) < 0.02 * np.ptp(frame)
     lods = torch.linspace(0.0, 7.0, 701, device=device)
     light = decoder.read(uv[:1].expand(701, 2), torch.zeros(701, device=device), 1.0, lods)
     assert float(light.diff(dim=0).abs().max()) < 0.03 * float(light.max())
     assert torch.equal(light[0], decoder.read(uv[:1], torch.zeros(1, device=device), 1.0)[0])
     with pytest.raises(ValueError, match="lod: expected a model with mips"):
-        bare.decoder().read(uv[:1].cpu(), torch.zeros(1), 0, torch.zeros(1))
+        bare.decoder().read(uv[:1].cpu(), 0, 0, torch.zeros(1))
 
 
 def test_views_of_the_scene_decide(scene):
     """A crate in a closed room is hidden from around, and is seen from inside."""
     varies = variation(scene, peaks_of(scene), "cpu")
-    room, crate, small = scene_weights(scene, varies, SceneProfile(name="", views=3), 0, "cpu")
+    room, crate, small = scene_weights(scene, varies, Profile(name="", views=3), 0, "cpu")
     assert min(crate.sum(), small.sum()) > 0
     per_cell = [each[each > 0].mean() for each in (room, crate, small)]
     assert per_cell[2] < per_cell[1]
@@ -168,22 +141,22 @@ def test_views_of_the_scene_decide(scene):
 
 def test_states_count_by_what_they_would_lose(scene):
     """At half of its light, a state counts as before; with more edges in it, less."""
-    frames = [each.frames.copy() for each in scene.sheets]
+    frames = [each.lightmaps.copy() for each in scene.sheets]
     for each in frames:
         each[1] = 0.5 * each[0]
         each[2] = each[0]
         each[2, :, ::8] *= 0.8
-    varied = scene_of([each.mesh for each in scene.sheets], frames)
+    varied = join([_with(each, light) for each, light in zip(scene.sheets, frames, strict=True)])
     peak = peaks_of(varied)
     varies = variation(varied, peak, "cpu")
-    unit = scales(varies, [each.mesh.sheets[0].mask for each in scene.sheets]) * peak
+    unit = scales(varies, [each.mask for each in scene.sheets]) * peak
     assert unit[1] == pytest.approx(0.5 * unit[0], rel=1e-2) and unit[2] > 3.0 * unit[0]
 
 
 def test_coarse_components(model, device):
     """Of blocks of tiles in blocks: the first components larger, the others one block each."""
     assert model.report["coarse components"] > 0
-    first, size, component, count, page, blocks, coarse = unpack_tiles(model.lut, "mixed")
+    first, size, component, count, page, blocks, coarse = unpack_tiles(model.lut, FIRST_BLOCK_CODE)
     assert (coarse <= count).all() and blocks[coarse > 0].all() and (size[coarse > 0].prod(1) > 16).all()
     again = pack_tiles(first, size, component, count, page, blocks, coarse)
     assert (again == model.lut)[count > 0].all()
@@ -202,23 +175,23 @@ def unlike():
     left = np.where((column < 0.5)[..., None], fine, smooth)
     frames = np.stack([left, left[:, ::-1] ** 2, np.zeros_like(left)]).astype(np.float32)
     parts = [box((0, 0, 0), (6, 3, 5), inward=True), box((1, 0, 1), (2, 1, 2))]
-    meshes = [from_arrays(*part, frames[0], name=f"part {i}") for i, part in enumerate(parts)]
-    return scene_of(meshes, [frames, frames[:, ::-1]], name="unlike")
+    lit = zip(parts, (frames, frames[:, ::-1]), strict=True)
+    return join([from_arrays(*part, light, name=f"part {i}") for i, (part, light) in enumerate(lit)], "unlike")
 
 
 def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_path, device):
     """In the same bits they lose less so than with tiles in common."""
     settings = {"views": 2, "budget": 0.3}
-    apart = compress_scene(unlike, mips=True, **settings)
+    apart = compress(unlike, mips=True, **settings)
     states, stride = len(unlike.states), len(apart.sheets) + len(apart.levels)
-    assert apart.report["apart"] and apart.stride == stride and len(apart.rows) == states * stride
+    assert apart.report["separate"] and apart.stride == stride and len(apart.rows) == states * stride
     assert set(apart.report["components"]) == {"1"} and apart.report["components"]["1"] > sum(apart.report["tiles"])
     assert apart.lut.shape[2] == 2 and 1.0 - apart.compression_ratio <= 0.3
-    monkeypatch.setattr(sharing, "_better", lambda together, *rest: together)
-    together = compress_scene(unlike, mips=True, **settings)
+    monkeypatch.setattr(sharing, "_choose_sharing", lambda together, *rest: together)
+    together = compress(unlike, mips=True, **settings)
     assert not together.later and not together.stride
-    psnr = [evaluate_scene(each, unlike, views=3, resolution=48).psnr for each in (apart, together)]
-    assert apart.report["expected gain of states apart"] > 1.0 and psnr[0] > psnr[1] + 1.0
+    psnr = [evaluate(each, unlike, views=3, resolution=48).psnr for each in (apart, together)]
+    assert apart.report["expected gain of separate tiles"] > 1.0 and psnr[0] > psnr[1] + 1.0
     # Read as the reference does, whole, kept in a file, and between states and levels.
     random = np.random.default_rng(0)
     uv, sheet = random.random((300, 2)).astype(np.float32), random.integers(0, stride, 300)
@@ -235,22 +208,23 @@ def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_p
     ends = [decoder.read(points[0], points[1] % 2, state, far) for state in (0.0, 1.0, 0.5)]
     torch.testing.assert_close(ends[2], 0.5 * (ends[0] + ends[1]), rtol=1e-5, atol=1e-6)
     assert float((ends[0] - ends[1]).abs().min()) > 0.01
-    bare = apart.without_levels()
+    bare = apart.without_mips()
     near = (points[0], points[1] % 2)
     assert torch.equal(Decoder(bare, device).read(*near, 1.0), decoder.read(*near, 1.0))
     assert len(bare.rows) == states * len(apart.sheets) and not bare.levels and not bare.table()[:, 6].any()
-    assert not apart.without_levels().later[0].smaller and not together.without_levels().later
+    assert not apart.without_mips().later[0].smaller and not together.without_mips().later
 
 
 def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatch):
     monkeypatch.setattr(sharing, "_SAMPLES", 6)
-    near = compress_scene(unlike, views=1, budget=0.3, components=1)
-    assert near.later and near.report["expected gain of states apart"] > 0.0
+    monkeypatch.setattr(curves, "_RANKS", (1,))
+    near = compress(unlike, views=1, budget=0.3)
+    assert near.later and near.report["expected gain of separate tiles"] > 0.0
     # All states are one light, brighter and darker.
     sheet = unlike.sheets[0]
-    alike = scene_of([sheet.mesh], [np.stack([share * sheet.frames[0] for share in (1.0, 0.5, 0.2)])])
-    far = compress_scene(alike, views=1, budget=0.1, components=1)
-    assert not far.later and far.report["expected gain of states apart"] is None
+    alike = _with(sheet, np.stack([share * sheet.lightmap for share in (1.0, 0.5, 0.2)]))
+    far = compress(alike, views=1, budget=0.1)
+    assert not far.later and far.report["expected gain of separate tiles"] is None
 
 
 def files(folder, states=("day", "night")):
@@ -284,25 +258,23 @@ def test_instances_with_a_rectangle_each(tmp_path, convention):
     objects = [CONVENTIONS[convention](name, x) for name, x in (("left", 0.0), ("right", 0.5))]
     content = {"states": ["day", "night"], "sheets": [{"files": ["day.exr", "night.exr"]}], "objects": objects}
     (tmp_path / "lights.json").write_text(json.dumps(content | {"convention": convention}))
-    scene = load_scene(path, tmp_path / "lights.json")
+    scene = load(path, tmp_path / "lights.json")
     (sheet,) = scene.sheets
-    assert scene.states == ("day", "night") and scene.uv_set == 1 and sheet.frames.shape == (2, SIDE, SIDE, 3)
+    assert scene.states == ("day", "night") and scene.uv_set == 1 and sheet.lightmaps.shape == (2, SIDE, SIDE, 3)
     assert [(each.label, each.scale_offset[2:]) for each in scene.objects] == [("left", (0, 0)), ("right", (0.5, 0))]
     uv = box((0, 0, 0), (2, 2, 2))[2] * [0.5, 0.75]
-    np.testing.assert_allclose(np.sort(sheet.mesh.sheets[0].uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
+    np.testing.assert_allclose(np.sort(sheet.uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
     assert len(scene.blocker) == 12  # the rock has no lightmap
-    model = compress_scene(scene, views=1, budget=0.3)
-    paths = export_scene(model, tmp_path / "out", scene)
-    assert {each.name for each in paths} == {
-        *("scene.wlm", "scene.glb", "scene.glsl", "report.json"),
-        *("sheets.dds", "lut.dds", "factors.dds", "colour_0.dds", "blocks_0.dds"),
-    }
-    again, report = read_scene(tmp_path / "out")
-    assert again.source == scene.source and report["objects"][1]["scale_offset"][2] == 0.5
-    from wlm.formats.gltf import read_gltf
-
-    document, _ = read_gltf(tmp_path / "out" / "scene.glb")
-    assert document.content["nodes"][1]["extras"]["wlm"]["scale_offset"] == [0.5, 0.75, 0.5, 0.0]
+    model = compress(scene, views=1, budget=0.3)
+    model.save(tmp_path / "out.wlm")
+    again = wlm.load(tmp_path / "out.wlm")
+    assert again.source == scene.source and again.scene.objects == scene.objects
+    np.testing.assert_array_equal(again.scene.blocker, scene.blocker)
+    for name in ("position", "triangle", "uv", "mask"):
+        np.testing.assert_array_equal(getattr(again.scene.sheets[0], name), getattr(sheet, name))
+    made = again.bundle()
+    assert made.document["objects"][1]["scale_offset"] == [0.5, 0.75, 0.5, 0.0] and made.document["uv_set"] == 1
+    assert set(made.textures) >= {"sheets", "lut", "factors", "colour"}
 
 
 def test_materials_own_lightmaps(tmp_path):
@@ -319,11 +291,11 @@ def test_materials_own_lightmaps(tmp_path):
     images = {"textures": [{"source": 0}], "images": [{"uri": "day.exr", "name": "baked"}]}
     path = write_scene(tmp_path / "scene.gltf", things, images)
     write_exr(tmp_path / "day.exr", lights(0)[0])
-    scene = load_scene(path)
+    scene = load(path)
     assert [each.scale_offset for each in scene.objects] == [(1, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
     assert scene.sheets[0].name == "baked" and scene.states == ("light",)
-    inside = scene.sheets[0].mesh.sheets[0].mask
-    np.testing.assert_allclose(scene.sheets[0].frames[0][inside], 2 * lights(0)[0][inside], rtol=1e-3)
+    inside = scene.sheets[0].mask
+    np.testing.assert_allclose(scene.sheets[0].lightmap[inside], 2 * lights(0)[0][inside], rtol=1e-3)
 
 
 def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
@@ -332,9 +304,9 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
 
     def told(**content):
         lists.write_text(json.dumps({"sheets": [{"files": ["day.exr"]}]} | content))
-        return error_of(load_scene, path, lists)
+        return error_of(load, path, lists)
 
-    assert "no material has a lightmap (MOZ_lightmap)" in error_of(load_scene, path)
+    assert "no material has a lightmap (MOZ_lightmap)" in error_of(load, path)
     assert "sheets: expected 2 files each, one a state, found [1]" in told(states=["a", "b"])
     assert "objects[0].sheet: expected below 1, found 3" in told(objects=[{"node": "left", "sheet": 3}])
     assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])
@@ -357,16 +329,32 @@ def test_hard_cases_of_a_scene(tmp_path):
     tiny = uv.copy()
     tiny[:4] = [0.5, 0.5]  # without area
     tiny[4:8] = 0.25 + 0.2 / SIDE * (tiny[4:8] - tiny[4:8].min(0)) * [3, 2]  # within a texel
-    meshes = [
-        from_arrays(position, triangle, each, lights(0)[0], name=name)
-        for name, each in (("overlap", 0.3 + 0.4 * (uv % [1 / 3, 0.5])), ("tiny", tiny), ("black", uv))
-    ]
     black = np.zeros((3, SIDE, SIDE, 3))
-    scene = scene_of(meshes, [lights(0), lights(1), black])
-    model = compress_scene(scene, views=1, budget=0.3, components=2)
+    uvs, light = (0.3 + 0.4 * (uv % [1 / 3, 0.5]), tiny, uv), (lights(0), lights(1), black)
+    parts = [from_arrays(position, triangle, *each) for each in zip(uvs, light, strict=True)]
+    model = compress(scene := join(parts), views=1, budget=0.3)
     decoder = Decoder(model)
     assert not decoder.lightmap(2, 1).any()
-    score = compare_scene(scene, {"it": decoder.read}, views=2, resolution=32)["it"]
+    score = compare(scene, {"it": decoder}, views=2, resolution=32)["it"]
     assert score.psnr > 35.0
-    dark = compress_scene(scene_of(meshes, [black] * 3), views=1, budget=0.3, components=1)
+    dark = compress(join([_with(part.sheets[0], black) for part in parts]), views=1, budget=0.3)
     assert not Decoder(dark).lightmap(0, 2).any()
+
+
+def test_an_interrupted_compression_goes_on_to_the_same_bytes(scene, model, tmp_path):
+    """Numbers of components that are done are not done again."""
+    output, done = tmp_path / "a.wlm", []
+
+    def stop(report):
+        done.append(report.stage)
+        if done.count("curves") > 3:
+            raise KeyboardInterrupt
+
+    options = {"seed": 0, "every": 0.0, **QUICK}
+    with pytest.raises(KeyboardInterrupt):
+        compress(scene, checkpoint=open_checkpoint(output, scene, **options), progress=stop, **QUICK)
+    kept = open_checkpoint(output, scene, resume=True, **options)
+    assert kept.resumed
+    again = compress(scene, checkpoint=kept, **QUICK)
+    for name in ("texels", "blocks", "lut", "factor"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(model, name))

@@ -7,7 +7,7 @@ import pytest
 from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 
-from wlm.atlas import belonging
+from wlm.atlas import matching as belonging
 from wlm.atlas.data import from_arrays, load
 from wlm.atlas.evaluation import compare
 from wlm.formats.exr import write_exr
@@ -40,7 +40,7 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
         "a: 2 meshes lie on each other in TEXCOORD_0: the lightmap fits crate best; the others are left out",
     )
     for name in ("lamp", "lamp-mesh", "1"):
-        assert [part.primitive.node for part in load(scene, tmp_path / "a.exr", node=name).parts] == [1]
+        assert [part.primitive.node for part in load(scene, tmp_path / "a.exr", node=name).sheets[0].parts] == [1]
     assert "node: expected one of crate, lamp, found 'wall'" in error_of(load, scene, tmp_path / "a.exr", node="wall")
     write_exr(tmp_path / "grey.exr", np.ones((SIDE, SIDE, 3)))
     assert "fits none clearly better: expected the name of one as the node (--node): crate, lamp" in error_of(
@@ -49,7 +49,7 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
     # Side by side in one atlas they share it, and so does a second node with the same mesh.
     side = [Thing("a", position, triangle, [uv * [0.5, 1]]), Thing("b", position, triangle, [uv * [0.5, 1] + [0.5, 0]])]
     write_scene(scene, [*side, Thing("c", like=0)])
-    assert len(load(scene, tmp_path / "grey.exr").parts) == 3
+    assert len(load(scene, tmp_path / "grey.exr").sheets[0].parts) == 3
 
 
 @pytest.mark.parametrize("band", [None, 8])
