@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-# The stamp, not the folder, is the target: a folder's own time changes with every file put into it.
+# The target is a stamp and not the folder, whose modification time changes with every file added.
 STAMP := .venv/.installed
 
 demo: $(STAMP)
@@ -21,22 +21,22 @@ demo: $(STAMP)
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
 
-# The pictures of README and docs, of what the demos leave.
+# Makes the pictures of README and docs from the output of the demos.
 pictures: demo
 	$(BIN)/python demos/pictures.py
 
-# A file's tests stay on one worker, so that each kernel is compiled by few of them.
+# The tests of a file stay on one worker, so that fixtures of a module are made once.
 test: lint
 	$(BIN)/pytest -n 2 --dist loadfile
 
 test-all: lint
 	$(BIN)/pytest -n 2 --dist loadfile -m ""
 
-# 20,000 changed files of each kind: about half an hour on two cores; the counts are in out/fuzz.json.
+# Reads 20,000 changed files of each kind in about half an hour on two cores; writes the counts to out/fuzz.json.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
 
-# The documents as a site, out/docs/index.html; a link that leads nowhere is an error.
+# Builds the documents as a site, out/docs/index.html; a broken link is an error.
 docs: $(STAMP)
 	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -53,6 +53,7 @@ bench: $(STAMP)
 
 lint: $(STAMP)
 	$(BIN)/ruff check
+	$(BIN)/mypy
 
 .venv: $(STAMP)
 
@@ -62,5 +63,5 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 	touch $@
 
 clean:
-	rm -rf .venv .cache .pytest_cache .ruff_cache build *.egg-info
+	rm -rf .venv .cache .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

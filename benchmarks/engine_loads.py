@@ -84,7 +84,7 @@ def measured(browser, address: str) -> dict[str, float]:
 def main(target: Path) -> None:
     """Writes the figures as JSON."""
     model, methods = lightmap(), {}
-    kinds = [int(count) for count in np.bincount(model.kind)]
+    kinds = [int(count) for count in np.bincount(model.light.kind)]
     environment = describe_environment("cpu", "python benchmarks/engine_loads.py benchmarks/engine-loads.json")
     with tempfile.TemporaryDirectory() as name:
         for engine in ENGINES:

@@ -95,6 +95,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
     },
     "Time": {
         "encode_seconds": Figure("encode", "s", ".3g"),
+        "load_ms": Figure("load a tile", "ms", ".2g"),
         "decode_ms": Figure("decode time", "ms", ".3g"),
         "time_ms": Figure("time", "ms", ".3g"),
         "replay_ms": Figure("replayed", "ms", ".3g"),

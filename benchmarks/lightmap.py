@@ -2,20 +2,21 @@
 
 Five kinds of rows:
 
-- method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, and the
-  decode time of the whole map to 8 bits on the fast path. The largest error is in radiance, against the float64 path.
+- method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, the
+  decode time of the whole map to 8 bits on the fast path, and the time to unpack one tile of the file. The largest
+  error is in radiance, against the float64 path.
 - methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, and on CUDA
   "matrix" (the fast path on matrix units), of profile M:
   the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
   8 bits, 0.00196, is the rounding itself.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
-  (`wlm.lightmap.page`), its errors and how long it takes from the stored bytes.
+  (`wlm.lightmap.runtime_texture`), its errors and how long it takes from the stored bytes.
 - the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
   and a video codec; between stored times their light is mixed.
 - method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
 
-Profiles and rivals have the scores of `wlm.lightmap.seen` too: those between stored times where both are scored, those
-of views in a full run.
+Profiles and rivals have the scores of `wlm.lightmap.view_scores` too: those between stored times where both are scored,
+those of views in a full run.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
 alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
@@ -36,18 +37,27 @@ from benchmarks.rivals.lightmap_torch import PlainFit
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data
 from wlm.errors import WlmError
+from wlm.formats import zstd
+from wlm.lightmap.codec import tile_sizes
 from wlm.lightmap.data import LightmapSet, load
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, count_kinds, memory_bytes
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings import encoding_of
+from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.frame_decode import image_kinds
-from wlm.lightmap.model import TILE, LightmapModel, Profile, TimeAxis
-from wlm.lightmap.page import MapDecoder
-from wlm.lightmap.runtime import ExactDecoder, FrameDecoder, MatrixDecoder, StripDecoder, fast_decoder
-from wlm.lightmap.seen import Tally
-from wlm.lightmap.tiles import TileGrid, TileKind, assemble
-from wlm.lightmap.views import VIEWS, views_of
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.profile import Profile, TimeAxis
+from wlm.lightmap.runtime import (
+    ExactDecoder,
+    FrameDecoder,
+    MatrixDecoder,
+    RuntimeDecoder,
+    StripDecoder,
+    fast_decoder,
+)
+from wlm.lightmap.runtime_texture import MapDecoder
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind, assemble
+from wlm.lightmap.view_scores import VIEWS, Tally, views_of
 from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
 
 PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
@@ -65,11 +75,10 @@ _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # of 1024 x 1024
 _PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # of the fit in plain torch: enough for its time
+_LOADS = 50  # tiles that are unpacked for the time of one
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
 _SEEN = ("seen", "ring", "between", "border", "view_psnr", "view_flip")  # scores that are figures by their names
-
-_Runtime = StripDecoder | MatrixDecoder | ExactDecoder | FrameDecoder
 
 # GELU by its gate, which is shorter to read in a plot.
 _GELUS = {"exact": "erf", "tanh": "tanh", "fast": "fast tanh"}
@@ -81,7 +90,6 @@ def run(
     device: str,
     set_path: str | os.PathLike[str] | None = None,
     names: Sequence[str] | None = None,
-    qualities: Sequence[int] = (),
     rivals: bool = True,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -92,8 +100,7 @@ def run(
             set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
-        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`, or none beside `qualities`.
-        qualities: Of the profile `video`, 0 to 100: a row for each, "video 75" for example.
+        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
         rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
         progress: Called with a line before each part of the work.
 
@@ -101,16 +108,13 @@ def run(
         The rows, in the order of the module's list.
 
     Raises:
-        WlmError: The set or the device isn't there, a quality is out of range, or a fit diverged.
+        WlmError: The set or the device isn't there, or a fit diverged.
     """
-    if not names:
-        names = () if qualities else QUICK_PROFILES if quick else PROFILES
-    profiles = [Profile.load(name) for name in names]
-    profiles += [Profile.load("video").override({"name": f"video {q}", "video_quality": q}) for q in qualities]
+    profiles = [Profile.load(name) for name in names or (QUICK_PROFILES if quick else PROFILES)]
     lightmaps = _load(set_path)
     chosen = np.arange(len(lightmaps.times))
     if quick:
-        steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.mask.shape).count)
+        steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.light.mask.shape).count)
         profiles = [
             profile.model_copy(update={"steps": min(steps, profile.steps), "samples": _QUICK_SAMPLES})
             for profile in profiles
@@ -175,7 +179,7 @@ def run_rows(
     fits = [bench.fit_profile(profile) for profile in profiles]
     peers = [row(fit) for fit in fits for row in (bench.profile_row, bench.texture_row)]
     best = next((fit for fit in fits if fit.option == "M"), fits[0])
-    if len(best.model.mapped):
+    if len(best.model.light.mapped):
         # On the CPU "fast" is "tanh".
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
         peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
@@ -183,7 +187,7 @@ def run_rows(
             peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
     rows += [bench.rival_row(name) for name in rivals]
-    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.mapped)]
+    rows += [bench.fit_row(fit) for fit in fits if len(fit.model.light.mapped)]
     return rows + bench.plain_rows(best)
 
 
@@ -202,18 +206,34 @@ def _hours(times: Sequence[float]) -> str:
     return ", ".join(f"{t:g}" for t in times)
 
 
-def _repeated(model: LightmapModel, count: int) -> LightmapModel:
+def _repeated(model: SheetModel, count: int) -> SheetModel:
     """The model of a map that holds the tiles of this one several times over."""
     arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     width, height = TILE * len(model.kind), TILE * count
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
 
 
-def _matrix(model: LightmapModel, device: str, gelu: str | None) -> MatrixDecoder:
+def _load_ms(model: SheetModel) -> float | None:
+    """The median time to unpack one tile of the file on the CPU, milliseconds; None without a packed tile."""
+    numbers = np.flatnonzero(tile_sizes(model)).tolist()
+    if not numbers:
+        return None
+    packed = [(number, encoding_of(model.kind[number])) for number in numbers]
+    frames = [(number, encoding, zstd.compress(encoding.pack(model, number))) for number, encoding in packed]
+    seconds = []
+    for number, encoding, frame in frames * max(1, _LOADS // len(frames)):
+        start = time.perf_counter()
+        data = zstd.decompress(frame, encoding.packed_size(model, number), "tile")
+        encoding.unpack(model, number, np.frombuffer(data, np.uint8))
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(seconds))
+
+
+def _matrix(model: SheetModel, device: str, gelu: str | None) -> MatrixDecoder:
     return MatrixDecoder(model, device)
 
 
-def _fast(model: LightmapModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
+def _fast(model: SheetModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
     return fast_decoder(model, device)
 
 
@@ -224,9 +244,9 @@ class _LightmapBench(Bench):
         self, lightmaps: LightmapSet, chosen: np.ndarray, device: str, progress: Note | None, repeats: int | None
     ) -> None:
         super().__init__("lightmap", device, progress, scene=lightmaps.name, repeats=repeats)
-        self.lightmaps, self.chosen = lightmaps, chosen
+        self.set, self.lightmaps, self.chosen = lightmaps, lightmaps.light, chosen
         self.times = [float(t) for t in lightmaps.times[chosen]]
-        self.grid = TileGrid.of(*lightmaps.mask.shape)
+        self.grid = TileGrid.of(*self.lightmaps.mask.shape)
         places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
         self.error_times = [self.times[i] for i in places]
         """Those at which the float64 path is run too."""
@@ -236,18 +256,18 @@ class _LightmapBench(Bench):
 
     def fit_profile(self, profile: Profile) -> Fit:
         """Fits and writes a profile; compiling its kernels is no part of either time."""
-        if profile.frames in ("always", "video"):  # no kernel is compiled
+        if profile.frames == "always":  # no kernel is compiled
             self.note(f"{profile.name}: encoding {self.grid.count} tiles")
-            return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
+            return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
         self.note(f"{profile.name}: fitting {self.grid.count} tiles, {profile.steps:,} steps")
-        compress(self.lightmaps, profile.model_copy(update={"steps": 10}), device=self.device)
-        return self.fit(profile.name, lambda: compress(self.lightmaps, profile, device=self.device))
+        compress(self.set, profile.model_copy(update={"steps": 10}), device=self.device)
+        return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """What a profile costs and yields; and its decode, to be timed."""
         self.note(f"{fit.option}: scoring")
-        model = fit.model
-        decoder = Decoder(model, self.device)
+        model = fit.model.light
+        decoder = SheetDecoder(model, self.device)
         frames = {t: decoder.frame(t) for t in self.times}
         error = 0.0
         for t in self.error_times:
@@ -258,11 +278,12 @@ class _LightmapBench(Bench):
             "ours",
             fit.option,
             f"{self.scored_at}errors of the float decode; time of the whole map to 8 bits, {self.mode}",
-            bytes=memory_bytes(model),
-            bpp=bits_per_texel(model, self.lightmaps.mask, memory_bytes(model)),
+            bytes=model.memory_bytes,
+            bpp=bits_per_texel(model, self.lightmaps.mask, model.memory_bytes),
             disk_bytes=fit.bytes,
             disk_bpp=bits_per_texel(model, self.lightmaps.mask, fit.bytes),
             encode_seconds=fit.seconds,
+            load_ms=_load_ms(model),
             max_error=error,
             steps=model.profile.steps if len(model.mapped) else None,
             **self._score(frames.values(), fit.option, decode=decoder.frame),
@@ -273,7 +294,7 @@ class _LightmapBench(Bench):
     def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """What a renderer samples of a profile: one texture of the map, with mips."""
         self.note(f"{fit.option}: texture")
-        decoder = MapDecoder(fit.model, self.device)
+        decoder = MapDecoder(fit.model.light, self.device)
 
         def frame(t: float) -> np.ndarray:
             decoder.set_time(t)
@@ -292,7 +313,7 @@ class _LightmapBench(Bench):
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
         """One way to decode a profile to 8 bits."""
         self.note(f"{fit.option}: {path} decode with {gelu} GELU")
-        model = fit.model
+        model = fit.model.light
         decoders = self._decoders(model, path, gelu)
         # A small map leaves most of a GPU idle: there the time is that of 1024 x 1024, the same tiles repeated.
         repeat = 1 if self.device == "cpu" else max(1, _FULL_TILES // self.grid.count)
@@ -350,7 +371,7 @@ class _LightmapBench(Bench):
             step_ms=1e3 * fit.fit_seconds / profile.steps,
             steps=profile.steps,
             samples=profile.samples,
-            **self._tiles(fit.model),
+            **self._tiles(fit.model.light),
         )
 
     def plain_rows(self, fit: Fit) -> list[Row]:
@@ -385,7 +406,7 @@ class _LightmapBench(Bench):
     def _assembled(self, tiles: np.ndarray) -> np.ndarray:
         return assemble(tiles, np.arange(self.grid.count), self.grid)
 
-    def _tiles(self, model: LightmapModel) -> dict[str, int]:
+    def _tiles(self, model: SheetModel) -> dict[str, int]:
         """Counts tiles by kind; those without valid texels are left out."""
         kinds = count_kinds(model).items()
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
@@ -404,7 +425,7 @@ class _LightmapBench(Bench):
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
 
     def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
-        """The scores of `wlm.lightmap.seen`, to be filled."""
+        """The scores of `wlm.lightmap.view_scores`, to be filled."""
         whole = len(self.chosen) == len(self.lightmaps.times)
         seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
         for warning in warnings:
@@ -431,20 +452,21 @@ class _LightmapBench(Bench):
         worst = {"worst_seen": score.worst_seen, "worst_between": score.worst_between}
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
-    def _decoders(self, model: LightmapModel, path: str, gelu: str | None) -> list[_Runtime]:
+    def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
         """Decoders of the tiles with maps; a constant tile needs no launch."""
-        decoders: list[_Runtime] = []
+        decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
             decoders.append(make(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
-        decoders += [FrameDecoder(model, self.device, kind) for kind in image_kinds(model)]
+        if len(model.frames):
+            decoders.append(FrameDecoder(model, self.device))
         for decoder in decoders:
             decoder.set_time(self.times[0])
         return decoders
 
-    def _decode(self, decoders: Sequence[_Runtime]) -> Callable[[], object]:
+    def _decode(self, decoders: Sequence[RuntimeDecoder]) -> Callable[[], object]:
         def decode() -> None:
             for decoder in decoders:
                 decoder.decode()
@@ -453,7 +475,7 @@ class _LightmapBench(Bench):
         return self.replay(decode) if decoders else decode
 
     def _tiles_8bit(
-        self, model: LightmapModel, decoders: Sequence[_Runtime], t: float, compare: bool
+        self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float, compare: bool
     ) -> tuple[np.ndarray, float]:
         """Radiance of all tiles through 8 bits, and the largest error of a byte over 255 if it is to be compared."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))

@@ -26,10 +26,8 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import memory_bytes
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, assemble
 from wlm.metrics import evaluate_frame, summarise
 
@@ -126,12 +124,12 @@ class _AblationBench(Bench):
 
     def __init__(self, lightmaps: LightmapSet, profile: Profile, device: str, progress: Note | None) -> None:
         super().__init__("lightmap", device, progress, scene=f"{lightmaps.name}, ablation")
-        self._lightmaps, self._profile = lightmaps, profile
-        targets = dynamic_targets(lightmaps, profile)
+        self._set, self._lightmaps, self._profile = lightmaps, lightmaps.light, profile
+        targets = dynamic_targets(self._lightmaps, profile)
         if targets is None:
             raise WlmError(f"{lightmaps.name}: expected a tile whose light changes in more than its strength")
         self._targets = targets
-        self._grid = TileGrid.of(*lightmaps.mask.shape)
+        self._grid = TileGrid.of(*self._lightmaps.mask.shape)
         tiles = np.ones((len(targets.number), TILE, TILE, 1), bool)
         self._held = assemble(tiles, targets.number, self._grid)[..., 0]
 
@@ -154,13 +152,13 @@ class _AblationBench(Bench):
     def kernels_row(self) -> Row:
         """The profile as it is shipped."""
         profile, tiles = self._profile, sorted(self._targets.number.tolist())
-        compress(self._lightmaps, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
+        compress(self._set, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
         start = time.perf_counter()
-        model = compress(self._lightmaps, profile, tiles=tiles, seed=_SEED, device=self.device)
+        model = compress(self._set, profile, tiles=tiles, seed=_SEED, device=self.device)
         seconds = time.perf_counter() - start
-        decoder = Decoder(model, self.device)
+        decoder = model.decoder(self.device)
         frames = (decoder.frame(t) for t in self._lightmaps.times)
-        return self._row(KERNELS, "fused kernels", memory_bytes(model), frames, seconds)
+        return self._row(KERNELS, "fused kernels", model.memory_bytes, frames, seconds)
 
     def _row(self, name: str, notes: str, size: int, frames: Iterable[np.ndarray], seconds: float) -> Row:
         lightmaps, steps = self._lightmaps, self._profile.steps

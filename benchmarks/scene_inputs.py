@@ -21,7 +21,7 @@ from wlm.atlas.matching import chart_map
 from wlm.atlas.tiles.layout import place
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
-from wlm.lightmap.data import LightmapSet
+from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.data import load as load_set
 from wlm.texels import fill_gaps, nearest_valid
 
@@ -50,7 +50,7 @@ def load(
     Raises:
         WlmError: The set or its mesh can't be read, or has no such hour or side.
     """
-    lightmaps = load_set(path, trust=trust)
+    lightmaps = load_set(path, trust=trust).light
     if lightmaps.mesh is None:
         raise WlmError(f"{path}: expected a set with a mesh")
     for hour in hours:
@@ -75,7 +75,7 @@ def load(
 
 
 def cut(
-    lightmaps: LightmapSet, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, factor: int = 1
+    lightmaps: SheetFrames, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, factor: int = 1
 ) -> LightmappedScene:
     """Cuts lightmaps into those of the objects of their mesh.
 

@@ -10,11 +10,11 @@ from benchmarks.rows import Row
 from benchmarks.smoke_network_setup import Frame, NetworkBench, Pipeline
 from wlm.config import profile_names
 from wlm.smoke.evaluation import of_decoder, score
-from wlm.smoke.model import SmokeModel
+from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.planes import GUIDES, decode_lightmaps, render_guide
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import DatasetSettings, Profile
-from wlm.smoke.network.unet import SixWayNetwork, parameter_count
+from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import LightSettings
 
 _LIGHTS = (

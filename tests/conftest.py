@@ -1,21 +1,20 @@
-"""What every test shares: the devices, and a Warp kernel cache that outlasts the run."""
+"""Shared by every test: the devices, and a cache of Warp kernels that outlasts the run."""
 
 import os
 from pathlib import Path
 
 import pytest
 
-# One folder a worker: two that compile the same module at once would race for its files. Set before anything
-# imports Warp, which reads it when it starts.
-_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
-# A worker a core: with a thread for each core in each of them, they wait for each other more than they compute.
-if _WORKER != "main":
+# A worker per core: with a thread for each core in each worker, they would wait for each other more than they compute.
+if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ["WARP_CACHE_PATH"] = str(Path(__file__).resolve().parents[1] / ".cache" / f"warp-{_WORKER}")
+# All workers share one cache, so that each kernel is compiled once: Warp builds a module in a folder of its process and
+# renames that folder. Set before anything imports Warp, which reads it when it starts.
+os.environ["WARP_CACHE_PATH"] = str(Path(__file__).resolve().parents[1] / ".cache" / "warp")
 
 
 def _devices() -> list[str]:
-    """Lists the devices to test on: those that Warp finds, narrowed by WLM_TEST_DEVICES."""
+    """Lists the devices to test on: all that Warp finds, or the ones that WLM_TEST_DEVICES names."""
     import warp as wp
 
     # Its banner and compile notes would drown a failing test's output.

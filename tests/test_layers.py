@@ -7,7 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 GROUND = (
     "wlm_kernels wlm wlm._facade wlm.bundle wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels "
-    "wlm.system wlm.workers wlm.shading"
+    "wlm.system wlm.workers"
 )
 FLOORS = (
     GROUND.split(),

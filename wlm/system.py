@@ -31,7 +31,6 @@ from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read
 # Which package reads which system's files.
 _PACKAGES = {
     "lightmap": "wlm.lightmap",
-    "lightmap-layers": "wlm.lightmap.layers",
     "atlas": "wlm.atlas",
     "probe": "wlm.probe",
     "smoke-network": "wlm.smoke",
@@ -238,6 +237,21 @@ class Model:
         """
         room, name = self.DECODER
         return getattr(_room(self.SYSTEM, room), name)(self, device, **options)
+
+    def bundle(self, device: str = "cpu", **options: Any) -> Any:
+        """Makes the textures, buffers and shader that a GPU reads.
+
+        Args:
+            device: Device that decodes the reference.
+            options: Further arguments of the system's `bundle`.
+
+        Returns:
+            The `wlm.bundle.Bundle`.
+
+        Raises:
+            WlmError: There is no such device, or the model can not be exported.
+        """
+        return _room(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
         """Settings, parts and source of the file."""

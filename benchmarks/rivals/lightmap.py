@@ -19,14 +19,7 @@ from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
 from benchmarks.rivals.lightmap_video import encode_av1
 from benchmarks.rivals.rival import Rival
 from wlm.errors import WlmError
-from wlm.interop import check_device
-from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.evaluation import SCORES, scored_mask
-from wlm.lightmap.model import TILE, LightmapModel
-from wlm.lightmap.seen import SeenScore, Tally
-from wlm.lightmap.views import VIEWS, views_of
-from wlm.metrics import FrameMetrics, evaluate_frame, summarise
-from wlm.system import Meter, OnProgress
+from wlm.lightmap.data import SheetFrames
 
 _Scored = TypeVar("_Scored")
 
@@ -113,28 +106,6 @@ def usual(device: str, quick: bool = False) -> tuple[str, ...]:
     return tuple(name for name in names if device != "cpu" or not RIVALS[name].fitted)
 
 
-@dataclass(frozen=True)
-class Score(SeenScore):
-    """How wrong a rival is on a set, over the texels that ours is scored over.
-
-    Between stored times its light is the mix of the two lightmaps. The scores of `SeenScore` are attributes too.
-
-    Attributes:
-        psnr, ssim, flip: As in the report of `wlm.lightmap.evaluate`.
-        bpp: Bits in memory for each texel and time, of the whole map, also where only some tiles are scored.
-        bytes: Of all times of the whole map; a video's are those on the disk.
-        disk_bpp, disk_bytes: The same after lossless compression.
-    """
-
-    psnr: float
-    ssim: float
-    flip: float
-    bpp: float
-    bytes: int
-    disk_bpp: float
-    disk_bytes: int
-
-
 def check_rival(name: str) -> None:
     """Raises a `WlmError` where `RIVALS` has no method of this name."""
     if name not in RIVALS:
@@ -143,7 +114,7 @@ def check_rival(name: str) -> None:
 
 def encode_set(
     name: str,
-    lightmaps: LightmapSet,
+    lightmaps: SheetFrames,
     visit: Callable[[int, np.ndarray], _Scored],
     chosen: Sequence[int] | np.ndarray | None = None,
     *,
@@ -153,7 +124,7 @@ def encode_set(
 
     Args:
         name: A key of `RIVALS`.
-        lightmaps: The set.
+        lightmaps: The lightmaps.
         visit: Called with the index of a time and its decoded lightmap, float32 [H, W, 3], in the order of `chosen`.
         chosen: Indices of the times to visit, at least one; None for all. A method that takes one lightmap at a time
             encodes these alone; the sizes and the seconds of all times are then estimated from them.
@@ -186,56 +157,3 @@ def encode_set(
     sizes = {key: round(total(key)) for key in ("bytes", "disk_bytes")}
     seconds = {key: total(key) for key in ("encode_seconds", "decode_seconds")}
     return replace(rivals[0], option=" and ".join(options), **sizes, **seconds), visits
-
-
-def evaluate_rivals(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    names: Sequence[str] | None = None,
-    *,
-    metrics: Sequence[str] = SCORES,
-    views: int = VIEWS,
-    device: str = "cpu",
-    progress: OnProgress | None = None,
-) -> list[tuple[Rival, Score]]:
-    """Puts a set through rivals and scores the texels that `evaluate` scores.
-
-    Args:
-        model: The model to compare with: it says which tiles are scored.
-        lightmaps: The input.
-        names: Keys of `RIVALS`; None: a third of them, see `usual`.
-        metrics, views: As for `wlm.lightmap.evaluate`.
-        device: As for `encode_set`.
-        progress: Called about twice a second.
-
-    Returns:
-        For each name the rival, with bytes and seconds of all times and without what was decoded, and its score.
-
-    Raises:
-        WlmError: As `wlm.lightmap.evaluate`, an unknown name, or the extra `baselines` is missing.
-    """
-    device = check_device(device)
-    names = usual(device, quick=True) if names is None else names
-    mask, count = scored_mask(model, lightmaps), len(lightmaps.frames)
-    plain, seen = [metric for metric in metrics if metric != "seen"], "seen" in metrics
-    meter = Meter(progress, "baselines", len(names) * count)
-    results = []
-    for k, name in enumerate(names):
-        tally = Tally(lightmaps, mask, views=views_of(lightmaps, views if seen else 0)[0], name=name)
-
-        def score(i: int, decoded: np.ndarray, k: int = k, name: str = name, tally: Tally = tally) -> FrameMetrics:
-            inside = mask & lightmaps.valid(i)
-            frame = evaluate_frame(lightmaps.frames[i], decoded, inside, TILE, plain, name=name)
-            if seen:
-                tally.add(i, decoded, frame)
-            if meter.due(k * count + i + 1):
-                meter.report(k * count + i + 1)
-            return frame
-
-        rival, frames = encode_set(name, lightmaps, score, device=device)
-        summary, texels = summarise(frames), lightmaps.mask.size * count
-        scores = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **vars(tally.score())}
-        sizes = rival.bytes * 8 / texels, rival.bytes, rival.disk_bytes * 8 / texels, rival.disk_bytes
-        keys = ("bpp", "bytes", "disk_bpp", "disk_bytes")
-        results.append((rival, Score(**scores, **dict(zip(keys, sizes, strict=True)))))
-    return results

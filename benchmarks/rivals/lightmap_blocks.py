@@ -23,7 +23,7 @@ from wlm.errors import WlmError
 from wlm.formats import bc7_modes, hdr_blocks
 from wlm.formats.block_reuse import reuse_blocks
 from wlm.formats.hdr_blocks import ASTC_THOROUGH, need
-from wlm.lightmap.model import TILE
+from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
 
 _BC_BLOCK = 4  # texels along a block's side

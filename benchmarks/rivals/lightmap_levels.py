@@ -16,8 +16,8 @@ from scipy.ndimage import binary_dilation
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-from wlm.lightmap.frames import round_half
-from wlm.lightmap.model import TILE
+from wlm.lightmap.encodings.frames import round_half
+from wlm.lightmap.tiles import TILE
 from wlm.texels import fill_gaps
 
 GAMMA = 2.2

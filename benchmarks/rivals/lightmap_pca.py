@@ -22,7 +22,7 @@ from benchmarks.rivals.lightmap_levels import TileRanges, prepare, seen_texels, 
 from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
-from wlm.lightmap.model import TILE
+from wlm.lightmap.tiles import TILE
 from wlm.texels import fill_gaps
 
 _BC4_BLOCK = 4

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from benchmarks.rivals.rival import EXTRA
 from wlm.formats.hdr_blocks import need
-from wlm.lightmap.model import Profile, TimeAxis, encode_time
+from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE
 from wlm.ops import plain
@@ -134,7 +134,7 @@ class PlainFit:
         self.tile_bytes = f.bytes + 2 * sum(value[0].numel() for value in net) + 4 * times + 12
         groups = [{"params": maps, "lr": profile.map_rate}, {"params": net, "lr": profile.net_rate}]
         betas = (_MOMENTUM, profile.adam_decay)
-        self._adam = torch.optim.Adam(groups, fused=True, eps=profile.adam_epsilon, betas=betas)
+        self._adam = torch.optim.Adam(groups, fused=True, betas=betas)
         final, last = profile.final_rate, max(profile.steps - 1, 1)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(
             self._adam, lambda s: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(s / last, 1)))

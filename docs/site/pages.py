@@ -22,8 +22,7 @@ PACKAGES = (
     "wlm.ops",
     "wlm.bake",
     "wlm.inspection",
-    "wlm.export.engines",
-    "wlm.export.page",
+    "wlm.export",
 )
 _OUTSIDE = re.compile(
     r"\[([^\]]+)\]\((?:\.\./)*(?:wlm|wlm_kernels|benchmarks|demos|tests|configs|LICENSE|README\.md)(?:[/#][^)]*)?\)"

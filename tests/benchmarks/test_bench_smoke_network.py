@@ -105,7 +105,7 @@ def test_flip_book(rows):
 def test_profiles(rows):
     profiles = by_option(rows, "profiles")
     names = [name.removeprefix("network-") for name in profile_names("smoke") if name.startswith("network-")]
-    assert list(profiles) == [f"{name}, fp32" for name in names] and {"16", "24", "32", "fast"} <= set(names)
+    assert list(profiles) == [f"{name}, fp32" for name in names] and {"fast", "paper"} <= set(names)
     for row in profiles.values():
         assert row["file_size"] == pytest.approx(2e-6 * row["parameters"])
 
@@ -137,8 +137,8 @@ def test_scenes_that_do_not_come_up():
 def test_networks_are_named_and_read(network, tmp_path):
     (subject,) = open_subjects([network], [])
     assert subject.name == "young" and subject.trained and subject.settings == SETTINGS
-    (raw,) = open_subjects([], ["16"])
-    assert raw.name == "network-16 untrained" and not raw.trained and raw.model.settings.width == 16
+    (raw,) = open_subjects([], ["paper"])
+    assert raw.name == "network-paper untrained" and not raw.trained and raw.model.settings.width == 16
     with pytest.raises(WlmError, match="got young 2 times"):
         open_subjects([network, network], [])
     with pytest.raises(WlmError, match="nosuch"):
@@ -157,12 +157,13 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
 
 
 def test_the_command(rows, network, tmp_path, monkeypatch):
-    words = ["smoke-network", "--quick", "--network", network, "--profile", "16"]
+    words = ["smoke-network", "--quick", "--network", network, "--profile", "paper"]
     command, arguments, options = check_command(monkeypatch, bench, rows, words, tmp_path)
-    assert command == "python -m benchmarks smoke-network --quick --device cpu --network young.safetensors --profile 16"
-    assert arguments == ([network], ["16"]) and options["quick"] and options["device"] == "cpu"
+    expected = "smoke-network --quick --device cpu --network young.safetensors --profile paper"
+    assert command == f"python -m benchmarks {expected}"
+    assert arguments == ([network], ["paper"]) and options["quick"] and options["device"] == "cpu"
     # Without any, the network that ships; a profile alone stays alone.
-    for words, expected in (([], ([shipped()], ())), (["--profile", "16"], ([], ["16"]))):
+    for words, expected in (([], ([shipped()], ())), (["--profile", "paper"], ([], ["paper"]))):
         assert check_command(monkeypatch, bench, rows, ["smoke-network", *words], tmp_path)[1] == expected
 
 
@@ -171,9 +172,9 @@ def test_networks_or_profiles_are_needed(monkeypatch):
     monkeypatch.setattr(bench, "run_rows", lambda sizes, subjects, **options: calls.append((sizes, subjects)))
     with pytest.raises(WlmError, match="^bench: expected --network FILE or --profile NAME, found neither$"):
         run(quick=True, device="cpu")
-    run([], ["16"], quick=True, device="cpu")
+    run([], ["paper"], quick=True, device="cpu")
     ((sizes, (subject,)),) = calls
-    assert sizes == QUICK and subject.name == "network-16 untrained"
+    assert sizes == QUICK and subject.name == "network-paper untrained"
 
 
 def test_without_the_extra(monkeypatch):

@@ -44,29 +44,16 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 def _lightmap() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (2, 7), "times": (3, 24.5), "constant": (0, -1.0), "scale_static": (0, -0.5), "affine": (0, -1.0)}
+    ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.scale_static": (0, -0.5)}
+    ranges |= {"0.affine": (0, -1.0)}
     return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
 def _frames() -> Kept:
     from builders.synthetic import random_model
 
-    ranges = {"kind": (1, 7), "ranges": ((0, 0, 0), 3.0)}
+    ranges = {"0.kind": (1, 7), "0.ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
-
-
-def _video() -> Kept:
-    from builders.synthetic import random_model
-
-    ranges = {"kind": (1, 7), "video_ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(random_model((5, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
-
-
-def _levels() -> Kept:
-    from builders.synthetic import random_model
-
-    ranges = {"kind": (1, 7), "level_ranges": ((0, 0, 0, 0), 3.0)}
-    return Kept(_written(random_model((6, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _layers() -> Kept:
@@ -102,14 +89,6 @@ def _smoke() -> Kept:
     return Kept(_written(random_model(levels=2).save), wlm.load, {}, {})
 
 
-def _pool() -> Kept:
-    from wlm.smoke.network.pool import load_pool, save_pool
-    from wlm.smoke.network.settings import DatasetSettings
-
-    content = _written(lambda path: save_pool(path, _samples(), DatasetSettings(), "seed-0"))
-    return Kept(content, load_pool, {}, {})
-
-
 def _samples() -> Any:
     import torch
 
@@ -124,12 +103,12 @@ def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
     from builders.small_sets import moving_light, tiny_profile
 
-    from wlm.lightmap.fit import _Fit
+    from wlm.lightmap.fit import SheetFit
     from wlm.lightmap.trainer import Trainer
 
-    fit = _Fit(moving_light(40, 24), tiny_profile())
-    (batch,) = fit.batches()
-    trainer = Trainer(fit.profile, fit.model.axis, fit.piece(batch.rows).targets(), True, 0, "cpu")
+    fit = SheetFit(moving_light(40, 24).light, tiny_profile())
+    (batch,) = fit.batches(0)
+    trainer = Trainer(fit.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
     trainer.run(3)
     return fit, trainer
 
@@ -153,7 +132,7 @@ def _lightmap_running() -> Kept:
 
 def _lightmap_finished() -> Kept:
     fit, trainer = lightmap_fit()
-    (batch,) = fit.batches()
+    (batch,) = fit.batches(0)
     content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").add_finished(0, trainer.quantised()))
     return Kept(content, lambda path: _opened(path, "lightmap").finished(0, fit.table(batch)), {}, {})
 
@@ -225,15 +204,12 @@ KEPT: dict[str, Callable[[], Kept]] = {
     for name, make in {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
-        "lightmap-video": _video,
-        "lightmap-levels": _levels,
         "lightmap-layers": _layers,
         "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),
         "atlas-bc6h": lambda: _atlas("plain with uv", "bc6h"),
         "smoke": _smoke,
-        "pool": _pool,
         "lightmap-running": _lightmap_running,
         "lightmap-finished": _lightmap_finished,
         "probe-running": _probe_running,

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 from builders.small_sets import HOURS, moving_light
-from builders.synthetic import random_model
+from builders.synthetic import random_sheet
 from PIL import Image
 
 from wlm.formats.exr import write_exr
-from wlm.lightmap.layers.data import LayerArrays, LayeredSet, from_layers
-from wlm.lightmap.layers.model import LayeredModel
-from wlm.lightmap.layers.sheet import Sheet
+from wlm.lightmap.data import Layer, LightmapSet, from_layers
+from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.sheet import Sheet
 
 SHEETS = (
     Sheet("a", "light", ("R", "G", "B"), "radiance"),
@@ -21,19 +21,19 @@ SHEETS = (
 )
 
 
-def random_layers(**settings) -> LayeredModel:
+def random_layers(**settings) -> LightmapModel:
     """A model of random maps: atlas a with gaps and four more channels, atlas b of light alone."""
     mask = np.random.default_rng(3).random((108, 119)) < 0.7
     linear = {"gamma": 1.0, "peak": 1.0}
     models = [
-        random_model((3,), 1, seed=1, mask=mask, **settings),
-        random_model((4,), 1, seed=2, mask=mask, **linear, **settings),
-        random_model((1,), 1, seed=3, mask=mask, **linear, **settings),
-        random_model((2, 0), 2, seed=4, **settings),
+        random_sheet((3,), 1, seed=1, mask=mask, **settings),
+        random_sheet((4,), 1, seed=2, mask=mask, **linear, **settings),
+        random_sheet((1,), 1, seed=3, mask=mask, **linear, **settings),
+        random_sheet((2, 0), 2, seed=4, **settings),
     ]
     for model in models[1:]:
         model.mask = mask if model.mask.shape == mask.shape else model.mask
-    return LayeredModel("random", "fedcba9876543210", dict(zip(SHEETS, models, strict=True)))
+    return LightmapModel("random", "fedcba9876543210", models[0].profile, dict(zip(SHEETS, models, strict=True)))
 
 
 def turning_directions(height=128, width=128, hours=HOURS) -> np.ndarray:
@@ -45,15 +45,15 @@ def turning_directions(height=128, width=128, hours=HOURS) -> np.ndarray:
     return (np.stack([x, y, z], -1) / np.sqrt(x**2 + y**2 + z**2)[..., None]).astype(np.float32)
 
 
-def small_layers(height=128, width=128, hours=HOURS, period=24.0) -> LayeredSet:
+def small_layers(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet:
     """Light, directions and a mask of three channels, of which one is zero and two are equal."""
     light, directions = moving_light(height, width, hours).frames, turning_directions(height, width, hours)
     mask = np.zeros((len(hours), height, width, 3), np.float32)
     mask[..., 1] = mask[..., 2] = light[..., 0] / light.max()
     layers = [
-        LayerArrays(light, "light"),
-        LayerArrays(directions, "dir", encoding="signed"),
-        LayerArrays(mask, "shadow", encoding="unit"),
+        Layer(light, "light"),
+        Layer(directions, "dir", encoding="signed"),
+        Layer(mask, "shadow", encoding="unit"),
     ]
     return from_layers(layers, hours, period=period, name="layers")
 

@@ -6,8 +6,8 @@ import numpy as np
 from PIL import Image
 
 from wlm.formats.exr import write_exr
-from wlm.lightmap.data import LightmapSet, from_arrays
-from wlm.lightmap.model import Profile
+from wlm.lightmap.data import LightmapSet, SheetFrames, from_arrays, load
+from wlm.lightmap.profile import Profile
 
 HOURS = (0.0, 5.0, 11.0, 13.5, 20.0)
 
@@ -40,7 +40,18 @@ def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
 def write_set(folder: Path, lightmaps: LightmapSet) -> None:
     """Writes the frames of a set into a new folder, and its mask if not all is valid; their names tell their hours."""
     folder.mkdir()
-    if not lightmaps.mask.all():
-        Image.fromarray(lightmaps.mask.astype(np.uint8) * 255).save(folder / "mask.png")
-    for time, frame in zip(lightmaps.times, lightmaps.frames, strict=True):
+    light = lightmaps.light
+    if not light.mask.all():
+        Image.fromarray(light.mask.astype(np.uint8) * 255).save(folder / "mask.png")
+    for time, frame in zip(light.times, light.frames, strict=True):
         write_exr(folder / f"light_{time:05.2f}h.exr".replace(".", "_", 1), frame, half=False)
+
+
+def load_sheet(*args, **options) -> SheetFrames:
+    """Reads the first sheet of light of a set."""
+    return load(*args, **options).light
+
+
+def sheet_from_arrays(*args, **options) -> SheetFrames:
+    """Makes the sheet of a set from arrays."""
+    return from_arrays(*args, **options).light

@@ -27,7 +27,7 @@ def smoke(layout, _) -> Subject:
     frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
     camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
     first, second = pack(frames, layout, rows=2, columns=3, gain=0.5, padding=2)
-    text = smoke_shader("glsl", layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
+    text = smoke_shader(layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
     asked, way, expected = [], [], []
     for n, frame in enumerate(frames):
         for row, column in ((0, 0), (3, 7), (5, 8)):
@@ -68,7 +68,7 @@ def smoke_point(_) -> Subject:
     frame, depth = SixWay(maps[:6], maps[6], None, camera), torch.tensor(random.uniform(-1, 1, (6, 9)))
     first, second = pack([frame], "unity", rows=1, columns=1, padding=1)
     book = {"rows": 1, "columns": 1, "count": 1, "size": (6, 9), "padding": 1, "hot": False}
-    text = smoke_shader("glsl", "unity", **book, depth=0.4)
+    text = smoke_shader("unity", **book, depth=0.4)
     away = lay_out(encoded_depth(depth[None] / 3.0, 0.4), 1, 1, 1)
     asked, way, expected = [], [], []
     for position in ((0.2, 0.1, 0.3), (-2.0, 1.5, 0.0), (0.5, -3.0, -4.0)):
@@ -110,7 +110,7 @@ def smoke_motion(_) -> Subject:
     """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
     random = np.random.default_rng(7)
     size, scale = {"rows": 2, "columns": 3, "count": 5, "size": (24, 24), "padding": 4}, 0.07
-    text = smoke_shader("glsl", "unity", **size, motion=scale)
+    text = smoke_shader("unity", **size, motion=scale)
     asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
     way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
     way[0, :2] = ZERO

@@ -3,20 +3,24 @@
 import numpy as np
 
 from wlm.formats.bc7 import pack_mode6
-from wlm.lightmap.frame_packing import clear_unneeded, needed_blocks
-from wlm.lightmap.level_packing import join_streams
-from wlm.lightmap.model import LightmapModel, Profile
-from wlm.lightmap.streams import code_levels
-from wlm.lightmap.tiles import TileGrid, TileKind, valid_texels
-from wlm.lightmap.video import encode_levels
-from wlm.lightmap.video_packing import pages
+from wlm.lightmap.encodings.frames import clear_unneeded, needed_blocks
+from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.profile import Profile
+from wlm.lightmap.sheet import LIGHT
+from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm_kernels import mlp
 
 
-def random_model(
+def random_model(*args, **options) -> LightmapModel:
+    """Makes a model with one sheet, see `random_sheet`."""
+    sheet = random_sheet(*args, **options)
+    return LightmapModel("random", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
+
+
+def random_sheet(
     kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, mask=None, **settings
-) -> LightmapModel:
-    """Makes a model with tiles of these kinds, `columns` in a row; without a `mask` it has no gaps.
+) -> SheetModel:
+    """Makes a sheet with tiles of these kinds, `columns` in a row; without a `mask` it has no gaps.
 
     `settings` are the profile's.
     """
@@ -50,24 +54,12 @@ def random_model(
     for i, number in enumerate(framed.tolist()):
         frames[i] = clear_unneeded(frames[i], needed_blocks(mask, number))
     ranges = np.sort(rng.uniform(0.0, 1.5, (len(framed), len(times), 2, 3)), axis=2)
-    streams = []
-    for page in pages(kind, columns, len(times)):
-        levels = rng.random((len(times), *(side // 16 for side in page.shape), 3)).repeat(16, 1).repeat(16, 2)
-        streams.append(np.frombuffer(encode_levels(levels.astype(np.float32), 60, 10), np.uint8))
-    video_ranges = np.sort(rng.uniform(0.0, 1.5, (int((kind == TileKind.VIDEO).sum()), len(times), 2)), axis=2)
-    levelled = np.flatnonzero(kind == TileKind.LEVELS)
-    shape = len(levelled), len(times), 8, 8, 3
-    levels = np.random.default_rng(seed).integers(0, 1024, shape, np.uint16).repeat(16, 2).repeat(16, 3)
-    valid = [valid_texels(mask, number) for number in levelled.tolist()]
-    coded = join_streams([code_levels(*tile) for tile in zip(levels, valid, strict=True)])
-    level_ranges = np.sort(rng.uniform(0.0, 1.5, (len(levelled), len(times), 2, 3)), axis=2)
-    return LightmapModel(
+    return SheetModel(
         name="random",
         width=width,
         height=height,
         times=np.array(times, np.float64),
         period=period,
-        source="0123456789abcdef",
         profile=profile,
         mask=mask,
         kind=kind,
@@ -84,12 +76,6 @@ def random_model(
         constant=rng.uniform(0.0, 3.0, (constant, len(times), 3)).astype(np.float16),
         frames=frames,
         ranges=ranges.astype(np.float16),
-        video=np.concatenate(streams) if streams else np.zeros(0, np.uint8),
-        video_sizes=np.array([len(stream) for stream in streams], np.uint32),
-        video_ranges=video_ranges.astype(np.float16),
-        levels=coded[0],
-        level_sizes=coded[1],
-        level_ranges=level_ranges.astype(np.float16),
     )
 
 

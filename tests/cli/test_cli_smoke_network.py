@@ -22,7 +22,6 @@ from wlm.smoke.march.coarse import bake_coarse
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network import dataset, onnx_file
 from wlm.smoke.network.planes import GUIDES, encode_lightmaps, render_guide
-from wlm.smoke.network.pool import load_pool
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.network.trainer import Trainer
 from wlm_kernels.smoke.settings import March
@@ -173,7 +172,7 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     monkeypatch.setattr(codec, "shipped", lambda: network)
     text = call("smoke", "evaluate", "--resolution", 16, "--json", tmp_path / "a.json")
     assert str(network) in text.replace("\n", "") and json.loads((tmp_path / "a.json").read_text())["cells"] == 16
-    monkeypatch.setattr(onnx_file, "export", lambda model, path, **size: model.settings.width)
+    monkeypatch.setattr(onnx_file, "export_onnx", lambda model, path, **size: model.settings.width)
     assert "8 bytes, 512 x 512 pixels" in call("smoke", "export", "-o", tmp_path / "a.onnx")
 
 
@@ -229,21 +228,6 @@ def test_export(network, tmp_path):
     (planes,) = runtime.InferenceSession(out).run(["lightmaps"], {"guide": guide.numpy()})
     with torch.no_grad():
         assert np.allclose(planes, wlm.load(network).network(guide), atol=1e-5)
-
-
-def test_dataset(tmp_path):
-    """A file and a picture of the samples, of a round and of the validation."""
-    names = ("cells", "refine", "resolution", "sequences", "frames", "views", "views_a_frame", "warmup")
-    settings = {name: PROFILE["dataset"][name] for name in (*names, "validation_sequences")}
-    (tmp_path / "a.yaml").write_text(yaml.safe_dump(settings))
-    words = ("smoke", "dataset", tmp_path / "a.yaml", "-o")
-    for more, count in (((), 1), (("--validation",), 2)):
-        assert "seconds: reference" in call(*words, tmp_path / "out", *more)
-        assert len(load_pool(tmp_path / "out" / "pool.safetensors")) == count
-        assert (tmp_path / "out" / "sheet.png").stat().st_size > 500
-    (tmp_path / "b.yaml").write_text("cells: 2\n")
-    assert "b.yaml: cells: " in fails("smoke", "dataset", tmp_path / "b.yaml", "-o", tmp_path / "out")
-    assert "cannot write there" in fails(*words, tmp_path / "no" / "out")
 
 
 def test_wrong_words_are_one_line(trained, network, volume, tmp_path):

@@ -72,6 +72,33 @@ def test_nothing_half_written_is_left(tmp_path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
 
 
+def test_files_in_subfolders_are_replaced(tmp_path):
+    """Without a rule for names: what the old index lists goes; other files, and what lies elsewhere, stay."""
+    folder = tmp_path / "out"
+
+    def put(*names):
+        with staged(folder, INDEX, FORMAT) as made:
+            for name in names:
+                (made / name).parent.mkdir(exist_ok=True)
+                (made / name).write_text(name)
+            write_index(made / INDEX, {"format": FORMAT})
+
+    put("a", "sheet/b", "sheet/c")
+    assert read_index(folder / INDEX)["files"] == ["a", "sheet/b", "sheet/c"]
+    (folder / "mine.txt").write_text("x")
+    put("sheet/c", "d")
+    left = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert left == {INDEX, "d", "sheet/c", "mine.txt"}
+    put("d")
+    assert not (folder / "sheet").exists()
+    (tmp_path / "victim").write_text("x")
+    (folder / "link").symlink_to(tmp_path)
+    hostile = ["../victim", "link/victim", str(tmp_path / "victim"), "mine.txt/../mine.txt", 3, None, "d"]
+    write_index(folder / INDEX, {"format": FORMAT, "files": hostile})
+    put("a")
+    assert (tmp_path / "victim").exists() and (folder / "mine.txt").exists() and not (folder / "d").exists()
+
+
 def test_folders_of_others_are_refused(tmp_path):
     folder = tmp_path / "full"
     folder.mkdir()

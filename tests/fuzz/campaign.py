@@ -95,7 +95,7 @@ class Worker:
         # One thread: workers are as many as there are cores. No GPU: its driver isn't what is looked at.
         self._folder = tempfile.mkdtemp(prefix="wlm-fuzz-")
         environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "TMPDIR": self._folder}
-        cache = environment.get("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp-main"))
+        cache = environment.get("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp"))
         # Two that compile one kernel at once would race for its files.
         environment["WARP_CACHE_PATH"] = f"{cache}-{self.number}" if self.number else cache
         self._process = subprocess.Popen(

@@ -9,7 +9,6 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import OpenEXR
-import torch
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_models, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
@@ -26,8 +25,6 @@ from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.flipbook.shots import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
-from wlm.smoke.network.pool import Pool, save_pool
-from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
@@ -199,9 +196,6 @@ def _smoke(folder: Path) -> None:
     six = bake_smoke(plume, smoke_plumes.facing(plume, size=12), estimate=False)
     looks = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE]}).looks(1)
     write_six_way(folder / "six-way.exr", with_surface(six, plume, looks), looks)
-    guides, targets = (torch.linspace(0, 1, 2 * planes * 16).reshape(1, 2, planes, 4, 4).half() for planes in (3, 8))
-    pool = Pool(guides, targets, torch.zeros(1, 2, 4, 4).half(), torch.zeros(1, dtype=torch.int64))
-    save_pool(folder / "pool.safetensors", pool, DatasetSettings(), "seed-0")
     scene = Scene.model_validate(smoke_plumes.SCENE | {"obstacles": [smoke_plumes.SPHERE], "frames": 1})
     open_frames(folder / "frames", scene)
     (folder / "frames" / "scene.json").rename(folder / "scene.json")

@@ -272,7 +272,7 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
         for suffix, reader in (
             (".wlm", "lightmap"),
             (".partial", "probe-checkpoint"),
-            (".safetensors", "smoke-pool"),
+            (".safetensors", "smoke-network"),
             (".exr", "exr"),
             (".hdr", "radiance"),
             (".ktx2", "ktx2"),

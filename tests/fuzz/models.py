@@ -20,12 +20,11 @@ from wlm.probe.day import DayModel
 from wlm.probe.regions import RegionModel
 from wlm.probe.transform import Transform
 from wlm.smoke.march.motion import read_velocity, write_velocity
-from wlm.smoke.network.pool import load_pool
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
 
 from .containers import vary_artifact, vary_compact, vary_npz
-from .reader import Reader, check_digest, check_finite, corpus, stored
+from .reader import Reader, check_digest, check_finite, stored
 
 
 def _lightmap(path: Path) -> None:
@@ -126,15 +125,6 @@ def _velocity(path: Path) -> None:
     velocity = read_velocity(path)
     check_finite(velocity=velocity)
     assert velocity.ndim == 4 and velocity.shape[3] == 3, f"accepted {velocity.shape}"
-
-
-def _pool(path: Path) -> None:
-    pool = load_pool(path)
-    check_digest(path)
-    parts = {"guides": pool.guides, "targets": pool.targets, "motion": pool.motion}
-    check_finite(**parts)
-    assert all(part.dtype == torch.half for part in parts.values()), "accepted parts that aren't half floats"
-    assert pool.sequence.dtype == torch.int64, "accepted sequences that aren't 64-bit"
 
 
 # Checkpoints: a fit goes on from each, to its end.
@@ -352,7 +342,6 @@ READERS = (
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-velocity", "a.npz", _velocities, vary_npz, _velocity),
-    Reader("smoke-pool", "pool.safetensors", corpus("pool.safetensors"), vary_artifact, _pool),
     Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
     Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),
     Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from wlm_kernels.lightmap.video import VIDEO
 
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
@@ -13,7 +14,6 @@ from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.frames import FRAMES
-from wlm_kernels.lightmap.video import VIDEO
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network

@@ -8,12 +8,14 @@ import imagecodecs
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.small_sets import load_sheet as load
+from builders.small_sets import sheet_from_arrays as from_arrays
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.formats.exr import write_exr
 from wlm.formats.light import read_light
-from wlm.lightmap.data import from_arrays, load, parse_times
+from wlm.lightmap.data import parse_times
 
 HEIGHT, WIDTH = 5, 7
 TIMES = (0.0, 6.5, 18.55)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.synthetic import random_model
+from builders.synthetic import random_sheet
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
@@ -27,7 +27,7 @@ TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
     ids=str,
 )
 def test_the_decoder_agrees(settings, device):
-    model = random_model(**settings)
+    model = random_sheet(**settings)
     decoder = Decoder(model, device)
     for time in TIMES:
         tiles = decoder.tiles(range(4), time)
@@ -46,7 +46,7 @@ def test_the_decoder_agrees(settings, device):
 
 def test_a_network_that_passes_its_features_through():
     """One texel by hand: the first layer reads F_uv's red alone, far on GELU's linear side, and the rest copies it."""
-    model = random_model(kinds=(2, 0), seed=3)
+    model = random_sheet(kinds=(2, 0), seed=3)
     net = np.zeros_like(model.net_static)
     hidden, width = net[0], model.profile.hidden
     hidden[0 * width] = 1.0  # input 0 to unit 0
@@ -71,7 +71,7 @@ def test_a_network_that_passes_its_features_through():
 
 
 def test_what_is_not_there():
-    model = random_model()
+    model = random_sheet()
     with pytest.raises(WlmError, match="tile 4 is outside"):
         decode_tile64(model, 4, 0.0)
     with pytest.raises(WlmError, match="finite"):

@@ -11,6 +11,9 @@ from builders.running import report_always
 from builders.shader_runs import read_dds_levels
 from builders.small_sets import HOURS, tiny_profile
 from builders.synthetic import random_model
+from wlm.lightmap.layers import codec
+from wlm.lightmap.layers.data import LayerArrays, from_layers
+from wlm.lightmap.layers.model import LayeredModel
 
 import wlm
 from wlm.export.page.pages import make_page
@@ -18,9 +21,6 @@ from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import Pace
 from wlm.formats.exr import read_exr
 from wlm.lightmap import survey
-from wlm.lightmap.layers import codec
-from wlm.lightmap.layers.data import LayerArrays, from_layers
-from wlm.lightmap.layers.model import LayeredModel
 from wlm.lightmap.tiles import TileKind
 
 

@@ -7,13 +7,13 @@ import pytest
 from builders.checks import error_of
 from builders.layered_sets import write_set_json, write_unity
 from PIL import Image
+from wlm.lightmap.layers.data import LayerArrays, LayeredSet, from_layers
 
 import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import read_exr, write_exr, write_part
 from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.layers.data import LayerArrays, LayeredSet, from_layers
 
 RGB = ("R", "G", "B")
 

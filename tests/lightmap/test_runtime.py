@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from builders.synthetic import random_model
+from builders.synthetic import random_sheet
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.lightmap.decode import Decoder
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.exact import colour_tile64
 from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
@@ -15,8 +15,8 @@ KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic o
 
 
 def test_strip_and_exact_agree_at_any_time(device):
-    model = random_model(KINDS, hidden=16)
-    strip, exact, decoder = StripDecoder(model, device), ExactDecoder(model, device), Decoder(model, device)
+    model = random_sheet(KINDS, hidden=16)
+    strip, exact, decoder = StripDecoder(model, device), ExactDecoder(model, device), SheetDecoder(model, device)
     assert strip.numbers.tolist() == exact.numbers.tolist() == [0, 2, 5]
     for time in (None, 13.0, 21.7, 3.1):
         for runtime in (strip, exact):
@@ -33,7 +33,7 @@ def test_strip_and_exact_agree_at_any_time(device):
 
 @pytest.mark.parametrize(("gelu", "most"), [("exact", 1e-4), ("tanh", 2e-2), ("fast", 2e-2)])
 def test_a_cheaper_gelu_stays_close(gelu, most, device):
-    model = random_model((3,), columns=1)
+    model = random_sheet((3,), columns=1)
     strip = StripDecoder(model, device, gelu)
     strip.set_time(7.5)
     strip.decode()
@@ -42,19 +42,19 @@ def test_a_cheaper_gelu_stays_close(gelu, most, device):
 
 
 def test_static_tiles(device):
-    model = random_model(KINDS)
+    model = random_sheet(KINDS)
     exact = ExactDecoder(model, device, kind=TileKind.STATIC)
     exact.set_time(13.0)
     exact.decode()
     assert exact.numbers.tolist() == [1]
-    assert np.array_equal(exact.numpy(), Decoder(model, device).tiles_8bit([1], 13.0)[0])
+    assert np.array_equal(exact.numpy(), SheetDecoder(model, device).tiles_8bit([1], 13.0)[0])
 
 
 @pytest.mark.parametrize("hidden", [16, 48, 64])
 def test_matrix_units_are_close(hidden, device):
     if device == "cpu":
         pytest.skip("a CPU has none")
-    model = random_model(KINDS, hidden=hidden, gelu="tanh")
+    model = random_sheet(KINDS, hidden=hidden, gelu="tanh")
     matrix, exact = MatrixDecoder(model, device), ExactDecoder(model, device)
     assert matrix.numbers.tolist() == [0, 2, 5]
     for time in (13.0, 21.7):
@@ -66,7 +66,7 @@ def test_matrix_units_are_close(hidden, device):
 
 
 def test_a_captured_decode_repeats(device):
-    model = random_model((3, 3))
+    model = random_sheet((3, 3))
     strip = StripDecoder(model, device)
     strip.decode()
     expected = strip.numpy()
@@ -80,12 +80,12 @@ def test_a_captured_decode_repeats(device):
 
 def test_what_is_refused():
     with pytest.raises(WlmError, match="expected at least one dynamic tile, found none"):
-        StripDecoder(random_model((2, 0)))
+        StripDecoder(random_sheet((2, 0)))
     with pytest.raises(WlmError, match="expected at least one static tile, found none"):
-        ExactDecoder(random_model((3, 0)), kind=TileKind.STATIC)
+        ExactDecoder(random_sheet((3, 0)), kind=TileKind.STATIC)
     with pytest.raises(WlmError, match="expected cuda for the matrix path, got cpu"):
-        MatrixDecoder(random_model((3, 0)), "cpu")
+        MatrixDecoder(random_sheet((3, 0)), "cpu")
     with pytest.raises(WlmError, match="gelu: expected one of"):
-        StripDecoder(random_model((3, 0)), gelu="relu")
+        StripDecoder(random_sheet((3, 0)), gelu="relu")
     with pytest.raises(WlmError, match="finite"):
-        StripDecoder(random_model((3, 0))).set_time(float("inf"))
+        StripDecoder(random_sheet((3, 0))).set_time(float("inf"))

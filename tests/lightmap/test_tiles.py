@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.small_sets import sheet_from_arrays as from_arrays
 
 from wlm.errors import WlmError
-from wlm.lightmap.data import LightmapSet, from_arrays
+from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.tiles import (
     TILE,
     TileData,
@@ -27,7 +28,7 @@ def _half(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def lightmaps() -> LightmapSet:
+def lightmaps() -> SheetFrames:
     random = np.random.default_rng(1)
     frames = random.uniform(0.0, 4.0, (3, HEIGHT, WIDTH, 3)).astype(np.float32)
     mask = random.random((HEIGHT, WIDTH)) < 0.4

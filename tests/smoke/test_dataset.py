@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from builders.smoke_samples import small_pool
-from PIL import Image
 from pydantic import ValidationError
 
 from wlm.errors import WlmError
@@ -23,12 +22,11 @@ from wlm.smoke.network.dataset import (
     pool_of_volume,
 )
 from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
-from wlm.smoke.network.pool import Pool, load_pool, save_pool
+from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Air
 from wlm.smoke.simulation import make_solver, volume_of
-from wlm.view.smoke import pool_sheet
 from wlm_kernels.smoke.settings import March
 
 SMALL = DatasetSettings(
@@ -397,27 +395,3 @@ def test_pools_are_checked_and_taken_apart():
     odd = pool.take(torch.arange(len(pool)) % 2 == 1)
     assert odd.sequence.tolist() == [1, 3, 5] and torch.equal(odd.guides, pool.guides[1::2])
     assert pool.take(torch.tensor([4, 0])).sequence.tolist() == [4, 0]
-
-
-def test_files(tmp_path):
-    """A pool comes back as it was, and other files are refused."""
-    pool, path = small_pool(), tmp_path / "pool"
-    assert save_pool(path, pool, SMALL, "round-0") == path.stat().st_size and _same(load_pool(path), pool)
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(WlmError, match="damaged"):
-        load_pool(path)
-    pool_sheet(tmp_path / "a.png", pool)
-    with pytest.raises(WlmError, match="a.png: expected an artifact"):
-        load_pool(tmp_path / "a.png")
-
-
-def test_sheet(tmp_path, pool):
-    """Twelve rows of planes for the samples asked for; an empty pool has none."""
-    samples, _ = pool
-    assert pool_sheet(tmp_path / "a.png", samples, columns=3) == (0, 6, 11)
-    with Image.open(tmp_path / "a.png") as image:
-        assert image.height > 12 * 40 and image.width > 3 * 40 and np.asarray(image).std() > 20
-    with pytest.raises(ValueError, match="at least one"):
-        pool_sheet(tmp_path / "b.png", samples.take(torch.zeros(0, dtype=torch.int64)))

@@ -5,53 +5,23 @@ import math
 import pytest
 import torch
 from builders.smoke_samples import small_pool
-from pydantic import ValidationError
 
-from wlm.smoke.network.losses import Losses, temporal, warp
-from wlm.smoke.network.settings import LossSettings
+from wlm.smoke.network.losses import losses, temporal, warp
+from wlm.smoke.network.settings import TrainSettings
 
 
 def test_parts_are_computed_only_where_they_weigh():
     pool = small_pool()
     targets = pool.targets.float()
     predicted = targets + 0.1
-    for weights, parts in (({}, ("mse",)), ({"mse": 2.0, "temporal": 0.5}, ("mse", "temporal"))):
-        settings = LossSettings(**weights)
-        assert settings.parts == parts and settings.pairs == ("temporal" in parts)
-        losses = Losses(settings)(predicted, targets, pool.motion)
-        assert tuple(losses) == ("loss", *parts)
-        expected = sum(getattr(settings, name) * losses[name] for name in parts)
-        assert float(losses["loss"]) == pytest.approx(float(expected))
-    assert float(Losses(LossSettings())(predicted, targets, None)["mse"]) == pytest.approx(0.01, rel=1e-4)
-
-
-def test_a_loss_of_nothing_is_refused():
-    with pytest.raises(ValidationError, match="expected mse or temporal above 0, found 0 for both"):
-        LossSettings(mse=0.0)
-
-
-def test_light_is_compared_in_srgb_or_as_it_is():
-    """An error of one size in the dark counts for less as light, opacity's for the same; below 0 there is a slope."""
-    target = torch.zeros(1, 1, 8, 4, 4)
-    target[:, :, :3] = 0.1
-    target[:, :, 3:6] = 0.8
-    linear = Losses(LossSettings(srgb=False))
-    for plane, share in ((0, 0.05), (3, 2.5), (6, 1.0)):
-        off = target.clone()
-        off[:, :, plane] += 0.01
-        ratio = float(linear(off, target, None)["mse"] / Losses(LossSettings())(off, target, None)["mse"])
-        assert ratio == pytest.approx(share, rel=0.5 if plane < 6 else 1e-4)
-    below = (target - 0.2).requires_grad_()
-    linear(below, target, None)["loss"].backward()
-    assert (below.grad != 0).all()
-
-
-def test_emission_that_is_not_predicted_is_not_learned():
-    targets = small_pool().targets.float()
-    predicted = targets.clone()
-    predicted[:, :, 7] += 1
-    assert Losses(LossSettings(), emission=False)(predicted, targets, None)["loss"] == 0
-    assert Losses(LossSettings())(predicted, targets, None)["loss"] > 0.1
+    predicted[:, 1] += 0.1
+    for weight, parts in ((0.0, ("mse",)), (0.5, ("mse", "temporal"))):
+        assert TrainSettings(temporal=weight).losses == parts
+        found = losses(predicted, targets, pool.motion, weight)
+        assert tuple(found) == ("loss", *parts)
+        expected = float(found["mse"]) + (weight * float(found["temporal"]) if weight else 0.0)
+        assert float(found["loss"]) == pytest.approx(expected)
+    assert float(losses(targets + 0.1, targets, pool.motion, 0.0)["mse"]) == pytest.approx(0.01, rel=1e-4)
 
 
 def test_warping_moves_an_image_by_its_motion():

@@ -30,11 +30,7 @@ def _expected(model: SmokeModel, guide: torch.Tensor) -> torch.Tensor:
         {},
         {"stem": 2},
         {"adapters": False, "stem": 2},
-        {"emission": False, "depth": False, "residual": False},
-        {"emission": False, "adapters": False},
-        {"adapters": False, "residual": False, "stem": 2},
         {"guide": "six", "stem": 2},
-        {"guide": "six", "depth": False},
     ],
 )
 def test_folded_weights_give_the_same_planes(settings, size):

@@ -22,12 +22,12 @@ from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse
 from wlm.smoke.march.fine import bake
-from wlm.smoke.model import SmokeModel
-from wlm.smoke.network.onnx_file import export
+from wlm.smoke.model import SmokeModel, parameter_count
+from wlm.smoke.network.onnx_file import export_onnx
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
 from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
-from wlm.smoke.network.unet import ADAPTERS, NafBlock, SixWayNetwork, parameter_count, support
+from wlm.smoke.network.unet import ADAPTERS, NafBlock, SixWayNetwork, support
 from wlm.smoke.scene import CameraSettings, make_camera
 from wlm.smoke.synthetic import make_plume
 
@@ -94,17 +94,9 @@ def test_switches_change_what_they_should():
     assert len(full.adapters) == len(ADAPTERS) and planes[:, 7].abs().max() > 0
     assert not torch.equal(planes, full(depthless))
 
-    for residual in (False, True):
-        blind = _network(depth=False, residual=residual)
-        assert torch.equal(blind(guides), blind(depthless))
-    assert parameter_count(_network(residual=False)) == parameter_count(full) - 3 * 25 * len(PLANES)
-
     shared = _network(adapters=False)
     assert len(shared.adapters) == len(shared.heads) == 1
     assert parameter_count(shared) == parameter_count(full) - 3 * (7 * 8**2 + 33 * 8)
-
-    cold = _network(emission=False)(guides)
-    assert (cold[:, 7] == 0).all() and cold[:, 6].abs().max() > 0
 
     coarse = _network(stem=2)
     assert coarse.features(guides).shape == (6, 8, 16, 16)
@@ -297,7 +289,7 @@ def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
 
 def test_onnx_of_no_pixels_is_refused(tmp_path):
     with pytest.raises(ValueError, match="pixel"):
-        export(random_model(), tmp_path / "a.onnx", height=0, width=22)
+        export_onnx(random_model(), tmp_path / "a.onnx", height=0, width=22)
     assert not (tmp_path / "a.onnx").exists()
 
 
@@ -309,7 +301,7 @@ def test_onnx_computes_the_same(tmp_path, kind, stem):
     runtime = pytest.importorskip("onnxruntime")
     model = random_model(guide=kind, stem=stem, levels=2)
     path = tmp_path / "a.onnx"
-    assert export(model, path, height=18, width=22) == path.stat().st_size
+    assert export_onnx(model, path, height=18, width=22) == path.stat().st_size
     guide = torch.rand(1, len(GUIDES[kind]), 18, 22)
     (planes,) = runtime.InferenceSession(path).run(["lightmaps"], {"guide": guide.numpy()})
     assert np.allclose(planes, model.network(guide).detach(), atol=1e-5)

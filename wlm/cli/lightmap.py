@@ -1,8 +1,8 @@
-"""`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, look into it, export it."""
+"""`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, describe it, export it."""
 
 import time as clock
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,8 +20,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.lightmap_layers import refuse_layers, show_layered, show_layered_info, show_layered_report, write_layer
-from wlm.cli.lightmap_tables import show_contest, show_report, show_tiles
+from wlm.cli.lightmap_tables import kinds_of, show_report, show_tiles
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
@@ -41,10 +40,7 @@ from wlm.cli.options import (
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.lightmap import LayeredModel, LayeredSet, LightmapModel, LightmapSet, Profile
-    from wlm.lightmap.rate import Choice
-
-_LAYERED = "lightmap-layers"
+    from wlm.lightmap import LightmapModel, LightmapSet
 
 app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
 
@@ -52,7 +48,7 @@ _Set = Annotated[
     Path,
     typer.Argument(
         metavar="SET",
-        help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds), of Unity's states or of a contest.",
+        help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or of Unity's states of light.",
     ),
 ]
 _Times = Annotated[
@@ -60,12 +56,7 @@ _Times = Annotated[
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
 _Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
-_Layers = Annotated[
-    str | None, typer.Option(metavar="NAMES", help="Of a set with layers: which to read, by commas; default all.")
-]
-_Map = Annotated[
-    str | None, typer.Option("--map", metavar="ID", help="Which lightmap of a contest's folder: ID or LEVEL/ID.")
-]
+_Layers = Annotated[str | None, typer.Option(metavar="NAMES", help="Layers to read, separated by commas; default all.")]
 
 
 @app.command()
@@ -73,18 +64,10 @@ _Map = Annotated[
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, ..., frames, video, levels, or a YAML file of settings.")] = "M",
+    profile: Annotated[str, typer.Option(help="L, M, H, standard, fine, frames, or a YAML file of settings.")] = "M",
     tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
     steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
     samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
-    target_psnr: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="Choose the maps' size, or a video's quality, for it; takes longer."),
-    ] = None,
-    max_bpp: Annotated[
-        float | None,
-        typer.Option(metavar="BITS", help="Choose the same for a file of at most so many bits a texel and time."),
-    ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
     workers: Annotated[
@@ -93,7 +76,7 @@ def compress(
             min=1,
             metavar="N",
             help="Processes that fit tiles side by side; the file is the same. Default: one for two cores, one on a "
-            "GPU, what a cluster has room for; with cuda N are spread over the GPUs.",
+            "GPU, as many as a cluster has room for; with cuda N are spread over the GPUs.",
         ),
     ] = None,
     cluster: Annotated[
@@ -108,60 +91,42 @@ def compress(
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
-    map_id: _Map = None,
     layers: _Layers = None,
     trust: Trust = False,
 ) -> None:
     """Compress a lightmap set into one file.
 
-    The fit is kept in OUT.wlm.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume goes
-    on exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
+    Long fits are saved to OUT.wlm.partial every 30 s, and on Ctrl-C and SIGTERM; the same command with --resume
+    continues exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
     """
     check_output(output, ".wlm")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import bits_per_texel, count_kinds, lost_light
-    from wlm.lightmap.front import compress, open_checkpoint
-    from wlm.lightmap.layers.data import LayeredSet
-    from wlm.lightmap.model import Profile
+    from wlm.lightmap import Profile, open_checkpoint
+    from wlm.lightmap import compress as fit
+    from wlm.lightmap.evaluation import lost_light
     from wlm.lightmap.tiles import TileGrid, parse_tiles
 
     settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
-    # The device of a cluster is none of this machine's.
+    # The machines of a cluster have their own devices.
     own_device = "cpu" if cluster is not None else check_device(device)
-    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
-    layered = isinstance(lightmaps, LayeredSet)
-    if layered:
-        refuse_layers(**{"tiles": tiles, "target-psnr": target_psnr, "max-bpp": max_bpp})
-    numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.mask.shape).count)
-    places = {"workers": workers, "cluster": cluster}
-    if target_psnr is not None or max_bpp is not None:
-        if numbers is not None:
-            raise WlmError("--tiles: expected without --target-psnr and --max-bpp, which choose for a whole set")
-        wanted = {"target_psnr": target_psnr, "max_bpp": max_bpp}
-        choice = _chosen(lightmaps, settings, wanted, {"seed": seed, "device": device} | places)
-        settings, places["survey"] = choice.profile, choice.survey
-    options = {"seed": seed, "device": device} | ({} if layered else {"tiles": numbers})
+    lightmaps = _load(set_path, times, mask, period, trust, layers)
+    numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.light.mask.shape).count)
+    options = {"seed": seed, "device": device, "tiles": numbers}
     checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
     note_start(checkpoint, resume, "at step 0")
     start = clock.perf_counter()
+    places = {"workers": workers, "cluster": cluster}
     with running("fit", checkpoint.path) as progress:
-        model = compress(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
+        model = fit(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
         seconds = clock.perf_counter() - start
         size = model.save(output)
         checkpoint.remove()
-    if layered:
-        show_layered(output, model, lightmaps, size, seconds, own_device)
-        return
-    kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
-    rows = table(model.name, ["file", "bytes", "bpp", "tiles", "seconds"], text=["tiles"])
-    # Tiles without a valid texel leave nothing to count.
-    bpp = bits_per_texel(model, lightmaps.mask, size) if model.kind.any() else None
-    rows.add_row(escape(str(output)), f"{size:,}", number(bpp, ".3f"), kinds, f"{seconds:.1f}")
+    rows = table(model.name, ["file", "bytes on disk", "bytes of GPU memory", "seconds", "tiles"], text=["tiles"])
+    memory = f"{model.memory_bytes:,}"
+    rows.add_row(escape(str(output)), f"{size:,}", memory, f"{seconds:.1f}", kinds_of(model))
     show(rows)
-    if bpp is not None and max_bpp is not None and bpp > max_bpp:
-        note(f"warning: --max-bpp {max_bpp:g}: the trials were smaller than the file, which has {bpp:.3f}")
-    for warning in (*model.warnings, *(lost_light(model, lightmaps, own_device) if model.kind.any() else ())):
+    for warning in (*model.warnings, *lost_light(model, lightmaps, own_device)):
         note(f"warning: {warning}")
 
 
@@ -174,48 +139,52 @@ def decode(
         Path | None,
         typer.Option(
             metavar="FRAME.png",
-            help="Also write what a texture cache holds: 8 bits, radiance = (byte / 255 * bound) ** gamma, with gamma "
-            "and the bound of each tile in the PNG's text.",
+            help="Also write 8 bits as a texture cache holds them: radiance = (byte / 255 * bound) ** gamma, with "
+            "gamma and the bound of each tile in the PNG's text.",
         ),
     ] = None,
     texture: Annotated[
         Path | None,
         typer.Option(
             metavar="MAP.dds",
-            help="Also write what a renderer samples: one texture of RGB9E5 texels, 32 bits each, with mips.",
+            help="Also write the texture that a renderer samples: RGB9E5 texels, 32 bits each, with mips.",
         ),
     ] = None,
-    layer: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of a file with layers: which; default the first of light.")
-    ] = None,
-    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Of such a file: which; default the first.")] = None,
+    layer: Annotated[str | None, typer.Option(metavar="NAME", help="Layer; default the first of light.")] = None,
+    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas; default the first.")] = None,
     device: Device = "cpu",
 ) -> None:
-    """Decode the whole map at one time."""
+    """Decode a whole map at one time."""
     check_output(output, ".exr")
     if texture is not None:
         check_output(texture, ".dds")
     if eight_bit is not None:
         check_output(eight_bit, ".png")
     quiet_warp()
-    from wlm.formats.exr import write_exr
-    from wlm.lightmap.exporter import write_8bit, write_texture
+    import numpy as np
+
+    from wlm.formats.channels import read_channels
+    from wlm.formats.exr import HALF_MAX, write_part
+    from wlm.lightmap.runtime_texture import write_8bit, write_texture
 
     model = _model(file)
+    sheets = model.layer(layer, atlas)
+    if (eight_bit or texture) and len(sheets) > 1:
+        raise WlmError(f"--eight-bit: expected a layer of at most three channels, found {sheets[0].layer} of more")
+    if texture is not None and sheets[0].linear:
+        raise WlmError(f"--texture: expected a layer of light, found {sheets[0].layer}")
     decoder = model.decoder(device)
-    if model.SYSTEM == _LAYERED:
-        refuse_layers(texture=texture)
-        frame = write_layer(decoder, time, layer, atlas, output, eight_bit)
-    else:
-        for name, value in {"layer": layer, "atlas": atlas}.items():
-            if value is not None:
-                raise WlmError(f"{file}: --{name} means nothing to a file without layers")
-        frame = decoder.frame(time)
-        write_exr(output, frame)
-        if eight_bit is not None:
-            write_8bit(eight_bit, decoder, time)
-        if texture is not None:
-            write_texture(texture, model, time, device)
+    frame = decoder.frame(time, layer, atlas)
+    names = [name for sheet in sheets for name in sheet.channels]
+    planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)
+    channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
+    write_part(output, channels, read_channels)
+    if eight_bit is not None:
+        write_8bit(eight_bit, decoder.sheets[sheets[0]], time, sheets[0].values)
+    if texture is not None:
+        write_texture(texture, model.sheets[sheets[0]], time, device)
+    if len(model.sheets) > 1:
+        note(f"layer {sheets[0].layer} of atlas {sheets[0].atlas}, {sheets[0].encoding}: {', '.join(names)}")
     rows = table(str(file), ["time", "size", "mean", "largest", "file"])
     size, mean, largest = f"{frame.shape[1]}x{frame.shape[0]}", f"{frame.mean():.4g}", f"{frame.max():.4g}"
     rows.add_row(f"{time:g}", size, mean, largest, escape(str(output)))
@@ -231,21 +200,17 @@ def evaluate(
     views: Annotated[
         int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
     ] = 50,
-    score: Annotated[
-        Literal["hprc"] | None, typer.Option(help="Add the score of a contest, as far as its rules are public.")
-    ] = None,
     device: Device = "cpu",
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
-    map_id: _Map = None,
     layers: _Layers = None,
     trust: Trust = False,
 ) -> None:
-    """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, bits per texel, and what is seen of it.
+    """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, and the error where light is shown.
 
-    As it is seen: filtered, in the gaps beside charts, between stored times, across tiles, over time, in views of the
-    set's mesh.
+    That is filtered, in the gaps beside charts, between stored times, across tiles, over time, in views of the set's
+    mesh.
     """
     if json_path is not None:
         check_output(json_path, ".json")
@@ -253,38 +218,21 @@ def evaluate(
         check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap.evaluation import contest_score
-    from wlm.lightmap.front import evaluate
-    from wlm.system import plain
+    from wlm.lightmap import evaluate as score
 
     device = check_device(device)
     model = _model(file)
-    if model.SYSTEM == _LAYERED:
-        refuse_layers(html=html_path, score=score)
-    lightmaps = _load(set_path, times, mask, period, trust, map_id, layers)
+    lightmaps = _load(set_path, times, mask, period, trust, layers)
     with running("score") as progress:
         size = file.stat().st_size
-        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
-    if model.SYSTEM == _LAYERED:
-        if json_path is not None:
-            write_json(json_path, report.to_json())
-        show_layered_report(file, report)
-        return
+        report = score(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
     if html_path is not None:
         from wlm.view.reports import lightmap_report
 
         lightmap_report(html_path, model, lightmaps, report)
-    extra: dict[str, Any] = {}
-    contest = None
-    if score is not None:
-        with running("contest") as progress:
-            contest = contest_score(model, lightmaps, device=device, progress=progress)
-        extra[score] = plain(contest)
     if json_path is not None:
-        write_json(json_path, report.to_json() | extra)
+        write_json(json_path, report.to_json())
     show_report(file, report)
-    if contest is not None:
-        show_contest(contest)
 
 
 @app.command()
@@ -292,52 +240,47 @@ def info(
     file: ModelFile,
     tiles: Annotated[bool, typer.Option("--tiles", help="List each tile: its kind, its bytes, and why.")] = False,
     as_json: AsJson = False,
-    device: Annotated[str, typer.Option(help="Where to load it, to say what memory its maps take there.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device to load it to, to show the memory of its maps.")] = "cpu",
 ) -> None:
-    """Say what a file holds, without decoding it."""
+    """Describe a file without decoding it."""
     quiet_warp()
-    from wlm.lightmap.evaluation import count_kinds, part_bytes
-    from wlm.lightmap.held import held_tiles
+    from wlm.lightmap.codec import part_bytes, sheet_bytes
+    from wlm.lightmap.evaluation import count_kinds
+    from wlm.lightmap.tile_report import report_tiles
 
     model = _model(file)
-    if tiles and model.SYSTEM == _LAYERED:
-        raise WlmError(f"{file}: --tiles is of files of one lightmap, not of layers")
-    if model.SYSTEM == _LAYERED:
-        show_layered_info(file, model, model.decoder(device), as_json)
-        return
-    decoder = model.decoder(device)
-    size = file.stat().st_size
+    decoder, size, sizes = model.decoder(device), file.stat().st_size, sheet_bytes(model)
+    sheets = []
+    for sheet, own in model.sheets.items():
+        facts = vars(sheet) | {"width": own.width, "height": own.height, "bytes": sizes[sheet]}
+        facts |= {"tiles": count_kinds(own)}
+        sheets.append(facts | ({"each_tile": [vars(tile) for tile in report_tiles(own)]} if tiles else {}))
     facts: dict[str, Any] = {
         "name": model.name,
         "bytes": size,
-        "width": model.width,
-        "height": model.height,
+        "memory_bytes": model.memory_bytes,
         "times": model.times.tolist(),
         "period": model.period,
         "source": model.source,
-        "tiles": count_kinds(model),
         "parts": part_bytes(model, size),
         "device": decoder.device,
         "device_bytes": decoder.device_bytes,
         "profile": model.profile.model_dump(mode="json"),
+        "sheets": sheets,
     }
-    held = held_tiles(model) if tiles else []
-    if tiles:
-        facts["each_tile"] = [vars(tile) for tile in held]
     if as_json:
         show_json(facts)
         return
     sections = (
         {
             "name": escape(model.name),
-            "bytes": f"{size:,}",
-            "size": f"{model.width}x{model.height}",
+            "bytes on disk": f"{size:,}",
+            "bytes of GPU memory": f"{model.memory_bytes:,}",
             "times": f"{len(model.times)}, {model.times[0]:g} to {model.times[-1]:g}",
             "period": number(model.period, "g"),
             "source": escape(model.source),
             "profile": escape(model.profile.name),
         },
-        {f"{kind} tiles": str(count) for kind, count in facts["tiles"].items()},
         {f"bytes of {part}": f"{count:,}" for part, count in facts["parts"].items()},
         {f"bytes on {decoder.device}": f"{decoder.device_bytes:,}"},
     )
@@ -347,8 +290,13 @@ def info(
             rows.add_row(*row)
         rows.add_section()
     show(rows)
-    if tiles:
-        show_tiles(held)
+    rows = table("sheets", ["", "encoding", "size", "bytes", "tiles"], text=["encoding", "tiles"])
+    for sheet, own in model.sheets.items():
+        counts = ", ".join(f"{count} {kind}" for kind, count in count_kinds(own).items() if count)
+        rows.add_row(escape(sheet.label), sheet.encoding, f"{own.width}x{own.height}", f"{sizes[sheet]:,}", counts)
+    show(rows)
+    for own in model.sheets.values() if tiles else ():
+        show_tiles(report_tiles(own))
 
 
 @app.command()
@@ -358,81 +306,43 @@ def export(
     engine: Engine = "raw",
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
-    device: Annotated[str, typer.Option(help="Of raw, where the frame to compare with is decoded.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device that decodes the reference frame.")] = "cpu",
 ) -> None:
-    """Write the light for an engine: textures, floats, a decoder, and for an engine by name what puts them together.
-
-    Of raw, frame.exr is the map at the first stored time: what the shader should show. Of a file with layers each sheet
-    of three channels has a folder of its own, for an engine by name each sheet of light; sheets.json names them.
-    """
+    """Write the light for an engine: textures, buffers and a shader, and for a named engine the parts that use them."""
     language = shader_of(engine, shader, exact)
     if engine != "raw" and device != "cpu":
         raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
     quiet_warp()
-    from wlm.export import export as export_kit
-    from wlm.lightmap.front import export
+    from wlm.export import export
 
     model = _model(file)
     rows = table(str(output), ["file", "bytes"])
-    if engine == "raw":
-        paths = export(model, output, device=device, shader=language, exact=exact)
-    else:
-        paths = export_kit(model, output, engine)
-        left = [] if model.SYSTEM != _LAYERED else [sheet.label for sheet in model.sheets if sheet.linear]
-        if left:
-            note(f"warning: left out, since --engine {engine} shows light alone: {', '.join(left)}")
+    options = {"shader": language, "exact": exact, "device": device} if engine == "raw" else {}
+    paths = export(model, output, None if engine == "raw" else engine, **options)
+    left = [sheet.label for sheet in model.sheets if sheet.linear] if engine != "raw" else []
+    if left:
+        note(f"warning: left out, since --engine {engine} only shows light: {', '.join(left)}")
     for path in paths:
         rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
     show(rows)
 
 
-def _model(file: Path) -> "LightmapModel | LayeredModel":
-    """Reads a file of lightmaps, with layers or without."""
+def _model(file: Path) -> "LightmapModel":
+    """Reads a file of lightmaps."""
     from wlm.system import load
 
-    model = load(file)
-    if model.SYSTEM not in ("lightmap", _LAYERED):
-        raise WlmError(f"{file}: expected an artifact of lightmap, found one of {model.SYSTEM}")
-    return model
-
-
-def _chosen(
-    lightmaps: "LightmapSet",
-    settings: "Profile",
-    wanted: dict[str, float | None],
-    options: dict[str, Any],
-) -> "Choice":
-    """Chooses the size of the maps, or the quality of video, and says what it was and why."""
-    from wlm.lightmap.rate import choose
-
-    with running("choose") as progress:
-        choice = choose(lightmaps, settings, **wanted, **options, progress=progress)
-    resolution, quality = choice.profile.uvt_resolution, choice.profile.video_quality
-    chosen = f"F_uvt of {resolution}x{resolution}" if settings.frames != "video" else f"video of quality {quality}"
-    psnr = "" if choice.psnr is None else f", {choice.psnr:.1f} dB"
-    note(f"{chosen}: about {choice.bpp:.3f} bits a texel and time{psnr}")
-    if choice.limited:
-        psnr, bpp = wanted["target_psnr"], wanted["max_bpp"]
-        note(f"warning: --max-bpp {bpp:g} holds the PSNR below the {psnr:g} dB of --target-psnr")
-    return choice
+    return load(file, "lightmap")
 
 
 def _load(
-    path: Path,
-    times: str | None,
-    mask: str | None,
-    period: float | None,
-    trust: bool,
-    map_id: str | None,
-    layers: str | None,
-) -> "LightmapSet | LayeredSet":
-    """Reads a set and prints what was repaired in it."""
-    from wlm.lightmap.data import parse_times
-    from wlm.lightmap.front import load
+    path: Path, times: str | None, mask: str | None, period: float | None, trust: bool, layers: str | None
+) -> "LightmapSet":
+    """Reads a set and prints its repairs."""
+    from wlm.lightmap.data import load, parse_times
 
     stamps = None if times is None else parse_times(times)
     names = None if layers is None else [name.strip() for name in layers.split(",")]
-    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, map_id=map_id, layers=names)
+    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names)
     for warning in lightmaps.warnings:
         note(f"warning: {warning}")
     return lightmaps

@@ -89,8 +89,8 @@ def flipbook(
     if gain is None and output.suffix.lower() == ".exr":
         gain = 1.0
     quiet_warp()
+    from wlm.export.shading import ENDINGS, translate
     from wlm.formats.atomic import atomic_write
-    from wlm.shading import ENDINGS
     from wlm.smoke.flipbook.shader import book_functions
     from wlm.smoke.flipbook.textures import write_page
 
@@ -107,7 +107,8 @@ def flipbook(
     clipped = sum(write_page(path, packed.pages[name]) for name, path in paths.items())
     if shader:
         for language in ("glsl", "hlsl", "msl", "wgsl"):
-            atomic_write(output.with_suffix(ENDINGS[language]), book_functions(packed, language).encode())
+            text = translate(book_functions(packed), language)
+            atomic_write(output.with_suffix(ENDINGS[language]), text.encode())
     show_book(str(smoke), packed, paths, clipped)
 
 

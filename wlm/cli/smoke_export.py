@@ -92,14 +92,12 @@ def export(
     if padding is None:
         padding = 0 if mips is not None else _PADDING
     quiet_warp()
-    from dataclasses import replace
-
     from wlm.export import export as export_kit
-    from wlm.export.bundles import bundle_of
+    from wlm.smoke.bundle import bundle as bundle_of
 
     opened = opened_book(source, textures, cells, source_layout, straight)
     packed = packed_book(source, options, opened, **packing, layout=layout or "unity", padding=padding)
-    bundle = replace(bundle_of(packed, "cpu"), name=source.resolve().stem)
+    bundle = bundle_of(packed, name=source.resolve().stem)
     paths = export_kit(bundle, output, None if engine == "raw" else engine, shader=language)
     shown = {path.stem: path for path in paths if path.stem in packed.pages}
     show_book(str(output), packed, shown, bundle.document["clipped"])
@@ -116,7 +114,7 @@ def _network(output: Path, network: Path | None, resolution: int) -> None:
 
     network = network or shipped()
     model: SmokeModel = load(network, "smoke-network")
-    size = onnx_file.export(model, output, height=resolution, width=resolution)
+    size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
     rows = table(str(network), ["", "planes"], text=["planes"])
     rows.add_row("guide", " ".join(GUIDES[model.settings.guide]))
     rows.add_row("lightmaps", " ".join(PLANES))

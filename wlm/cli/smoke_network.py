@@ -12,7 +12,6 @@ from wlm.cli.console import (
     exclusive,
     note,
     number,
-    progress_bar,
     quiet_warp,
     running,
     show,
@@ -29,9 +28,7 @@ if TYPE_CHECKING:
     from wlm.smoke.evaluation import Comparison
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SmokeModel
-    from wlm.system import Progress
 
-_POOL, _SHEET = "pool.safetensors", "sheet.png"
 _MARCH = 130  # steps of `predict --coarse` along the longest edge
 
 _Network = Annotated[
@@ -42,13 +39,13 @@ _Network = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Adds the commands to `wlm smoke`."""
-    for command in (train, predict, evaluate, dataset):
+    for command in (train, predict, evaluate):
         app.command()(command)
 
 
 @exclusive
 def train(
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, 16, 24, 32, paper, or a YAML file.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
@@ -182,65 +179,6 @@ def evaluate(
     _show_comparisons(network, comparisons)
 
 
-@exclusive
-def dataset(
-    settings_file: Annotated[
-        Path, typer.Argument(metavar="SETTINGS", help="A YAML file of dataset settings, each with a default.")
-    ],
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    seed: Annotated[int, typer.Option(min=0, help="Of all rounds.")] = 0,
-    round_number: Annotated[int, typer.Option("--round", min=0, help="Which round of samples.")] = 0,
-    validation: Annotated[
-        bool, typer.Option("--validation", help="The validation's samples, which no round has.")
-    ] = False,
-    columns: Annotated[int, typer.Option(min=1, max=64, help="Samples in the contact sheet.")] = 12,
-    device: Device = "cpu",
-) -> None:
-    """Simulate scenes drawn at random, and write the samples that a network would learn from.
-
-    DIR gets pool.safetensors, and sheet.png with guiding maps, lightmaps and motion.
-    """
-    quiet_warp()
-    from wlm.config import load_settings
-    from wlm.smoke.network.dataset import STAGES, make_pool, make_validation
-    from wlm.smoke.network.pool import save_pool
-    from wlm.smoke.network.settings import DatasetSettings
-    from wlm.view.smoke import pool_sheet
-
-    settings = load_settings(DatasetSettings, settings_file)
-    try:
-        output.mkdir(exist_ok=True)
-    except OSError as error:
-        raise WlmError(f"{output}: cannot write there: {error.strerror or error}") from error
-    figures: dict[str, float] = {}
-    with progress_bar("dataset") as bar:
-
-        def report(progress: "Progress") -> None:
-            figures.update(progress.figures)
-            bar(progress.done, progress.total, f"{progress.figures['samples']:.0f} samples")
-
-        if validation:
-            pool = make_validation(settings, device, progress=report)
-        else:
-            pool = make_pool(settings, seed=seed, round=round_number, device=device, progress=report)
-    if not len(pool):
-        raise WlmError(f"{settings_file}: expected frames with smoke, found none: use a longer warmup")
-    source = f"validation-{settings.validation_seed}" if validation else f"seed-{seed}-round-{round_number}"
-    size = save_pool(output / _POOL, pool, settings, source)
-    chosen = pool_sheet(output / _SHEET, pool, columns=columns)
-    rows = table(f"{output}: {source}", ["", "value"])
-    rows.add_row("samples", f"{len(pool):,}")
-    rows.add_row("pixels", f"{settings.resolution} x {settings.resolution}")
-    rows.add_row("voxels", " x ".join([str(settings.cells * settings.refine)] * 3))
-    rows.add_row("scenes that blew up", f"{figures['skipped']:.0f}")
-    rows.add_row("samples without smoke, left out", f"{figures['dropped']:.0f}")
-    for stage in STAGES:
-        rows.add_row(f"seconds: {stage}", f"{figures[stage]:.3g}")
-    rows.add_row(escape(str(output / _POOL)), f"{size:,} bytes")
-    show(rows)
-    note(f"{output / _SHEET}: samples {', '.join(map(str, chosen))}")
-
-
 def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
     """Makes lightmaps by a march whose nodes are as far apart as its steps."""
     from wlm.smoke.march.coarse import bake_coarse
@@ -272,7 +210,7 @@ def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[Densit
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     """The network, and what its file says of its training."""
-    from wlm.smoke.network.unet import parameter_count
+    from wlm.smoke.model import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
     training = {name: model.summary[name] for name in names if name in model.summary}

@@ -12,10 +12,10 @@ from wlm._facade import facade
 
 _PLACES = {
     "ENGINES": "wlm.export.engines.kit",
-    "LANGUAGES": "wlm.shading",
+    "LANGUAGES": "wlm.export.shading",
     "export": "wlm.export.writing",
     "make_page": "wlm.export.page.pages",
-    "translate": "wlm.shading",
+    "translate": "wlm.export.shading",
     "write_page": "wlm.export.page.pages",
 }
 

@@ -22,11 +22,10 @@ from typing import Any
 
 from wlm.bundle import FORMAT, INDEX_FILE, RESERVED, Bundle
 from wlm.errors import WlmError
-from wlm.export.bundles import bundle_of
 from wlm.export.engines.kit import ENGINES
 from wlm.export.files import write_buffer, write_reference, write_texture
+from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.folder import compact_json, made_parents, read_index, staged
-from wlm.shading import ENDINGS, check_language, translate
 
 _VERSION = 1
 _KITS = {
@@ -77,7 +76,7 @@ def export(
         raise WlmError(f"engine {engine}: shader and exact have no meaning for a kit, whose language is the engine's")
     folder = Path(folder)
     with made_parents(folder), staged(folder, INDEX_FILE, FORMAT) as staging:
-        bundle = bundle_of(model, device)
+        bundle = model if isinstance(model, Bundle) else model.bundle(device=device)
         if engine is None:
             _check_options(options, (), "a raw folder")
             _write_raw(bundle, staging, shader, exact)

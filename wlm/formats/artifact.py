@@ -30,7 +30,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.compact import encode_compact, is_compact, parse_compact
 from wlm.formats.reading import open_file
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 _LENGTH = struct.Struct("<Q")
 _NO_DIGEST = "0" * 32

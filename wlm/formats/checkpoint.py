@@ -248,46 +248,6 @@ class Checkpoint:
             kept.setdefault(int(number), {})[key] = np.array(value)
 
 
-class CheckpointRange:
-    """Batches of a checkpoint from one number on, counted from 0: for one of several fits that share a file.
-
-    The methods are those of `Checkpoint`.
-
-    Attributes:
-        path: The file.
-    """
-
-    def __init__(self, checkpoint: Checkpoint, first: int) -> None:
-        """Shares a checkpoint.
-
-        Args:
-            checkpoint: The checkpoint.
-            first: Its number of batch 0.
-        """
-        self._whole, self._first, self.path = checkpoint, first, checkpoint.path
-
-    def finished(self, number: int, table: Mapping[str, Part]) -> dict[str, np.ndarray] | None:
-        return self._whole.finished(self._first + number, table)
-
-    def running(self, number: int) -> dict[str, np.ndarray] | None:
-        return self._whole.running(self._first + number)
-
-    def wrong(self, number: int, error: ValueError) -> WlmError:
-        return self._whole.wrong(self._first + number, error)
-
-    def due(self) -> bool:
-        return self._whole.due()
-
-    def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
-        self._whole.save({self._first + number: state for number, state in states.items()})
-
-    def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
-        self._whole.add_finished(self._first + number, result)
-
-    def flush(self) -> None:
-        self._whole.flush()
-
-
 def _difference(stored: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
     """Names the first thing in which two fits differ; empty if they are one."""
     for key, value in expected.items():

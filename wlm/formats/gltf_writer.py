@@ -293,7 +293,9 @@ def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
             yield image, "bufferView"
 
 
-def _pack(path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]) -> list[bytes]:
+def _pack(
+    path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]
+) -> list[bytes | memoryview]:
     """Lays the views one after another in one buffer, and gives the file's pieces."""
     pieces: list[bytes | memoryview] = []
     start = 0

@@ -204,11 +204,11 @@ def _descriptor(fmt: str) -> bytes:
     """The data format descriptor: its total length and one basic descriptor block."""
     if fmt == _SHARED:
         # The exponent is named once for each channel.
-        samples = []
+        shared = []
         for i, channel in enumerate(_CHANNEL_IDS[:3]):
-            samples.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
-            samples.append(struct.pack("<H2B4x2I", 27, 4, channel | _EXPONENT, _SHARED_MIDDLE, _SHARED_MOST))
-        return _basic_block(_RGBSDA, 0, 4, samples)
+            shared.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
+            shared.append(struct.pack("<H2B4x2I", 27, 4, channel | _EXPONENT, _SHARED_MIDDLE, _SHARED_MOST))
+        return _basic_block(_RGBSDA, 0, 4, shared)
     if fmt in _CHANNELS:
         model, side = _RGBSDA, 0
         bits = 8 * _channel_bytes(fmt)
@@ -340,7 +340,7 @@ def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tu
         at += 4 + size + -size % 4
     orientation, swizzle = found.values()
     if orientation not in (b"rd", b"ru", b"ld", b"lu"):
-        raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]}")
+        raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]!r}")
     if swizzle[:channels] != b"rgba"[:channels]:
-        raise WlmError(f"{path}: KTXswizzle: expected rgba, found {swizzle[:20]}")
+        raise WlmError(f"{path}: KTXswizzle: expected rgba, found {swizzle[:20]!r}")
     return orientation[:1] == b"r", orientation[1:] == b"d"

@@ -190,7 +190,6 @@ def _model(path: Path) -> Finding:
         return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
     kind = {
         "lightmap": "lightmaps over time",
-        "lightmap-layers": "layered lightmaps over time",
         "atlas": "the lightmaps of a scene",
         "probe": "light probes",
     }[model.SYSTEM]

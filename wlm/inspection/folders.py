@@ -15,9 +15,7 @@ from wlm.inspection.files import BAKED, document_of, inspect_file
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import picture_of, said
 from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
-from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest
-from wlm.lightmap.layers.listing import list_layers, state_folders
-from wlm.lightmap.listing import SET_FILE, count_of, natural, time_of_name
+from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders, time_of_name
 
 MOST = 256
 """Findings that are told, and folders that are looked into."""
@@ -66,7 +64,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _contest, _godot, _flip_books, _pictures):
+        for whole in (_documents, _unity, _godot, _flip_books, _pictures):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -128,11 +126,11 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     stated: list[float] = [float(i) for i in range(len(states))]
     layers = ""
     try:
-        listing = list_layers(folder, stated, None, False)
+        listing = list_set(folder, stated)
     except WlmError as error:
         problems.append(said(error, folder))
         shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
-        layers, listing = f" --layers {','.join(shared)}", list_layers(folder, stated, shared, False)
+        layers, listing = f" --layers {','.join(shared)}", list_set(folder, stated, shared)
     sizes = []
     for atlas in listing.atlases:
         paths = [one[atlas.name, "light"].path for one in listing.states]
@@ -159,21 +157,10 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
 
 def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
     try:
-        list_layers(folder, times, layers, False)
+        list_set(folder, times, layers)
     except WlmError:
         return False
     return True
-
-
-def _contest(folder: Path, files: Sequence[Path]) -> _Found:
-    if not is_contest(folder):
-        return []
-    problems: tuple[str, ...] = ()
-    try:
-        what = f"a contest's raw lightmaps at {count_of(list_contest(folder, None, None).files, 'time')}"
-    except WlmError as error:
-        what, problems = "a contest's raw lightmaps", (said(error, folder / CONFIG_FILE),)
-    return [(Finding(folder, what, compress_command(folder), problems), set(_entries(folder)))]
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from wlm.errors import WlmError
 from wlm.inspection.finding import Finding, quoted
 from wlm.inspection.pictures import Picture, picture_of, read_lit, said
-from wlm.lightmap.layers.listing import is_layered, list_layers
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
-from wlm.lightmap.listing import Listing, count_of, parse_set
+from wlm.lightmap.listing import Listing, count_of, list_set
+from wlm.lightmap.sheet import LIGHT
 
 UNREADABLE = "a lightmap set that can't be read"
 
@@ -22,15 +22,15 @@ def compress_command(folder: Path, options: str = "") -> str:
 def inspect_set(path: Path) -> Finding:
     """Says what a `set.json` lists, and whether it is there."""
     try:
-        if is_layered(path):
-            listing = list_layers(path, None, None, False)
+        listing = list_set(path)
+        if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):
             sheets = f"{count_of(listing.atlases, 'atlas')} with {', '.join(layer.name for layer in listing.layers)}"
             problems = sorted(
                 {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
             )
             what = f"a layered set of lightmaps at {count_of(listing.states, 'time')}: {sheets}"
             return Finding(path.parent, what, compress_command(path.parent), tuple(problems[:4]))
-        return _checked(path.parent, parse_set(path, None))
+        return _checked(path.parent, listing)
     except WlmError as error:
         return Finding(path.parent, UNREADABLE, problems=(said(error, path),))
 
@@ -38,12 +38,10 @@ def inspect_set(path: Path) -> Finding:
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
     """The files beside a `set.json` that it names."""
     try:
-        if is_layered(path):
-            return {source.path for one in list_layers(path, None, None, False).states for source in one.values()}
-        listing = parse_set(path, None)
+        listing = list_set(path)
     except WlmError:
         return set()
-    return {*listing.files, Path(listing.mask)} & set(files)
+    return {*listing.files, *(Path(str(atlas.mask)) for atlas in listing.atlases)} & set(files)
 
 
 def _checked(folder: Path, listing: Listing) -> Finding:

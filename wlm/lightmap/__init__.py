@@ -4,21 +4,18 @@ from wlm._facade import facade
 
 _PLACES = {
     "Decoder": "wlm.lightmap.decode",
-    "LayerArrays": "wlm.lightmap.layers.data",
-    "LayeredModel": "wlm.lightmap.layers.model",
-    "LayeredReport": "wlm.lightmap.layers.evaluation",
-    "LayeredSet": "wlm.lightmap.layers.data",
+    "Layer": "wlm.lightmap.data",
     "LightmapModel": "wlm.lightmap.model",
     "LightmapSet": "wlm.lightmap.data",
-    "Profile": "wlm.lightmap.model",
+    "Profile": "wlm.lightmap.profile",
     "Report": "wlm.lightmap.evaluation",
-    "compress": "wlm.lightmap.front",
-    "evaluate": "wlm.lightmap.front",
-    "export": "wlm.lightmap.front",
+    "Sheet": "wlm.lightmap.sheet",
+    "compress": "wlm.lightmap.fit",
+    "evaluate": "wlm.lightmap.evaluation",
     "from_arrays": "wlm.lightmap.data",
-    "from_layers": "wlm.lightmap.layers.data",
-    "load": "wlm.lightmap.front",
-    "open_checkpoint": "wlm.lightmap.front",
+    "from_layers": "wlm.lightmap.data",
+    "load": "wlm.lightmap.data",
+    "open_checkpoint": "wlm.lightmap.fit",
 }
 
 __all__ = sorted(_PLACES)

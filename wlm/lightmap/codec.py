@@ -1,147 +1,278 @@
-"""A lightmap model as the parts of its file, and back: quantised maps, networks and scales."""
+"""A lightmap model as the parts of its file, and back.
+
+Parts of sheet k are called `k.NAME`. Times are stored once, the mask of an atlas with its first sheet. The maps and the
+network of a tile, or its frames, are one zstd frame in the part `k.tiles`; `k.tile_sizes` has their sizes, so that each
+tile can be read alone.
+"""
 
 import math
-import zlib
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from wlm.config import check_settings
+from wlm.errors import WlmError, one_line
+from wlm.formats import zstd
 from wlm.formats.artifact import Artifact
-from wlm.formats.deflate import inflate
+from wlm.formats.limits import check_growth
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm.lightmap.deflated import SIZES, TILES, inflate_tiles
-from wlm.lightmap.frame_packing import FRAME_SIZES, FRAMES, pack_frames, unpack_frames
-from wlm.lightmap.model import LightmapModel, Profile, TimeAxis, part_table
-from wlm.lightmap.packing import PACKED, STREAM_SIZES, TILE_STREAMS, pack_tiles, unpack_tiles
+from wlm.lightmap.encodings import encoding_of
+from wlm.lightmap.model import LightmapModel, SheetModel, part_table
+from wlm.lightmap.profile import Profile
+from wlm.lightmap.sheet import MOST_NAME, MOST_SHEETS, WIDTH, Sheet, check_sheets
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
+from wlm.workers import each
+
+PACKED = ("uv", "uvt", "ut", "vt", "net", "net_static", "frames")
+"""The arrays of a sheet that are packed by tile."""
 
 _ROUNDING = 2e-7  # relative, of stored times
 _TIMES = Part((np.float32, np.float64), (None,))
-_MASK = Part(np.uint8, (None,))
-# What files that don't state it were made with, and a setting of the fit that is no more.
-_OLD_PROFILE = {"interpolation": "network", "frames": "never"}
-_OLD_SETTINGS = ("between",)
+_BYTES = Part(np.uint8, (None,))
+_SIZES = Part(np.uint32, (None,))
+_Word = Annotated[Name, Field(min_length=1, max_length=MOST_NAME)]
+
+
+class _SheetHeader(Header):
+    """Settings of a sheet in a file; `size` is width and height in texels."""
+
+    name: Name
+    atlas: _Word
+    layer: _Word
+    channels: Annotated[list[_Word], Field(min_length=1, max_length=WIDTH)]
+    encoding: Literal["radiance", "unit", "signed"]
+    size: Annotated[list[int], Field(min_length=2, max_length=2)]
 
 
 class _Header(Header):
-    """The settings of a file; `size` is width and height in texels."""
+    """The settings of a file."""
 
     name: Name
-    size: Annotated[list[int], Field(min_length=2, max_length=2)]
     period: float | None = Field(gt=0)
     profile: Profile
+    sheets: Annotated[list[_SheetHeader], Field(min_length=1, max_length=MOST_SHEETS)]
 
 
 def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Lays a model out for its file: the settings, the parts and the hash of its source."""
-    settings = {
-        "name": model.name,
-        "size": [model.width, model.height],
-        "period": model.period,
-        "profile": _dated(model.profile),
-    }
-    plain = {name: value for name, value in model.parts.items() if name not in (*PACKED, "frames")}
-    parts = {name: value for name, value in plain.items() if value.size}
-    if len(model.mapped):
-        parts |= pack_tiles(model.parts, model.profile, model.kind, model.mask, model.axis)
-    if len(model.frames):
-        parts |= pack_frames(model.frames, model.kind, model.mask)
-    if not model.mask.all():
-        parts["mask"] = np.frombuffer(zlib.compress(np.packbits(model.mask).tobytes(), 9), np.uint8)
-    return settings, parts | {"times": _shortened(model.times)}, model.source
+    """Lays a model out for its file.
 
+    Returns:
+        The settings, the parts and the hash of its source.
 
-def _shortened(times: np.ndarray) -> np.ndarray:
-    """Times as float32 where that keeps them distinct and within `_ROUNDING` of their value."""
-    short = times.astype(np.float32)
-    distinct = len(times) < 2 or np.all(np.diff(short) > 0)
-    return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
+    Raises:
+        WlmError: The arrays can not be stored.
+    """
+    headers, parts, atlases = [], {"times": _shortened(model.times)}, set()
+    for number, (sheet, own) in enumerate(model.sheets.items()):
+        headers.append(
+            {
+                "name": own.name,
+                "atlas": sheet.atlas,
+                "layer": sheet.layer,
+                "channels": list(sheet.channels),
+                "encoding": sheet.encoding,
+                "size": [own.width, own.height],
+            }
+        )
+        stored = {name: value for name, value in own.parts.items() if name not in PACKED and value.size}
+        stored |= _pack_tiles(own)
+        if sheet.atlas not in atlases and not own.mask.all():
+            stored["mask"] = np.frombuffer(zstd.compress(np.packbits(own.mask).tobytes()), np.uint8)
+        atlases.add(sheet.atlas)
+        parts |= {f"{number}.{name}": value for name, value in stored.items()}
+    settings = {"name": model.name, "period": model.period, "profile": model.profile.changes(), "sheets": headers}
+    return settings, parts, model.source
 
 
 def decode(artifact: Artifact) -> LightmapModel:
     """Makes a model of the parts of its file.
 
     Raises:
-        WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
+        WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
     """
-    tensors = artifact.tensors
-    header = check_settings(_Header, _renewed(artifact.settings), "setting ")
-    width, height = header.size
-    tiles = Part(np.uint8, (TileGrid.of(height, width).count,), most=max(TileKind))
-    kind = check_part(tensors, "kind", tiles)
-    times = check_part(tensors, "times", _TIMES).astype(np.float64)
+    header = check_settings(_Header, artifact.settings, "setting ")
+    sheets = [Sheet(item.atlas, item.layer, tuple(item.channels), item.encoding) for item in header.sheets]
+    if len(set(sheets)) < len(sheets):
+        raise ValueError("setting sheets: expected each of them once")
+    sizes = [(item.size[1], item.size[0]) for item in header.sheets]
+    if min(map(min, sizes)) < 1:
+        raise ValueError("setting size: expected width and height of each sheet")
+    check_sheets("setting sheets", dict(zip(sheets, sizes, strict=True)))
+    times = check_part(artifact.tensors, "times", _TIMES).astype(np.float64)
     _check_times(times.tolist(), header.period)
-    mask = _mask(tensors, height, width)
-    others = {name: part for name, part in tensors.items() if name not in ("kind", "times", "mask")}
-    table = part_table(header.profile, kind, len(times))
-    if "tiles" in others or "sizes" in others:
-        packed = check_part(others, "tiles", TILES), check_part(others, "sizes", SIZES)
-        others = {name: part for name, part in others.items() if name not in ("tiles", "sizes")}
-        others |= inflate_tiles(*packed, table, header.profile, kind, mask)
-    if "streams" in others or "stream_sizes" in others:
-        packed = check_part(others, "streams", TILE_STREAMS), check_part(others, "stream_sizes", STREAM_SIZES)
-        others = {name: part for name, part in others.items() if name not in ("streams", "stream_sizes")}
-        axis = TimeAxis(times, header.period, header.profile.time_axis, header.profile.interpolation)
-        others |= unpack_tiles(*packed, table, header.profile, kind, mask, axis)
-    if "frames" in others or "frame_sizes" in others:
-        packed = check_part(others, "frames", FRAMES), check_part(others, "frame_sizes", FRAME_SIZES)
-        others = {name: part for name, part in others.items() if name != "frame_sizes"}
-        others["frames"] = unpack_frames(*packed, table, kind, mask)
-    parts = check_parts(others, table)
-    for name in ("ranges", "video_ranges", "level_ranges"):
-        if (parts[name][:, :, 0] > parts[name][:, :, 1]).any():
-            raise ValueError(f"part {name}: expected no least above its greatest")
-    model = LightmapModel(
-        name=header.name,
-        width=width,
-        height=height,
-        period=header.period,
-        source=artifact.source,
-        profile=header.profile,
-        mask=mask,
-        kind=kind,
-        times=times,
-        **parts,
-    )
-    if len(model.unpacked):
-        _ = model.words  # whatever is wrong with a stream is wrong with the file
-    return model
+    parts = _by_sheet(artifact.tensors, len(sheets))
+    tables, unpacked = [], 0
+    for number, (sheet, size) in enumerate(zip(sheets, sizes, strict=True)):
+        with _named(number):
+            count = TileGrid.of(*size).count
+            kind = check_part(parts[number], "kind", Part(np.uint8, (count,), most=max(TileKind)))
+            tables.append(part_table(header.profile.for_sheet(sheet), kind, len(times)))
+        unpacked += sum(math.prod(tables[-1][name].shape) for name in PACKED)
+    # Before memory is allocated for any sheet.
+    check_growth("the file", sum(value.nbytes for value in artifact.tensors.values()), unpacked)
+    masks: dict[str, np.ndarray] = {}
+    models: dict[Sheet, SheetModel] = {}
+    for number, (sheet, item, table) in enumerate(zip(sheets, header.sheets, tables, strict=True)):
+        own = parts[number]
+        if sheet.atlas in masks and "mask" in own:
+            raise ValueError(f"part {number}.mask: expected it with the first sheet of that atlas")
+        with _named(number):
+            if sheet.atlas not in masks:
+                masks[sheet.atlas] = _mask(own, *sizes[number])
+            plain = {name: part for name, part in table.items() if name not in PACKED}
+            packed = {name: own[name] for name in ("tiles", "tile_sizes") if name in own}
+            rest = {name: value for name, value in own.items() if name not in ("kind", "mask", *packed)}
+            arrays = check_parts(rest, plain)
+            arrays |= {name: np.zeros(table[name].shape, table[name].dtype) for name in PACKED}
+            models[sheet] = SheetModel(
+                name=item.name,
+                width=item.size[0],
+                height=item.size[1],
+                times=times,
+                period=header.period,
+                profile=header.profile.for_sheet(sheet),
+                mask=masks[sheet.atlas],
+                kind=own["kind"],
+                **arrays,
+            )
+            _unpack_tiles(models[sheet], packed)
+            check_parts({name: getattr(models[sheet], name) for name in PACKED}, {name: table[name] for name in PACKED})
+            if (arrays["ranges"][:, :, 0] > arrays["ranges"][:, :, 1]).any():
+                raise ValueError("part ranges: expected no least above its greatest")
+    return LightmapModel(name=header.name, source=artifact.source, profile=header.profile, sheets=models)
 
 
-def _dated(profile: Profile) -> dict[str, Any]:
-    """Settings for a file: those that differ from the defaults, and those whose default was another."""
-    return profile.changes() | {name: getattr(profile, name) for name in _OLD_PROFILE}
+def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
+    """Returns the bytes of a model's file by part, over all sheets, the largest first.
+
+    `tiles` are the packed tiles; `header` is the rest: the header and the sizes of the tiles.
+
+    Raises:
+        ValueError: `file_bytes` is less than the parts take.
+    """
+    parts: dict[str, int] = {}
+    for name, value in encode(model)[1].items():
+        name = name.rpartition(".")[2]
+        if name != "tile_sizes":
+            parts[name] = parts.get(name, 0) + value.nbytes
+    parts["header"] = file_bytes - sum(parts.values())
+    if parts["header"] < 0:
+        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")
+    return dict(sorted(((name, size) for name, size in parts.items() if size), key=lambda part: -part[1]))
 
 
-def _renewed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a file as today's names have them."""
-    profile = settings.get("profile")
-    if not isinstance(profile, dict) or profile.keys() >= _OLD_PROFILE.keys():
-        return settings
-    # A file with either of them has none of the settings that are no more.
-    dropped = () if profile.keys() & _OLD_PROFILE.keys() else _OLD_SETTINGS
-    kept = {name: value for name, value in profile.items() if name not in dropped}
-    return settings | {"profile": _OLD_PROFILE | kept}
+def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
+    """Returns the bytes of the parts of each sheet in the file; a mask counts for the first sheet of its atlas."""
+    sizes = [0] * len(model.sheets)
+    for name, value in encode(model)[1].items():
+        number, _, own = name.partition(".")
+        if own:
+            sizes[int(number)] += value.nbytes
+    return dict(zip(model.sheets, sizes, strict=True))
+
+
+def tile_sizes(sheet: SheetModel) -> np.ndarray:
+    """Returns the bytes of the zstd frame of each tile of the grid, int [tiles]; 0 for tiles without one."""
+    sizes = np.zeros(len(sheet.kind), int)
+    sizes[_packed_tiles(sheet)] = _pack_tiles(sheet).get("tile_sizes", ())
+    return sizes
+
+
+def _packed_tiles(sheet: SheetModel) -> list[int]:
+    """Returns the numbers of the tiles that have a zstd frame."""
+    kinds = {int(kind): encoding_of(kind) for kind in np.unique(sheet.kind)}
+    numbers = np.flatnonzero(sheet.kind).tolist()
+    return [number for number in numbers if kinds[int(sheet.kind[number])].packed_size(sheet, number)]
+
+
+def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
+    """Packs each tile as one zstd frame: `tiles`, uint8, and `tile_sizes`, uint32 [n]."""
+
+    def pack(number: int) -> bytes:
+        return zstd.compress(encoding_of(sheet.kind[number]).pack(sheet, number))
+
+    frames = list(each(pack, _packed_tiles(sheet)))
+    if not frames:
+        return {}
+    sizes = np.array([len(frame) for frame in frames], np.uint32)
+    return {"tiles": np.frombuffer(b"".join(frames), np.uint8), "tile_sizes": sizes}
+
+
+def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
+    """Reads the tiles into the arrays of a sheet.
+
+    Raises:
+        WlmError, ValueError: The frames are not those of these tiles.
+    """
+    numbers = _packed_tiles(sheet)
+    if not numbers and not packed:
+        return
+    tiles, sizes = (check_part(packed, name, part) for name, part in (("tiles", _BYTES), ("tile_sizes", _SIZES)))
+    if len(sizes) != len(numbers) or int(sizes.sum(dtype=np.uint64)) != len(tiles):
+        raise ValueError(
+            f"part tile_sizes: expected those of {len(numbers)} tiles and {len(tiles)} bytes, found others"
+        )
+    ends = np.cumsum(sizes.astype(np.int64)).tolist()
+
+    def unpack(job: tuple[int, int, int]) -> None:
+        number, end, size = job
+        encoding = encoding_of(sheet.kind[number])
+        frame, name = tiles[end - size : end].tobytes(), f"part tiles: tile {number}"
+        data = zstd.decompress(frame, encoding.packed_size(sheet, number), name)
+        try:
+            encoding.unpack(sheet, number, np.frombuffer(data, np.uint8))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+
+    for _ in each(unpack, zip(numbers, ends, sizes.tolist(), strict=True)):
+        continue
+
+
+@contextmanager
+def _named(number: int) -> Iterator[None]:
+    """Adds the number of the sheet to errors about its parts."""
+    try:
+        yield
+    except (WlmError, ValueError) as error:
+        raise ValueError(f"sheet {number}: {error}") from error
+
+
+def _by_sheet(tensors: Mapping[str, np.ndarray], count: int) -> list[dict[str, np.ndarray]]:
+    """Returns the parts of each sheet by their names without its number; `times` is none of them."""
+    parts: list[dict[str, np.ndarray]] = [{} for _ in range(count)]
+    for name, value in tensors.items():
+        number, _, own = name.partition(".")
+        if re.fullmatch("0|[1-9][0-9]{0,3}", number) and int(number) < count and own:
+            parts[int(number)][own] = value
+        elif name != "times":
+            raise ValueError(f"part {one_line(name, 60)} is none of the file's")
+    return parts
+
+
+def _shortened(times: np.ndarray) -> np.ndarray:
+    """Returns times as float32 if that keeps them distinct and within `_ROUNDING` of their value."""
+    short = times.astype(np.float32)
+    distinct = len(times) < 2 or np.all(np.diff(short) > 0)
+    return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
 
 
 def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndarray:
-    """The mask, bool [H, W]; a file without one has no gaps."""
+    """Returns the mask, bool [H, W]; without a part all texels are valid."""
     if "mask" not in tensors:
         return np.ones((height, width), bool)
-    size = -(-height * width // 8)
-    stored = check_part(tensors, "mask", _MASK).tobytes()
-    bits = inflate(stored, size, "part mask", f"{size} bytes, compressed, found others")
+    bits = zstd.decompress(check_part(tensors, "mask", _BYTES).tobytes(), -(-height * width // 8), "part mask")
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=height * width).reshape(height, width).astype(bool)
 
 
 def _check_times(times: list[float], period: float | None) -> None:
     if len(times) < 1 or not math.isfinite(times[-1] - times[0]) or not all(a < b for a, b in pairwise(times)):
         raise ValueError("part times: expected times that increase")
-    # Files may hold a time that was rounded up to the period.
+    # A file may hold a time that was rounded up to the period.
     if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
         raise ValueError(f"part times: expected 0 to {period:g}, the period, found {times[0]:g} to {times[-1]:g}")

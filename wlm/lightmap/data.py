@@ -1,7 +1,7 @@
-"""What comes in: a set of lightmaps over time, read from files or arrays and checked.
+"""Lightmap sets over time, read from files or arrays and checked.
 
-The stated behaviours. "Inside" is inside the mask. Repairs are counted in texels, whichever channels they touch, and
-listed in `LightmapSet.warnings`, one line per file and kind.
+"Inside" means inside the mask. Repairs are counted in texels, over all channels, and listed in `LightmapSet.warnings`,
+one line for each file and kind of repair.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -11,31 +11,36 @@ NaN, Inf inside                       the texel takes the value of the nearest f
 a frame with no finite texel inside   error
 negative inside                       the channel is clamped to 0; warning
 above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
-any of these outside                  0, 0 and 65,504, without a warning: those texels are never seen
-all zero                              fine
+any of these outside                  0, 0 and 65,504, without a warning: those texels are never shown
+all zero                              accepted
 an empty mask                         error
-one time                              fine
+one time                              accepted
 times out of order                    sorted, with their frames; warning
 two equal times                       error that names both files
 more than 100,000 times               error
 an alpha NaN or infinite              the texel is outside a mask from alpha; warning
-frames of unlike atlases              warning, where light or an alpha ends at the charts' borders
-texels that some frames alone have    kept: fitted at the other times to the frame nearest in time
-                                      that has them, and scored at their own; warning
+frames of different atlases           warning, if light or an alpha ends at the borders of charts
+texels that only some frames have     at other times they are fitted to the frame nearest in time that
+                                      has them; scored only at their own times; warning
 files, mask or mesh outside the       error, unless the set is trusted
 folder of their `set.json`
 frames beyond 1 GiB that small files  error, unless the set is trusted
 only claim
-frames beyond 1 GiB                   in a file without a name in the folder for temporary files
-                                      (TMPDIR); without that much space there: error
+frames beyond 1 GiB                   in an unnamed file in the folder for temporary files (TMPDIR);
+                                      error if there is not enough space
 a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
 a NaN or infinite time                error
-frames, mask or `set.json` that     error that names both files
+frames, mask or `set.json` that       error that names both files
 disagree in size
-PNG, integers, arrays, cubes, XYZ,    error that says what was found; what is read: docs/formats.md
-and what else is no linear light
+PNG, integers, arrays, cubes, XYZ,    error that says what was found; accepted formats: docs/formats.md
+and other content that is no light
 a file missing or damaged, a          error that names the file, and the field
-malformed `set.json` or `config.json`
+malformed `set.json`
+values beyond a linear layer's range  clamped to it; warning inside the mask
+a PNG of a linear layer               its levels run from the least value to the greatest
+a layer or atlas that a state lacks   error that names the state, and one that has it
+channels that a file lacks            error that names the file and its channels
+more than 12 channels of an atlas     error
 ====================================  ================================================================
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
@@ -44,44 +49,48 @@ Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
 import hashlib
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.light import EXPECTED, SUFFIXES, read_light
+from wlm.formats.channels import read_channels
+from wlm.formats.light import read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
-from wlm.lightmap.contest import CONFIG_FILE, is_contest, list_contest, read_coverage, read_raw
 from wlm.lightmap.layout import odd_layout
-from wlm.lightmap.listing import SET_FILE, Listing, list_folder, parse_set
+from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, is_name, list_set
+from wlm.lightmap.sheet import LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, first_light, sheets_of
 from wlm.texels import repair
 
-_READERS = 2  # decompression releases the GIL; more threads than this only fight over the disk
+_READERS = 2  # decompression releases Python's lock; more threads than this only compete for the disk
+_LIGHT_CHANNELS = ("R", "G", "B")
+_ALPHA = "A"
+_ALL, _FROM_ALPHA = "all", "alpha"
 
 
 @dataclass(frozen=True, eq=False)
-class LightmapSet:
-    """Lightmaps of one texture atlas at several times, checked and repaired as the module's table says.
+class SheetFrames:
+    """The lightmaps of one sheet at several times, checked and repaired as the module's table says.
 
     Attributes:
-        name: The set's name.
+        name: Name of the set, and of the sheet if it is not the ordinary lightmap.
         times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]. Row 0 is v = 0. More than 1 GiB
-            of them are mapped from a file, see `wlm.formats.scratch`.
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; levels in [0, 1] of a linear
+            sheet. Row 0 is v = 0. More than 1 GiB are mapped from a file, see `wlm.formats.scratch`.
         mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
-        period: Length of the day in the unit of `times`, all of which are then in [0, period); None where the
-            set is not periodic and times outside its ends are clamped.
+        period: Length of the day in the unit of `times`, all of which are then in [0, period); None if the set is not
+            periodic and times outside its ends are clamped.
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
-        warnings: What was repaired, one line each.
-        mesh: The mesh that the lightmaps belong to, as the set names it; it need not be there. None: no name.
-        covered: `[T, H, W]` bool, the valid texels that each frame has; None where every frame has all of them.
-            What a frame lacks holds the light of the frame nearest in time that has it.
+        warnings: Repairs, one line each.
+        mesh: The mesh that the lightmaps belong to, as the set names it; the file may be missing. None without a name.
+        covered: `[T, H, W]` bool, the valid texels that each frame has; None if every frame has all of them. A texel
+            that a frame lacks holds the light of the frame nearest in time that has it.
     """
 
     name: str
@@ -95,8 +104,78 @@ class LightmapSet:
     covered: np.ndarray | None = None
 
     def valid(self, index: int) -> np.ndarray:
-        """The valid texels that a frame has, bool [H, W]."""
+        """Returns the valid texels that a frame has, bool [H, W]."""
         return self.mask if self.covered is None else self.covered[index]
+
+
+@dataclass(frozen=True, eq=False)
+class LightmapSet:
+    """Lightmaps over time: one or more sheets at the same times.
+
+    Attributes:
+        name: Name of the set.
+        sheets: The sheets, atlas by atlas and layer by layer; an ordinary set has one.
+    """
+
+    name: str
+    sheets: dict[Sheet, SheetFrames]
+
+    @property
+    def light(self) -> SheetFrames:
+        """The first sheet of radiance, or the first sheet: all of an ordinary set."""
+        return self.sheets[first_light(self.sheets)]
+
+    def find(self, sheet: Sheet) -> SheetFrames:
+        """Returns the lightmaps of a sheet, or the only lightmaps of a set with one sheet.
+
+        Raises:
+            WlmError: The set has several sheets, but not this one.
+        """
+        if sheet not in self.sheets and len(self.sheets) > 1:
+            found = ", ".join(one.label for one in self.sheets)
+            raise WlmError(f"{self.name}: expected a set with {sheet.label}, found {found}")
+        return self.sheets.get(sheet, self.light)
+
+    @property
+    def times(self) -> np.ndarray:
+        """float64 [T], increasing."""
+        return self.light.times
+
+    @property
+    def period(self) -> float | None:
+        """Length of the day in the unit of the times, or None."""
+        return self.light.period
+
+    @property
+    def source(self) -> str:
+        """16 hexadecimal digits of BLAKE2b over the sheets and their names."""
+        digest = hashlib.blake2b(digest_size=8)
+        for sheet, own in self.sheets.items():
+            digest.update(repr((sheet, own.source)).encode())
+        return digest.hexdigest()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Repairs, one line each."""
+        return tuple(dict.fromkeys(text for own in self.sheets.values() for text in own.warnings))
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A layer of an atlas in memory.
+
+    Attributes:
+        frames: `[T, H, W, C]` of numbers.
+        name, atlas: Names of the layer and of the atlas.
+        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        channels: C names; None names them R, G, B, A, or by numbers if there are more than four.
+    """
+
+    frames: np.ndarray
+    name: str = LIGHT.layer
+    atlas: str = LIGHT.atlas
+    encoding: str = LIGHT.encoding
+    channels: tuple[str, ...] | None = None
 
 
 def load(
@@ -106,33 +185,34 @@ def load(
     mask: str | os.PathLike[str] | None = None,
     period: float | None = None,
     trust: bool = False,
-    map_id: str | None = None,
+    layers: Sequence[str] | None = None,
 ) -> LightmapSet:
-    """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or one of a contest.
+    """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or folders from Unity.
 
     A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
 
-    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and
-    may have `name`, `period_hours`, `mask` (a PNG's name, or "alpha"; absent means that all texels are valid) and
-    `mesh` (a glTF or OBJ file's name, read by `evaluate` alone). Other keys are ignored. Names of files are relative
-    to it.
+    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and may have
+    `name`, `period_hours`, `mask` (the name of a PNG, or "alpha"; without it all texels are valid) and `mesh` (the name
+    of a glTF or OBJ file, which only `evaluate` reads). Other keys are ignored. Names of files are relative to it. With
+    `layers` and `atlases` it describes several layers of several atlases (docs/formats.md).
 
-    The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are taken in natural order of their names
-    ("2" before "10"). Without `times`, the hours are read from the names if every one ends like `_18_55h`, `_18.55h`,
-    `_18h` or `_18.55`, the digits after the second separator being decimals, not minutes. A `mask.png` among them is
-    the mask unless `mask` says otherwise.
+    The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are read in natural order of their names
+    ("2" before "10"). Without `times`, the hours are read from the names if every name ends like `_18_55h`, `_18.55h`,
+    `_18h` or `_18.55`; the digits after the second separator are decimals, not minutes. A `mask.png` among them is the
+    mask unless `mask` says otherwise.
 
-    A folder with a `config.json` and no lightmap of these is read as `wlm.lightmap.contest` says.
+    A folder with `NAME_comp_light.exr`, as Unity writes it, is one state of light; a folder of such folders has a state
+    for each, in natural order of their names. NAME is the atlas; `_comp_dir` and `_comp_shadowmask` are linear layers.
 
     Args:
         path: The `set.json` or the folder.
-        times: One time for each lightmap in the order of the list or the names; replaces those of `set.json`.
-        mask: A PNG (a texel is valid where any colour channel is above 0), "alpha" (valid where the alpha
-            channel of a frame is above 0; frames may differ) or "all"; None takes what the set says.
-        period: Length of the day in the unit of the times; None takes the set's `period_hours`, if any.
+        times: A time for each state in the order of the list or of the names; replaces those of `set.json`.
+        mask: A PNG (a texel is valid if any colour channel is above 0), "alpha" (valid if the alpha channel of a frame
+            is above 0; frames may differ) or "all"; None uses the mask of the set. It applies to all atlases.
+        period: Length of the day in the unit of the times; None uses the set's `period_hours`, if any.
         trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
             (`wlm.formats.limits`).
-        map_id: Which lightmap of a contest's folder, `ID` or `LEVEL/ID`; None where it has but one.
+        layers: Names of the layers to read; None reads all.
 
     Returns:
         The set, repaired as the module's table says.
@@ -140,58 +220,39 @@ def load(
     Raises:
         WlmError: One line that names the file and the field, for each error of the module's table.
     """
-    path = Path(path)
-    if path.is_dir() and (path / SET_FILE).is_file():
-        path = path / SET_FILE
-    if path.is_dir() and is_contest(path):
-        listing = list_contest(path, map_id, times, trust)
-    elif map_id is not None:
-        raise WlmError(f"{path}: expected a contest's folder with a {CONFIG_FILE} to choose map {map_id} of")
-    elif path.is_dir():
-        listing = list_folder(path, times)
-    elif path.is_file():
-        if path.suffix.lower() != ".json":
-            lone = path.suffix.lower() in SUFFIXES
-            found = "one lightmap, which wlm atlas compress takes with its mesh" if lone else "a file of another kind"
-            raise WlmError(f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found {found}")
-        listing = parse_set(path, times, trust)
-    else:
-        raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
-
-    labels = [file.name for file in listing.files]
+    listing = list_set(Path(path), times, layers, trust)
     stamps = np.asarray(listing.times, np.float64)
     period = listing.period if period is None else period
-    # Before the files are read: of a bad list that would be in vain.
-    check_times(str(path), labels, stamps, period)
-    mask_source = str(mask) if mask is not None else listing.mask
-    need_alpha = mask_source == "alpha"
-    if need_alpha and listing.raw is not None:
-        raise WlmError(f"{path}: expected files of RGBA for a mask from alpha, found raw lightmaps without it")
-    order = np.argsort(stamps, kind="stable")
-    frames, covered, warnings = _read_frames(listing, order, need_alpha, trust)
-    height, width = frames.shape[1:3]
-    if need_alpha:
-        valid = covered
-    elif mask is None and listing.coverage is not None:
-        valid = read_coverage(listing.coverage, (height, width))
-    elif mask_source == "all":
-        valid = np.ones((height, width), bool)
-    else:
-        valid = read_mask(Path(mask_source), listing.files[0], (height, width), ', "alpha" or "all"')
-    lightmaps = checked_set(
-        listing.name,
-        labels,
-        stamps,
-        order,
-        frames,
-        valid,
-        period,
-        where=str(path),
-        mask_from="the alpha channels" if need_alpha else mask_source,
-        warn_order=listing.warn_order,
-        warnings=warnings,
-    )
-    return replace(lightmaps, mesh=listing.mesh)
+    # Before any file is read, since a wrong list makes that useless.
+    check_times(str(listing.where), listing.labels, stamps, period)
+    reader = _Reader(listing, np.argsort(stamps, kind="stable"), trust)
+    sheets: dict[Sheet, SheetFrames] = {}
+    for atlas in listing.atlases:
+        valid = mask_from = None
+        chosen = str(mask) if mask is not None else atlas.mask
+        # Light first: its alpha is the mask of the atlas.
+        for layer in sorted(listing.layers, key=lambda layer: layer.encoding != LIGHT.encoding):
+            light = layer.encoding == LIGHT.encoding
+            wanted = chosen if light and valid is None and chosen in (_FROM_ALPHA, None) else _ALL
+            stack = reader.read(atlas, layer, wanted)
+            if valid is None:
+                valid = _valid(listing, atlas, layer, stack, chosen)
+                mask_from = "the alpha of the light; --mask all takes all" if stack.alpha is not None else str(chosen)
+            states = _States(
+                [state[atlas.name, layer.name].label for state in listing.states],
+                stamps,
+                period,
+                str(listing.where),
+                mask_from,
+                listing.warn_order,
+            )
+            for sheet, frames in stack.frames.items():
+                mesh = None if sheet.linear else atlas.mesh
+                sheets[sheet] = states.checked(listing.name, sheet, frames, valid, stack.warnings, mesh)
+    atlas_of = {atlas.name: i for i, atlas in enumerate(listing.atlases)}
+    layer_of = {layer.name: i for i, layer in enumerate(listing.layers)}
+    ordered = sorted(sheets, key=lambda sheet: (atlas_of[sheet.atlas], layer_of[sheet.layer]))
+    return LightmapSet(listing.name, {sheet: sheets[sheet] for sheet in ordered})
 
 
 def from_arrays(
@@ -201,14 +262,14 @@ def from_arrays(
     period: float | None = None,
     name: str = "array",
 ) -> LightmapSet:
-    """Makes a checked set from arrays, under the same rules as `load`.
+    """Makes a checked set of one lightmap for each time from arrays, under the same rules as `load`.
 
     Args:
         frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
         times: `[T]`, in any order.
-        mask: `[H, W]`, true where a texel is valid, or `[T, H, W]`, where each frame has it; None for all.
+        mask: `[H, W]`, true where a texel is valid, or `[T, H, W]`, true where each frame has it; None for all.
         period: Length of the day in the unit of the times; None for a set that is not periodic.
-        name: The set's name, used in messages too.
+        name: Name of the set, also in messages.
 
     Returns:
         The set, repaired as the module's table says; a frame is called "frame 3 (time 5)" in its warnings.
@@ -217,29 +278,78 @@ def from_arrays(
         WlmError: A shape is wrong, or an error of the module's table.
     """
     frames = np.asarray(frames)
+    if frames.ndim != 4 or frames.shape[3] != 3:
+        raise WlmError(f"{name}: expected frames [T, H, W, 3], got {frames.shape}")
+    return from_layers([Layer(frames)], times, None if mask is None else {LIGHT.atlas: mask}, period, name)
+
+
+def from_layers(
+    layers: Sequence[Layer],
+    times: Sequence[float] | np.ndarray,
+    masks: Mapping[str, np.ndarray] | None = None,
+    period: float | None = None,
+    name: str = "array",
+) -> LightmapSet:
+    """Makes a checked set of several layers from arrays, under the same rules as `load`.
+
+    Args:
+        layers: In the order in which they are stored; all layers of an atlas have its height and width.
+        times: `[T]`, in any order.
+        masks: By atlas `[H, W]`, true where a texel is valid, or `[T, H, W]`; an atlas without a mask has no gaps.
+        period, name: As for `from_arrays`.
+
+    Raises:
+        WlmError: A shape is wrong, or an error of the module's table.
+    """
     stamps = np.asarray(times, np.float64)
-    if frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
-        raise WlmError(f"{name}: expected frames [T, H, W, 3], none of them 0, got {frames.shape}")
-    if stamps.shape != frames.shape[:1]:
-        raise WlmError(f"{name}: expected {len(frames)} times, one per frame, got shape {stamps.shape}")
-    valid = np.ones(frames.shape[1:3], bool) if mask is None else np.asarray(mask).astype(bool)
-    if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
-        raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
+    sizes: dict[Sheet, tuple[int, int]] = {}
+    sources: dict[Sheet, tuple[np.ndarray, list[int]]] = {}
+    for layer in layers:
+        frames, where = np.asarray(layer.frames), f"{name}: {layer.atlas}/{layer.name}"
+        if frames.ndim != 4 or 0 in frames.shape or stamps.shape != frames.shape[:1]:
+            expected = f"[{stamps.size}, H, W, C], none of them 0, and a time for each"
+            raise WlmError(f"{where}: expected frames {expected}, got {frames.shape} and times {stamps.shape}")
+        count = frames.shape[3]
+        channels = tuple(layer.channels or ("RGBA"[:count] if count <= 4 else map(str, range(count))))
+        if not all(is_name(value) for value in (layer.atlas, layer.name, *channels)):
+            raise WlmError(
+                f"{name}: atlases, layers, channels: expected names of 1 to {MOST_NAME} printable characters"
+            )
+        if layer.encoding not in VALUE_RANGES or len(channels) != count:
+            raise WlmError(
+                f"{where}: expected an encoding of {', '.join(VALUE_RANGES)} and {count} channels, got "
+                f"{layer.encoding!r} and {len(channels)}"
+            )
+        for sheet in sheets_of(layer.atlas, layer.name, channels, layer.encoding):
+            if sheet in sizes:
+                raise WlmError(f"{where}: expected each channel of a layer once")
+            sizes[sheet] = frames.shape[1:3]
+            sources[sheet] = frames, [channels.index(channel) for channel in sheet.channels]
+    check_sheets(name, sizes)
+    if unknown := (masks or {}).keys() - {sheet.atlas for sheet in sizes}:
+        raise WlmError(f"{name}: masks: expected those of atlases that layers are of, found {sorted(unknown)[0]!r}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     check_times(name, labels, stamps, period)
-    order = np.argsort(stamps, kind="stable")
-    copied = room(frames.shape, np.float32, name)
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
-        for frame, index in zip(copied, order, strict=True):
-            frame[...] = frames[index]
-    valid = valid[order] if valid.ndim == 3 else valid.copy()
-    return checked_set(name, labels, stamps, order, copied, valid, period, where=name, mask_from="the mask")
+    states = _States(labels, stamps, period, name, "the mask", True)
+    sheets, made = {}, 0
+    for sheet, (frames, chosen) in sources.items():
+        valid = np.asarray((masks or {}).get(sheet.atlas, np.ones(sizes[sheet], bool))).astype(bool)
+        if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
+            raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
+        copied = room((*frames.shape[:3], 3), np.float32, name, made)
+        made += copied.nbytes
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
+            for frame, index in zip(copied, states.order, strict=True):
+                frame[...] = sheet.to_levels(frames[index][..., chosen])
+        valid = valid[states.order] if valid.ndim == 3 else valid.copy()
+        sheets[sheet] = states.checked(name, sheet, copied, valid)
+    return LightmapSet(name, sheets)
 
 
 def parse_times(text: str) -> list[float]:
     """Reads a list of times: numbers and `start:stop:step` ranges, separated by commas.
 
-    A range leaves `stop` out, as Python's do: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
+    A range leaves `stop` out, as in Python: "0:24:1" is 0, 1, ... 23, one day without its first hour twice.
 
     Args:
         text: Such as "0,1,2.5", "0:24:1" or "0:18:1,18.45,18.55,19:24:1".
@@ -248,8 +358,7 @@ def parse_times(text: str) -> list[float]:
         The times in the order written, at least one.
 
     Raises:
-        WlmError: A part that is no number or range, a step that never reaches the stop, or more than 100,000
-            times.
+        WlmError: A part that is no number or range, a step that never reaches the stop, or more than 100,000 times.
     """
     times: list[float] = []
     for part in text.split(","):
@@ -273,71 +382,12 @@ def parse_times(text: str) -> list[float]:
     return times
 
 
-def _read_frames(
-    listing: Listing, order: np.ndarray, need_alpha: bool, trust: bool
-) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Reads all files into one array [T, H, W, 3], in an order; if asked for, also where alphas are above 0 [T, H, W].
-
-    Returns:
-        Both, and warnings.
-    """
-    first, alpha = _read_rgb(listing, 0, need_alpha)
-    size = first.shape[:2]
-    if listing.size is not None and size != listing.size:
-        raise WlmError(f"{listing.files[0]}: is {_size(size)}, but {listing.stated_by} states {_size(listing.size)}")
-    if not trust:
-        held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
-        check_growth(f"{listing.stated_by}: lightmaps", held, len(listing.files) * first.nbytes, PICTURE_GROWTH, FRAMES)
-    # One array from the start: a list of frames stacked at the end would need twice the memory.
-    where = f"{listing.stated_by}: {len(listing.files)} lightmaps of {_size(size)}"
-    frames = room((len(listing.files), *first.shape), np.float32, where)
-    place = np.argsort(order)
-    frames[place[0]] = first
-    covered, warnings = np.zeros(frames.shape[:3], bool) if need_alpha else None, []
-
-    def read(index: int) -> np.ndarray | None:
-        rgb, alpha = _read_rgb(listing, index, need_alpha)
-        if rgb.shape[:2] != size:
-            raise WlmError(
-                f"{listing.files[index]}: is {_size(rgb.shape)}, but {listing.files[0]} is {_size(size)}; "
-                "expected one size"
-            )
-        frames[place[index]] = rgb
-        return alpha
-
-    pool = ThreadPoolExecutor(_READERS)
-    try:
-        # In order, so that of several bad files the first is the one named.
-        alphas = chain([alpha], pool.map(read, range(1, len(listing.files))))
-        for i, (file, alpha) in enumerate(zip(listing.files, alphas, strict=True)):
-            if covered is None:
-                continue
-            covered[place[i]] = np.isfinite(alpha) & (alpha > 0)
-            if broken := np.count_nonzero(~np.isfinite(alpha)):
-                warnings.append(f"{file.name}: {broken} texels with an alpha NaN or infinite: not valid")
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return frames, covered, tuple(warnings)
-
-
-def _read_rgb(listing: Listing, index: int, need_alpha: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Reads one lightmap: colour [H, W, 3] and, if asked for, its alpha [H, W]."""
-    if listing.raw is not None:
-        return read_raw(listing.raw[index], listing.size), None
-    path = listing.files[index]
-    pixels, names = read_light(path)
-    if need_alpha and "A" not in names:
-        raise WlmError(f"{path}: expected a channel A, which the mask is to come from, found {', '.join(names)}")
-    return pixels[..., :3], pixels[..., 3] if need_alpha else None
-
-
-def _size(shape: Sequence[int]) -> str:
-    """Writes [H, W, ...] with the width first."""
-    return f"{shape[1]}x{shape[0]}"
-
-
 def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
-    """Applies the module's table to the times [T] of the frames of these labels."""
+    """Applies the module's table to the times [T] of the states with these labels.
+
+    Raises:
+        WlmError: A time or the period is wrong, or two times are equal.
+    """
     if period is not None and not (math.isfinite(period) and period > 0):
         raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
     for label, time in zip(labels, times, strict=True):
@@ -351,56 +401,233 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
             raise WlmError(f"{where}: {labels[i]} and {labels[j]} have the same time, {times[i]:g}")
 
 
-def checked_set(
-    name: str,
-    labels: Sequence[str],
-    times: np.ndarray,  # [T]
-    order: np.ndarray,  # [T], that of the times
-    frames: np.ndarray,  # [T, H, W, 3] in that order, repaired in place
-    mask: np.ndarray,  # [H, W], or [T, H, W] in that order
-    period: float | None,
-    *,
-    where: str,
-    mask_from: str,
-    warn_order: bool = True,
-    warnings: Sequence[str] = (),
-) -> LightmapSet:
-    """Applies the module's table to frames from files or arrays, whose times have been checked."""
-    if not mask.any():
-        raise WlmError(f"{where}: the mask is empty: no texel is valid ({mask_from})")
-    warnings = list(warnings)
-    if (np.diff(order) < 0).any() and warn_order:
-        warnings.append(f"{where}: the times were not in order: sorted, with their frames")
-    times, labels = times[order], [labels[i] for i in order]
-    covered = mask if mask.ndim == 3 and any((valid != mask[0]).any() for valid in mask) else None
-    mask = mask.any(0) if mask.ndim == 3 else mask
-    for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
-        inside = mask if covered is None else covered[i]
-        warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
-    odd = odd_layout(len(frames), lambda i: frames[i].any(-1) if covered is None else covered[i])
-    if odd is not None:
-        warnings.append(
-            f"{where}: {labels[odd[0]]} and {labels[odd[1]]} don't look like one atlas at two times: their charts "
-            "end in other texels"
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """The pictures of a layer of an atlas.
+
+    Attributes:
+        frames: Levels of each of its sheets, float32 [T, H, W, 3], in the order of the times.
+        alpha: bool [T, H, W], true where a texel has an alpha above 0; None if the mask is not taken from it.
+        warnings: Lines about alphas.
+    """
+
+    frames: dict[Sheet, np.ndarray]
+    alpha: np.ndarray | None
+    warnings: list[str]
+
+
+class _Reader:
+    """Reads the layers of a listing one after another."""
+
+    def __init__(self, listing: Listing, order: np.ndarray, trust: bool) -> None:
+        self._listing, self._place, self._trust = listing, np.argsort(order), trust
+        self._sizes: dict[Sheet, tuple[int, int]] = {}
+        self._made = 0  # bytes of the sheets that memory was allocated for
+
+    def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
+        """Reads a layer of an atlas at all times.
+
+        Args:
+            atlas, layer: The atlas and the layer.
+            mask: "alpha" requires an alpha channel, None reads one if the first picture has it, "all" ignores it.
+        """
+        sources = [state[atlas.name, layer.name] for state in self._listing.states]
+        first = sources[0]
+        pixels, names = _read(first, layer)
+        has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
+        stack = self._stack(atlas, layer, pixels, names, has_alpha, first)
+        size, known = pixels.shape[:2], names
+
+        def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
+            place, source = self._place[index], sources[index]
+            if pixels.shape[:2] != size:
+                raise WlmError(f"{source.path}: is {_size(pixels.shape)}, but {first.path} is {_size(size)}")
+            if layer.encoding != LIGHT.encoding and names != known:
+                raise WlmError(f"{source.path}: has {', '.join(names)}, but {first.path} has {', '.join(known)}")
+            for sheet, frames in stack.frames.items():
+                frames[place] = sheet.to_levels(pixels[..., [names.index(name) for name in sheet.channels]])
+            if stack.alpha is None:
+                return 0
+            if _ALPHA not in names:
+                found = ", ".join(names)
+                raise WlmError(f"{source.path}: expected a channel A, which the mask is to come from, found {found}")
+            alpha = pixels[..., names.index(_ALPHA)]
+            stack.alpha[place] = np.isfinite(alpha) & (alpha > 0)
+            return int(np.count_nonzero(~np.isfinite(alpha)))
+
+        broken = [put(0, pixels, names)]
+        pool = ThreadPoolExecutor(_READERS)
+        try:
+            # In order, so that the error names the first of several bad files.
+            broken += pool.map(lambda index: put(index, *_read(sources[index], layer)), range(1, len(sources)))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        for source, count in zip(sources, broken, strict=True):
+            if count:
+                stack.warnings.append(f"{source.label}: {count} texels with an alpha NaN or infinite: not valid")
+        return stack
+
+    def _stack(
+        self,
+        atlas: AtlasInfo,
+        layer: LayerInfo,
+        pixels: np.ndarray,
+        names: tuple[str, ...],
+        alpha: bool,
+        source: Source,
+    ) -> _Stack:
+        """Allocates memory for a layer, given its first picture."""
+        channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
+        if missing := [channel for channel in channels if channel not in names]:
+            found = ", ".join(names)
+            raise WlmError(f"{source.path}: layer {layer.name}: expected a channel {missing[0]}, found {found}")
+        size, where = pixels.shape[:2], self._listing.where
+        if atlas.size not in (None, size):
+            raise WlmError(f"{source.path}: is {_size(size)}, but {where} states {_size(atlas.size)}")
+        sheets = sheets_of(atlas.name, layer.name, channels, layer.encoding)
+        self._sizes |= dict.fromkeys(sheets, size)
+        check_sheets(str(where), self._sizes)
+        count = len(self._listing.states)
+        if not self._trust:
+            files = sum(os.path.getsize(file) for file in set(self._listing.files) if os.path.exists(file))
+            total = sum(math.prod(at) for at in self._sizes.values()) * 3 * 4 * count
+            check_growth(f"{where}: lightmaps", files, total, PICTURE_GROWTH, FRAMES)
+        # One array from the start: a list of frames that is stacked at the end would need twice the memory.
+        text, frames = f"{where}: {count} lightmaps of {_size(size)}", {}
+        for sheet in sheets:
+            frames[sheet] = room((count, *size, 3), np.float32, text, self._made)
+            self._made += frames[sheet].nbytes
+        return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, [])
+
+
+def _read(source: Source, layer: LayerInfo) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads a picture: values [H, W, C] and the names of the channels."""
+    if layer.encoding == LIGHT.encoding and layer.channels is None:
+        pixels, names = read_light(source.path)
+    else:
+        pixels, names, levels = read_channels(source.path)
+        if levels and layer.encoding == LIGHT.encoding:
+            raise WlmError(f"{source.path}: layer {layer.name}: expected light, found a PNG, whose bits are not light")
+        if levels:
+            least, greatest = VALUE_RANGES[layer.encoding]
+            pixels = np.float32(least) + pixels * np.float32(greatest - least)
+    if source.slices > 1:
+        height, rest = divmod(len(pixels), source.slices)
+        if rest or not height:
+            raise WlmError(f"{source.path}: expected {source.slices} slices of one height, found {len(pixels)} rows")
+        pixels = pixels[source.slice * height : (source.slice + 1) * height]
+    return pixels, names
+
+
+def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, mask: str | None) -> np.ndarray:
+    """Returns the valid texels of an atlas, bool [H, W] or [T, H, W] in the order of the times."""
+    size, first = next(iter(stack.frames.values())).shape[1:3], listing.states[0][atlas.name, layer.name].path
+    if stack.alpha is not None:
+        return stack.alpha
+    if mask == _FROM_ALPHA:
+        raise WlmError(f"{first}: expected light with a channel A, which the mask is to come from, found none")
+    if mask in (_ALL, None):
+        return np.ones(size, bool)
+    return read_mask(Path(mask), first, size, ', "alpha" or "all"')
+
+
+@dataclass(frozen=True, eq=False)
+class _States:
+    """The states of a set, in the order given, and the words that messages need.
+
+    Attributes:
+        labels: Names of the states.
+        times: float64 [T], checked.
+        period: Length of the day, or None.
+        where: The set, for messages.
+        mask_from: The origin of the mask, for messages.
+        warn_order: Whether times that are out of order deserve a warning.
+    """
+
+    labels: Sequence[str]
+    times: np.ndarray
+    period: float | None
+    where: str
+    mask_from: str
+    warn_order: bool
+
+    @property
+    def order(self) -> np.ndarray:
+        """int [T], the order of the times."""
+        return np.argsort(self.times, kind="stable")
+
+    def checked(
+        self,
+        name: str,
+        sheet: Sheet,
+        frames: np.ndarray,
+        mask: np.ndarray,
+        warnings: Sequence[str] = (),
+        mesh: Path | None = None,
+    ) -> SheetFrames:
+        """Applies the module's table to the frames of a sheet.
+
+        Args:
+            name: Name of the set.
+            sheet: The sheet.
+            frames: [T, H, W, 3] in the order of the times, repaired in place.
+            mask: [H, W], or [T, H, W] in the order of the times.
+            warnings: Lines that come first.
+            mesh: See `SheetFrames`.
+        """
+        where, period = self.where, self.period
+        if not mask.any():
+            raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")
+        warnings, order = list(warnings), self.order
+        if (np.diff(order) < 0).any() and self.warn_order:
+            warnings.append(f"{where}: the times were not in order: sorted, with their frames")
+        times, labels = self.times[order], [self.labels[i] for i in order]
+        if sheet.linear:
+            warnings += _clamp(sheet, labels, frames, mask)
+        covered = mask if mask.ndim == 3 and any((valid != mask[0]).any() for valid in mask) else None
+        mask = mask.any(0) if mask.ndim == 3 else mask
+        for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
+            inside = mask if covered is None else covered[i]
+            warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
+        odd = odd_layout(len(frames), lambda i: frames[i].any(-1) if covered is None else covered[i])
+        if odd is not None:
+            warnings.append(
+                f"{where}: {labels[odd[0]]} and {labels[odd[1]]} don't look like one atlas at two times: their charts "
+                "end in other texels"
+            )
+        if covered is not None:
+            covered = covered & mask
+            _fill_in_time(frames, covered, times, period)
+            missing = np.count_nonzero(mask & ~covered.all(0))
+            warnings.append(
+                f"{where}: {missing} texels are in some lightmaps alone: at the other times they are fitted to the "
+                "nearest lightmap that has them, and not scored"
+            )
+        return SheetFrames(
+            name=name if sheet == LIGHT else f"{name} {sheet.label}",
+            times=times,
+            frames=frames,
+            mask=mask,
+            period=None if period is None else float(period),
+            source=_hash(frames, times, mask if covered is None else covered),
+            warnings=tuple(warnings),
+            mesh=mesh,
+            covered=covered,
         )
-    if covered is not None:
-        covered = covered & mask
-        _fill_in_time(frames, covered, times, period)
-        missing = np.count_nonzero(mask & ~covered.all(0))
-        warnings.append(
-            f"{where}: {missing} texels are in some lightmaps alone: at the other times they are fitted to the nearest "
-            "lightmap that has them, and not scored"
-        )
-    return LightmapSet(
-        name=name,
-        times=times,
-        frames=frames,
-        mask=mask,
-        period=None if period is None else float(period),
-        source=_hash(frames, times, mask if covered is None else covered),
-        warnings=tuple(warnings),
-        covered=covered,
-    )
+
+
+def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.ndarray) -> Iterator[str]:
+    """Clamps levels to [0, 1] in place; infinite ones become NaN, which are repaired later. Yields warnings."""
+    least, greatest = VALUE_RANGES[sheet.encoding]
+    for i, frame in enumerate(frames):
+        inside = mask[i] if mask.ndim == 3 else mask
+        frame[np.isinf(frame)] = np.nan
+        with np.errstate(invalid="ignore"):
+            beyond = np.count_nonzero(((frame < 0.0) | (frame > 1.0)).any(axis=2) & inside)
+        if beyond:
+            texels = f"{beyond} {'texel' if beyond == 1 else 'texels'}"
+            yield f"{labels[i]}: {sheet.label}: {texels} beyond {least:g} to {greatest:g}: clamped to it"
+        np.clip(frame, 0.0, 1.0, out=frame)
 
 
 def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, period: float | None) -> None:
@@ -428,3 +655,8 @@ def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
     for frame in frames:
         digest.update(np.ascontiguousarray(frame, "<f4"))
     return digest.hexdigest()
+
+
+def _size(shape: Sequence[int]) -> str:
+    """Writes [H, W, ...] with the width first."""
+    return f"{shape[1]}x{shape[0]}"

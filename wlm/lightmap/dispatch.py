@@ -1,56 +1,71 @@
-"""Handing batches of tiles out to workers, in whatever order they get done: the result is the same."""
+"""Distributing batches of tiles to workers. Batches may finish in any order; the result is the same."""
 
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.checkpoint import Checkpoint, CheckpointRange
+from wlm.formats.checkpoint import Checkpoint
+from wlm.lightmap.targets import TileJob
 from wlm.lightmap.tiles import TileKind
-from wlm.lightmap.worker import Advance, Piece
+from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
 from wlm.metrics.tiled import nanmean
 from wlm.system import Meter
-from wlm.workers import Lost, Workers
+from wlm.workers import Actors, Here, Lost, Processes, Workers, cores
 
 _SLICE = 0.5  # seconds of work between two answers of another process
-_POLL = 0.2  # seconds: how long a signal waits at most to be heard
-_DEATHS = 3  # of workers of one batch from the same state; then the batch is to blame
-_STOPPING = 30.0  # seconds that workers get to give their state before a stop
+_POLL = 0.2  # seconds that a signal waits at most to be handled
+_DEATHS = 3  # workers that one batch may lose in the same state before the batch is considered the cause
+_STOPPING = 30.0  # seconds that workers get to return their state before a stop
+_WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
 
 Parts = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one kind that are fitted together.
+    """Tiles of one kind of one sheet that are fitted together.
 
     Attributes:
-        number: Of the batch, from 0.
+        number: Number of the batch, from 0.
         kind: STATIC or DYNAMIC.
-        rows: int [n], their places among the fit's tiles.
-        first: Number of tiles of that kind in earlier batches.
+        rows: int [n], positions of the tiles among the tiles of the sheet's fit.
+        first: Number of tiles of that kind in earlier batches of the sheet.
+        fit: The fit of the sheet.
     """
 
     number: int
     kind: TileKind
     rows: np.ndarray
     first: int
+    fit: "BatchOwner"
+
+
+class BatchOwner(Protocol):
+    """The fit of a sheet, as batches use it; see `wlm.lightmap.fit.SheetFit`."""
+
+    def job(self, batch: Batch) -> TileJob: ...
+
+    def store(self, batch: Batch, parts: Parts) -> None: ...
+
+    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool: ...
 
 
 @dataclass(eq=False)
-class _Job:
-    """A batch that a worker is at.
+class _Running:
+    """A batch that a worker is fitting.
 
     Attributes:
         batch: The batch.
         step: Steps done; None until the worker has begun.
-        deaths: Workers that it has lost since its state was last kept.
-        saving: Whether its state is asked for before it goes on.
+        deaths: Workers that it has lost since its state was last saved.
+        saving: Whether its state is requested before it goes on.
     """
 
     batch: Batch
@@ -59,57 +74,103 @@ class _Job:
     saving: bool = False
 
 
+def worker_devices(device: str, workers: int | None, cluster: str | None, samples: int = 0) -> list[str]:
+    """Chooses the device of each worker.
+
+    Args:
+        device, workers, cluster: As for `wlm.lightmap.compress`.
+        samples: Samples that the whole fit takes; short fits get fewer processes.
+
+    Raises:
+        WlmError: There is no such device, or the number of workers is below 1.
+    """
+    if workers is not None and workers < 1:
+        raise WlmError(f"workers: expected at least 1, got {workers}")
+    if cluster is not None:
+        if device not in ("cpu", "cuda"):
+            raise WlmError(f"device '{device}': expected cpu or cuda, whichever the machines of a cluster have")
+        return [device]
+    checked = interop.check_device(device)
+    if device == "cpu":
+        return ["cpu"] * (workers or max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
+    gpus = interop.available_devices()[1:] if device == "cuda" else [checked]
+    return [gpus[i % len(gpus)] for i in range(workers or 1)]
+
+
+def start_workers(
+    devices: list[str], workers: int | None, cluster: str | None, batches: int, seed: int, track: bool
+) -> Workers:
+    """Starts a `Fitter` for each device, or on the machines of a cluster.
+
+    Args:
+        devices: From `worker_devices`.
+        workers, cluster, seed: As for `wlm.lightmap.compress`.
+        batches: Number of batches, the largest number of workers on a cluster.
+        track: Whether the fitters report their PSNR.
+
+    Raises:
+        WlmError: The cluster is not there, or the system has no room for the processes.
+    """
+    if cluster is not None:
+        share = {"CPU": float(CPU_LANES)} if devices[0] == "cpu" else {"GPU": 1.0}
+        return Actors(Fitter, (seed, devices[0], track), workers, batches, cluster, share)
+    if len(devices) == 1:
+        return Here(Fitter(seed, devices[0], track))
+    return Processes(Fitter, [(seed, device, track) for device in devices])
+
+
 class Dispatch:
-    """Hands out batches, starts again what is lost, reports progress and keeps the checkpoint."""
+    """Hands out batches, restarts batches of lost workers, reports progress and writes the checkpoint."""
 
     def __init__(
         self,
         workers: Workers,
-        piece: Callable[[np.ndarray], Piece],
+        batches: Sequence[Batch],
         steps: int,
         done: int,
         meter: Meter,
-        checkpoint: Checkpoint | CheckpointRange | None,
+        checkpoint: Checkpoint | None,
     ) -> None:
-        """Takes what all batches share.
+        """Takes the data that all batches share.
 
         Args:
-            workers: Of `wlm.lightmap.worker.Fitter`.
-            piece: From the rows of tiles to what a worker gets of them.
-            steps: Of a batch.
-            done: Batches that are done already.
-            meter: Of the steps of all batches.
-            checkpoint: Where states and results are kept; None: nowhere.
+            workers: Workers with a `Fitter` each.
+            batches: The batches to fit.
+            steps: Steps of a batch.
+            done: Number of batches that were done before.
+            meter: Meter of the steps of all batches.
+            checkpoint: Keeps states and results; None keeps nothing.
         """
-        self._workers, self._piece, self._steps, self._done = workers, piece, steps, done
+        self._workers, self._steps, self._done = workers, steps, done
         self._meter, self._checkpoint = meter, checkpoint
-        self._jobs: dict[int, _Job] = {}
+        self._waiting = deque(batches)
+        self._running: dict[int, _Running] = {}
         self._dead: set[int] = set()
-        self._warm: set[TileKind] = set()
+        self._compiled: set[TileKind] = set()
         self._figures: dict[int, tuple[float, float]] = {}
-        self._states: dict[int, Parts] | None = None  # those of a save that is under way
+        self._states: dict[int, Parts] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None
         self._patience = math.inf
 
-    def run(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, Parts, float]]:
-        """Fits batches.
+    def run(self) -> Iterator[tuple[Batch, Parts]]:
+        """Fits the batches.
 
         Yields:
-            Each with its parts and its PSNR, see `Advance`, as they get done.
+            Each batch with its parts as it gets done.
 
         Raises:
-            WlmError: A fit diverged, a kept state is wrong, or the workers of a batch died again and again.
-            KeyboardInterrupt: Raised by the progress; the checkpoint has been written.
+            WlmError: A fit diverged, a saved state is wrong, or the workers of a batch died again and again.
+            KeyboardInterrupt: Raised by the progress callback; the checkpoint has been written.
         """
-        waiting, free = deque(batches), list(range(self._workers.count))[::-1]
-        while waiting or self._jobs:
-            while waiting and free and self._may_begin(waiting[0].kind):
-                self._begin(free.pop(), _Job(waiting.popleft()))
+        free = list(range(self._workers.count))[::-1]
+        while self._waiting or self._running:
+            while self._waiting and free and self._may_begin(self._waiting[0].kind):
+                self._begin(free.pop(), _Running(self._waiting.popleft()))
             answer, finished = self._workers.wait(_POLL), None
             if answer is None:
-                self._look_up(moved=False)
+                self._report(moved=False)
             elif isinstance(answer[1], Lost):
-                self._lost(*answer)
+                self._restart(*answer)
             elif (finished := self._take(*answer)) is not None:
                 free.append(answer[0])
             self._save()
@@ -117,96 +178,92 @@ class Dispatch:
                 yield finished
 
     def _may_begin(self, kind: TileKind) -> bool:
-        """Whether a batch may be handed out: the first of a kind goes alone until its kernels have been compiled, and
-        the others find them in the cache."""
+        """Returns whether a batch may start: the first batch of a kind runs alone until its kernels are compiled."""
         if self._stop is not None:
             return False
-        return kind in self._warm or all(job.batch.kind != kind for job in self._jobs.values())
+        return kind in self._compiled or all(run.batch.kind != kind for run in self._running.values())
 
-    def _begin(self, number: int, job: _Job) -> None:
+    def _begin(self, number: int, run: _Running) -> None:
         if number in self._dead:
             self._workers.renew(number)
             self._dead.remove(number)
-        job.step, job.saving = None, False
-        self._jobs[number] = job
-        state = None if self._checkpoint is None else self._checkpoint.running(job.batch.number)
-        self._workers.call(number, "start", self._piece(job.batch.rows), job.batch.kind == TileKind.DYNAMIC, state)
+        run.step, run.saving = None, False
+        self._running[number] = run
+        state = None if self._checkpoint is None else self._checkpoint.running(run.batch.number)
+        self._workers.call(number, "start", run.batch.fit.job(run.batch), state)
 
-    def _lost(self, number: int, why: Lost) -> None:
-        """Takes note of a worker's end, and begins its batch again from what was kept of it."""
+    def _restart(self, number: int, why: Lost) -> None:
+        """Begins the batch of a lost worker again from its last saved state."""
         self._dead.add(number)
-        job = self._jobs.pop(number, None)
-        if job is None or self._stop is not None:
+        run = self._running.pop(number, None)
+        if run is None or self._stop is not None:
             return
-        job.deaths += 1
-        if job.deaths == _DEATHS:
-            raise WlmError(f"fit: batch {job.batch.number} has lost {_DEATHS} workers: {why}")
-        self._begin(number, job)
+        run.deaths += 1
+        if run.deaths == _DEATHS:
+            raise WlmError(f"fit: batch {run.batch.number} has lost {_DEATHS} workers: {why}")
+        self._begin(number, run)
 
-    def _take(self, number: int, said: Any) -> tuple[Batch, Parts, float] | None:
-        """Takes a worker's answer and has it go on; returns a batch that is done."""
-        job = self._jobs[number]
-        if isinstance(said, BaseException):
-            raise self._told(job, said)
+    def _take(self, number: int, answer: Any) -> tuple[Batch, Parts] | None:
+        """Takes the answer of a worker and lets it go on; returns a batch that is done."""
+        run = self._running[number]
+        if isinstance(answer, BaseException):
+            # A wrong state is the checkpoint's fault.
+            if isinstance(answer, ValueError) and run.step is None and self._checkpoint is not None:
+                raise self._checkpoint.wrong(run.batch.number, answer)
+            raise answer
         finished = None
-        if isinstance(said, Advance):
-            begun, job.step = job.step is None, said.step
-            if said.parts is not None:
-                finished = job.batch, said.parts, said.psnr
-                self._finish(number, said.parts)
+        if isinstance(answer, Advance):
+            begun, run.step = run.step is None, answer.step
+            if answer.parts is not None:
+                finished = run.batch, answer.parts
+                self._finish(number, answer.parts)
             if not begun:
-                self._warm.add(job.batch.kind)
-                self._figures[number] = said.loss, said.psnr
-                self._look_up(moved=True)
+                self._compiled.add(run.batch.kind)
+                self._figures[number] = answer.loss, answer.psnr
+                self._report(moved=True)
         else:
-            self._states[job.batch.number] = said
-            job.saving, job.deaths = False, 0
+            self._states[run.batch.number] = answer
+            run.saving, run.deaths = False, 0
         if finished is not None:
             return finished
-        if job.saving:
+        if run.saving:
             self._workers.call(number, "state")
         elif self._stop is None:
             self._workers.call(number, "advance", _SLICE if self._workers.remote else 0.0)
         return None
 
-    def _told(self, job: _Job, error: BaseException) -> BaseException:
-        """The error of a worker, as it is to be raised: a wrong state is the checkpoint's."""
-        if isinstance(error, ValueError) and job.step is None and self._checkpoint is not None:
-            return self._checkpoint.wrong(job.batch.number, error)
-        return error
-
     def _finish(self, number: int, parts: Parts) -> None:
-        batch = self._jobs.pop(number).batch
+        batch = self._running.pop(number).batch
         self._done += 1
         if self._states is not None:
             self._states.pop(batch.number, None)
         if self._checkpoint is not None:
             self._checkpoint.add_finished(batch.number, parts)
 
-    def _look_up(self, moved: bool) -> None:
-        """Reports progress, and begins a save where one is due or the work is to stop."""
+    def _report(self, moved: bool) -> None:
+        """Reports progress, and begins a save if one is due or the work is to stop."""
         if self._stop is not None:
             return
-        done = self._done * self._steps + sum(job.step or 0 for job in self._jobs.values())
+        done = self._done * self._steps + sum(run.step or 0 for run in self._running.values())
         if self._meter.due(done):
             figures = np.array([*self._figures.values()]).reshape(-1, 2)
             loss, psnr = (nanmean(column) for column in figures.T)
             try:
                 self._meter.report(done, loss=float(loss), PSNR_dB=float(psnr))
             except KeyboardInterrupt as stop:
-                # Between two steps the states are whole; anywhere else an interrupt keeps nothing.
+                # Between two steps the states are complete; an interrupt anywhere else saves nothing.
                 self._stop, self._patience = stop, time.monotonic() + _STOPPING
         if self._checkpoint is None or self._states is not None:
             return
         if self._stop is not None or (moved and self._checkpoint.due()):
             self._states = {}
-            for job in self._jobs.values():
-                job.saving = True
+            for run in self._running.values():
+                run.saving = True
 
     def _save(self) -> None:
-        """Ends a save once all states have come, and then the work where it is to stop."""
+        """Ends a save once all states have arrived, and then the work if it is to stop."""
         late = time.monotonic() > self._patience
-        if self._states is not None and (late or not any(job.saving for job in self._jobs.values())):
+        if self._states is not None and (late or not any(run.saving for run in self._running.values())):
             self._checkpoint.save(self._states)
             self._states = None
         if self._stop is not None and self._states is None:

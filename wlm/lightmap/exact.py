@@ -1,49 +1,45 @@
-"""The float64 path: a stored tile decoded in plain NumPy, the reference of every other decoder."""
+"""The float64 path: decodes a stored tile in plain NumPy, as the reference of every other decoder."""
 
 import math
 
 import numpy as np
 from scipy.special import erf
 
-from wlm.errors import WlmError
 from wlm.formats.bc7 import blocks_image, decode_image
 from wlm.formats.bc7_modes import decode_blocks
-from wlm.lightmap.model import TILE, LightmapModel, decode_scale
-from wlm.lightmap.tiles import UNPACKED, TileGrid, TileKind
-from wlm.lightmap.video_packing import WHITE, levels_of
+from wlm.lightmap.model import SheetModel, decode_scale
+from wlm.lightmap.tiles import TILE, TileKind
 
 SQRT_12 = math.sqrt(12.0)
-"""Features in [0, 1] are fed to the network as (f - 1/2) sqrt(12): mean 0 and deviation 1 if they are uniform."""
-
-_IMAGES = (TileKind.FRAMES, *UNPACKED)
+"""Features in [0, 1] enter the network as (f - 1/2) sqrt(12), with mean 0 and deviation 1 if they are uniform."""
 
 
-def decode_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
+def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """Decodes one tile in float64 (neural-dynamic-gi, eq. 4, with the scale of section 4 undone).
 
     Args:
-        model: The model.
-        number: Of the tile in the grid, row-major.
-        time: In the unit of the set's times, stored or between, as for `wlm.lightmap.decode.Decoder`; gaps are left.
+        model: The sheet.
+        number: Number of the tile in the grid, row-major.
+        time: In the unit of the set's times, stored or between; gaps are not filled.
 
     Returns:
         Linear radiance, float64 [128, 128, 3]; 0 in an empty tile.
 
     Raises:
-        WlmError: There is no such tile, or the time isn't finite.
+        WlmError: There is no such tile, or the time is not finite.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
         return _filled(_constant(model, number, time))
-    if model.kind[number] in _IMAGES:
+    if model.kind[number] == TileKind.FRAMES:
         before, after, share = model.axis.neighbours(time)
         early, late = (_frame(model, number, at) ** model.profile.gamma for at in (before, after))
         return (1.0 - share) * early + share * late
     return sum(share * _colour(model, number, at) ** model.profile.gamma for at, share in model.axis.reads(time))
 
 
-def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
-    """The same tile in gamma space, radiance ** (1 / gamma): float64 [128, 128, 3]; see `decode_tile64`."""
+def colour_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
+    """Decodes one tile to gamma space, radiance ** (1 / gamma), float64 [128, 128, 3]; see `decode_tile64`."""
     _check(model, number, time)
     kind = model.kind[number]
     if kind == TileKind.EMPTY:
@@ -51,19 +47,19 @@ def colour_tile64(model: LightmapModel, number: int, time: float) -> np.ndarray:
     if kind == TileKind.CONSTANT:
         return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
     reads = model.axis.reads(time)
-    if kind in _IMAGES and model.axis.neighbours(time)[2] == 0:
+    if kind == TileKind.FRAMES and model.axis.neighbours(time)[2] == 0:
         return _frame(model, number, model.axis.neighbours(time)[0])
-    if kind not in _IMAGES and len(reads) == 1:
+    if kind != TileKind.FRAMES and len(reads) == 1:
         return _colour(model, number, reads[0][0])
     return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
 
 
-def _colour(model: LightmapModel, number: int, time: float) -> np.ndarray:
-    """What the network of a tile makes of one time, in gamma space [128, 128, 3]; 0 in an empty tile."""
+def _colour(model: SheetModel, number: int, time: float) -> np.ndarray:
+    """Evaluates the network of a tile at one time, in gamma space [128, 128, 3]; 0 in an empty tile."""
     if model.kind[number] == TileKind.EMPTY:
         return np.zeros((TILE, TILE, 3))
     before, after, share = model.axis.neighbours(time)
-    place = _place(model, number)
+    place = model.map_row(number)
     scale = model.scales[place].astype(np.float64)  # [T, 3]
     shift, spread = model.affine[place].astype(np.float64)
     output = _network_output(model, number, place, time)
@@ -71,13 +67,13 @@ def _colour(model: LightmapModel, number: int, time: float) -> np.ndarray:
     return np.maximum(colour, 0.0)
 
 
-def bound64(model: LightmapModel, number: int, time: float) -> float:
-    """Gamma-space colour that 255 of the 8-bit output stands for; 0 for a black or an empty tile.
+def bound64(model: SheetModel, number: int, time: float) -> float:
+    """Returns the gamma-space colour of level 255 of the 8-bit output; 0 for a black or an empty tile.
 
     Args:
-        model: The model.
-        number: Of the tile in the grid.
-        time: Between two stored times the larger of the two bounds holds.
+        model: The sheet.
+        number: Number of the tile in the grid.
+        time: Between two stored times the larger of both bounds holds.
 
     Raises:
         WlmError: As `decode_tile64`.
@@ -89,46 +85,29 @@ def bound64(model: LightmapModel, number: int, time: float) -> float:
         return float(_constant(model, number, time).max() ** (1.0 / model.profile.gamma))
     before, after, share = model.axis.neighbours(time)
     if model.kind[number] == TileKind.FRAMES:
-        peak = model.ranges[_row(model, number), :, 1].max(1)
-    elif model.kind[number] in UNPACKED:
-        peak = model.word_peaks[_row(model, number)]
+        peak = model.ranges[model.row(number), :, 1].max(1)
     else:
-        peak = decode_scale(model.peak[_place(model, number)], model.profile.gamma)
+        peak = decode_scale(model.peak[model.map_row(number)], model.profile.gamma)
     return float(peak[before] if share == 0 else max(peak[before], peak[after]))
 
 
-def _check(model: LightmapModel, number: int, time: float) -> None:
-    TileGrid.of(model.height, model.width).origin(number)
-    if not math.isfinite(time):
-        raise WlmError(f"time: expected a finite number, got {time}")
+def _check(model: SheetModel, number: int, time: float) -> None:
+    model.grid.origin(number)
+    model.axis.wrap(time)
 
 
-def _place(model: LightmapModel, number: int) -> int:
-    """The tile's place among those that have maps."""
-    return int((model.mapped < number).sum())
-
-
-def _row(model: LightmapModel, number: int) -> int:
-    """The tile's place among those of its kind; of video and levels among both."""
-    kind = TileKind(int(model.kind[number]))
-    return int(np.isin(model.kind[:number], UNPACKED if kind in UNPACKED else (kind,)).sum())
-
-
-def _frame(model: LightmapModel, number: int, at: int) -> np.ndarray:
-    """A frame of a tile in gamma space [128, 128, 3]."""
-    row = _row(model, number)
-    if model.kind[number] in UNPACKED:
-        least, greatest = model.word_ranges[row, at].astype(np.float64)
-        return least + levels_of(model.words[row, at]) / WHITE * (greatest - least)
+def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
+    """Decodes a frame of a tile to gamma space, [128, 128, 3]."""
+    row = model.row(number)
     levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
     return least + levels * (greatest - least)
 
 
-def _constant(model: LightmapModel, number: int, time: float) -> np.ndarray:
-    """Radiance of a constant tile [3]."""
+def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
+    """Returns the radiance of a constant tile, [3]."""
     before, after, share = model.axis.neighbours(time)
-    rows = model.constant[_row(model, number)].astype(np.float64)
+    rows = model.constant[model.row(number)].astype(np.float64)
     return (1.0 - share) * rows[before] + share * rows[after]
 
 
@@ -136,11 +115,11 @@ def _filled(colour: np.ndarray) -> np.ndarray:
     return np.broadcast_to(colour, (TILE, TILE, 3)).copy()
 
 
-def _network_output(model: LightmapModel, number: int, place: int, time: float) -> np.ndarray:
-    """The network's output y [128, 128, 3]."""
+def _network_output(model: SheetModel, number: int, place: int, time: float) -> np.ndarray:
+    """Returns the network's output y, [128, 128, 3]."""
     profile = model.profile
     dynamic = model.kind[number] == TileKind.DYNAMIC
-    row = _row(model, number)
+    row = model.row(number)
     maps = [decode_image(model.uv[place]) / 255.0]
     if dynamic:
         periodic = model.axis.periodic
@@ -170,7 +149,7 @@ def _network_output(model: LightmapModel, number: int, place: int, time: float) 
 
 
 def _along(values: np.ndarray, at: np.ndarray, periodic: bool = False) -> np.ndarray:
-    """Interpolates the first axis linearly at coordinates in [0, 1]; cell centres lie at (i + 1/2) / size."""
+    """Interpolates the first axis linearly at coordinates in [0, 1]; texel centres are at (i + 1/2) / size."""
     size = len(values)
     position = at * size - 0.5
     low = np.floor(position).astype(int)

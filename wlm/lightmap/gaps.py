@@ -1,6 +1,6 @@
-"""The gaps between charts, filled after decoding so that a filter's footprint may leave a chart.
+"""The gaps between charts, which are filled after decoding so that a filtered read may leave a chart.
 
-A bilinear read at the edge of a chart takes in texels outside it. The fit spends nothing on those; each takes the light
+A bilinear read at the edge of a chart includes texels outside it. The fit spends nothing on those; each takes the light
 of the nearest valid texel once its map is decoded, as a baker dilates charts before a lightmap is stored.
 """
 
@@ -19,7 +19,7 @@ class Gaps:
 
     Attributes:
         target: int [G, 2], row and column of each.
-        source: int [G, 2], of the valid texel whose light it takes.
+        source: int [G, 2], row and column of the valid texel whose light it takes.
     """
 
     target: np.ndarray
@@ -27,7 +27,7 @@ class Gaps:
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Gaps:
-        """Finds those within `wlm.texels.REACH` of a valid one.
+        """Finds the invalid texels within `wlm.texels.REACH` of a valid one.
 
         Args:
             mask: bool [H, W], true where a texel is valid.
@@ -35,11 +35,11 @@ class Gaps:
         return cls(*near_gaps(mask))
 
     def fill(self, image: np.ndarray) -> None:
-        """Fills a decoded map [H, W, C] in place."""
+        """Fills the gaps of a decoded map [H, W, C] in place."""
         image[tuple(self.target.T)] = image[tuple(self.source.T)]
 
     def within(self, window: tuple[slice, slice]) -> Gaps:
-        """Those whose target lies in a window of the map, in the map's rows and columns."""
+        """Returns the gaps whose target lies in a window of the map, in rows and columns of the map."""
         inside = [(at >= part.start) & (at < part.stop) for at, part in zip(self.target.T, window, strict=True)]
         chosen = inside[0] & inside[1]
         return Gaps(self.target[chosen], self.source[chosen])

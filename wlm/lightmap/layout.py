@@ -1,9 +1,10 @@
-"""Whether pictures are of one atlas: its charts begin and end in the same texels at any time.
+"""Detects frames that are not of the same atlas: charts begin and end in the same texels at any time.
 
-A chart's border is told by what lies round it: texels without light, or outside of a coverage. Light too ends within a
-chart, at a shadow of the sun alone say, so that a picture of the same atlas has borders that another lacks; but those
-of the charts that both light, both have. Of two atlases no more coincide than by chance. On 20 of our own sets, 0.74 to
-0.99 of an atlas' borders at two times coincide beyond chance, and 0.11 of those of any two atlases at most.
+The border of a chart shows in the texels around it: they have no light, or are outside of a coverage. Light also ends
+within a chart, at a shadow of the sun for example, so that one frame of an atlas can have borders that another lacks;
+but both have the borders of charts that are lit in both. Borders of two different atlases only coincide by chance. On
+20 of our own sets, 0.74 to 0.99 of the borders of an atlas at two times coincide beyond chance, and at most 0.11 of
+those of two different atlases.
 """
 
 from collections.abc import Callable
@@ -11,23 +12,24 @@ from collections.abc import Callable
 import numpy as np
 
 PICTURES = 8
-"""Of a set, that are compared."""
+"""Number of frames of a set that are compared."""
 
-_LEAST_BORDER = 0.005  # of the lit texels: with less there is nothing to tell by
-_MOST_BORDER = 0.6  # beyond it light ends everywhere, in noise
-_LEAST_SHARED = 0.2  # of the smaller picture, lit in both
-_COINCIDE = 0.2  # of a border, beyond chance
+_LEAST_BORDER = 0.005  # share of the lit texels; a shorter border is no evidence
+_MOST_BORDER = 0.6  # share of the lit texels; a longer border is noise
+_LEAST_SHARED = 0.2  # share of the texels of the darker frame that must be lit in both
+_COINCIDE = 0.2  # share of a border that coincides beyond chance in frames of one atlas
 
 
 def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] | None:
-    """Finds a picture that isn't of another's atlas.
+    """Finds two frames that belong to different atlases.
 
     Args:
-        count: Of the pictures.
-        lit: Gives the texels of a picture that have light, or a chart, bool [H, W]; asked for 8 at most, spread evenly.
+        count: Number of frames.
+        lit: Returns the texels of a frame that have light, or a chart, bool [H, W]; called for at most 8 frames, spread
+            evenly.
 
     Returns:
-        The numbers of both; None where all may be of one atlas, or too little is dark to tell.
+        The numbers of both frames; None if all may be of one atlas, or too few texels are dark to tell.
     """
     chosen = spread(count, PICTURES)
     pictures = [lit(i) for i in chosen]
@@ -43,7 +45,7 @@ def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] 
 
 
 def spread(count: int, most: int) -> list[int]:
-    """At most so many of the numbers from 0 to count - 1, spread evenly."""
+    """Returns at most `most` of the numbers from 0 to count - 1, spread evenly."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
 
@@ -63,14 +65,14 @@ def _differ(a: np.ndarray, border_a: np.ndarray, b: np.ndarray, border_b: np.nda
 
 
 def _border(lit: np.ndarray) -> np.ndarray:
-    """The lit texels beside dark ones, bool [H, W]; a dark one all alone is noise."""
+    """Returns the lit texels beside dark ones, bool [H, W]; a single dark texel is noise."""
     dark = ~lit
     dark &= _near(dark)
     return _near(dark) & ~dark
 
 
 def _near(mask: np.ndarray) -> np.ndarray:
-    """The texels beside those of a mask, in four directions."""
+    """Returns the texels beside those of a mask, in four directions."""
     near = np.zeros_like(mask)
     near[1:] |= mask[:-1]
     near[:-1] |= mask[1:]

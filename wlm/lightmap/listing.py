@@ -1,102 +1,159 @@
-"""The files of a lightmap set and their times: from a `set.json`, or from the names in a folder.
+"""The files of a lightmap set and their times: from a `set.json`, or from the names in folders.
 
-No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1.
+No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1. A set consists
+of atlases and layers; the plain set of one lightmap for each time has one atlas "0" with one layer "light".
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from wlm.errors import WlmError
-from wlm.formats.light import SUFFIXES
+from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file
 from wlm.lightmap.fields import field, is_list, is_number, is_size, is_text, kind, name_of, period_of, read_set
+from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, VALUE_RANGES
 
 SET_FILE = "set.json"
 
-# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may as well be
-# a frame's number and is not taken for an hour.
+# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may be the number
+# of a frame and is not read as an hour.
 _NAME_TIME = re.compile(r"_([0-9]+)(?:[_.]([0-9]+))?h$|_([0-9]+\.[0-9]+)$", re.IGNORECASE)
+
+# Names that Unity gives: Lightmap-0_comp_light.exr, Lightmap-0_comp_dir.png, Lightmap-0_comp_shadowmask.png.
+_UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.ktx2|\.dds)", re.IGNORECASE)
+_UNITY_ENCODING = {"light": "radiance", "dir": "unit", "shadowmask": "unit"}
+_UNITY_SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".png")  # the first format that all states have is read
+
+_MASK_WORDS = ("all", "alpha")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A picture: a file, or one of several pictures of equal height that are stacked in a file.
+
+    Attributes:
+        path: The file.
+        label: Name of the picture in warnings.
+        slice: Index of the picture in the stack, from the top.
+        slices: Number of pictures in the stack.
+    """
+
+    path: Path
+    label: str
+    slice: int = 0
+    slices: int = 1
+
+
+@dataclass(frozen=True)
+class LayerInfo:
+    """A layer that every atlas has.
+
+    Attributes:
+        name: Name of the layer.
+        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
+    """
+
+    name: str
+    encoding: str
+    channels: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class AtlasInfo:
+    """An atlas.
+
+    Attributes:
+        name: Name of the atlas.
+        mask: "all", "alpha", the path of a PNG, or None: alpha if the light has it, otherwise all.
+        size: Height and width in texels if the set states them, else None.
+        mesh: The mesh that the atlas belongs to, which does not have to exist, or None.
+    """
+
+    name: str
+    mask: str | None
+    size: tuple[int, int] | None = None
+    mesh: Path | None = None
 
 
 @dataclass(frozen=True)
 class Listing:
-    """The files to read, and what the set states about itself.
+    """The files to read, and the properties that the set states.
 
     Attributes:
-        name: The set's name.
-        files: The lightmaps, as ordered by the list or by name; of raw lightmaps the first of each.
-        times: One for each file, not yet checked.
-        mask: "all", "alpha", the path of a PNG, or "coverage": that of the files of `coverage`.
+        name: Name of the set.
+        where: The `set.json` or the folder.
+        times: A time for each state, not yet checked.
         period: Length of the day in the unit of the times, or None.
-        size: Height and width in texels where the set states them, else None.
-        stated_by: The file that states the size, or the folder.
+        layers, atlases: In the order of the set.
+        states: For each time the picture of each layer of each atlas, by the names of atlas and layer.
+        labels: Name of each state in messages.
         warn_order: Whether times that are out of order deserve a warning.
-        mesh: The mesh that the lightmaps belong to, which need not be there, or None.
-        raw: For each lightmap the raw files that it is made of, see `wlm.lightmap.contest`; None for pictures.
-        coverage: Likewise the raw masks: one, or one for each lightmap.
     """
 
     name: str
-    files: list[Path]
+    where: Path
     times: Sequence[float]
-    mask: str
     period: float | None
-    size: tuple[int, int] | None
-    stated_by: Path
-    warn_order: bool
-    mesh: Path | None = None
-    raw: list[list[Path]] | None = None
-    coverage: list[list[Path]] | None = None
+    layers: tuple[LayerInfo, ...]
+    atlases: tuple[AtlasInfo, ...]
+    states: list[dict[tuple[str, str], Source]]
+    labels: list[str]
+    warn_order: bool = True
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of all pictures, state by state."""
+        return [source.path for state in self.states for source in state.values()]
 
 
-def list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
-    """Lists a folder of lightmaps without a `set.json`, as `wlm.lightmap.load` states.
+def list_set(
+    path: Path, times: Sequence[float] | None = None, layers: Sequence[str] | None = None, trust: bool = False
+) -> Listing:
+    """Lists a set, as `wlm.lightmap.load` describes.
 
     Args:
-        folder: The folder.
-        times: One for each file in natural order of the names; None reads them from the names.
-
-    Returns:
-        The listing; "mask.png" of the folder is its mask, else all texels are valid.
+        path: The `set.json` or the folder.
+        times: A time for each state, replacing those of the set.
+        layers: Names of the layers to read; None reads all.
+        trust: Whether a `set.json` may name files outside its folder.
 
     Raises:
-        WlmError: There is no lightmap, their number is not that of the times, a name tells no hour, or the
-            folder cannot be read.
+        WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
+            many states, or the states do not have the same pictures; the message names the file and the field.
     """
-    try:
-        files = [f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()]
-    except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
-    # A hidden name is another program's: macOS writes one beside every file on a foreign disk.
-    files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
-    if not files:
-        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found neither")
-    # Names need not sort by their hours ("_5.5h" before "_5.45h"): only times that the caller gave have an order.
-    warn_order = times is not None
-    if times is None:
-        times = [time_of_name(f.stem) for f in files]
-        if None in times:
-            raise WlmError(
-                f"{folder}: {count_of(files, 'lightmap')} and no {SET_FILE}: give {count_of(files, 'time')} with "
-                f"--times ({files[times.index(None)].name} does not end in an hour such as _18_55h)"
-            )
-    check_count(folder, files, times)
-    mask = folder / "mask.png"
-    return Listing(
-        folder.resolve().name, files, times, str(mask) if mask.is_file() else "all", None, None, folder, warn_order
-    )
+    if path.is_dir() and (path / SET_FILE).is_file():
+        path = path / SET_FILE
+    if path.is_dir():
+        listing = _list_states(path, times, layers) if state_folders(path) else _list_folder(path, times)
+    elif path.is_file():
+        if path.suffix.lower() != ".json":
+            lone = path.suffix.lower() in SUFFIXES
+            found = "one lightmap, which wlm atlas compress takes with its mesh" if lone else "a file of another kind"
+            raise WlmError(f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found {found}")
+        listing = _parse(path, times, trust)
+    else:
+        raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
+    names = [layer.name for layer in listing.layers]
+    for name in layers or ():
+        if name not in names:
+            raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got {name!r}")
+    if layers is not None and not layers:
+        raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got none")
+    return replace(listing, layers=tuple(layer for layer in listing.layers if layers is None or layer.name in layers))
 
 
 def natural(name: str) -> list[str | int]:
-    """Sort key with digits split from text: "2" before "10"."""
+    """Returns a sort key with digits split from text: "2" sorts before "10"."""
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def time_of_name(stem: str) -> float | None:
-    """Returns the hour that a file's name ends in, or None."""
+    """Returns the hour at the end of a file's name, or None."""
     match = _NAME_TIME.search(stem)
     if not match:
         return None
@@ -105,66 +162,292 @@ def time_of_name(stem: str) -> float | None:
 
 
 def count_of(items: Sequence[object], noun: str) -> str:
-    """Counts items in words: "1 time", "2 times"."""
+    """Returns the number of items in words: "1 time", "2 times"."""
     return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
 
 
-def check_count(where: Path, files: Sequence[object], times: Sequence[float], noun: str = "lightmap") -> None:
-    """Checks that there is a time for each lightmap, or state.
+def is_name(value: object) -> bool:
+    """Returns whether a value can name a layer, an atlas or a channel."""
+    return is_text(value) and len(value) <= MOST_NAME and value.isprintable()
 
-    Raises:
-        WlmError: There are more or fewer.
+
+def state_folders(folder: Path) -> list[Path]:
+    """Returns the folders with light as Unity names it: the folder itself, or folders in it in natural order.
+
+    A folder with lightmaps of other names is a plain set, whatever the folders in it contain.
     """
-    if len(times) != len(files):
-        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(files, noun)}; expected one each")
+    try:
+        if _has_light(folder):
+            return [folder]
+        inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
+        if any(path.suffix.lower() in SUFFIXES and path.is_file() for path in inside):
+            return []
+        return [path for path in inside if path.is_dir() and _has_light(path)]
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
 
 
-def parse_set(path: Path, times: Sequence[float] | None, trust: bool = False) -> Listing:
-    """Reads and checks a `set.json`, as `wlm.lightmap.load` states.
+def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
+    if len(times) != len(items):
+        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected one each")
 
-    Args:
-        path: The file.
-        times: One for each lightmap, in place of those of the file; None takes those of the file.
-        trust: Whether its files, its mask and its mesh may lie outside its folder.
 
-    Returns:
-        The listing, with paths relative to the file resolved.
+def _plain_states(files: Iterable[Path]) -> list[dict[tuple[str, str], Source]]:
+    """Returns the states of a set with one picture for each time."""
+    return [{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files]
 
-    Raises:
-        WlmError: The file cannot be read, is not JSON, a field is missing or of a wrong kind, a file lies outside the
-            folder, or there are too many; the message names the file and the field.
-    """
+
+def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
+    """Lists a folder of lightmaps without a `set.json`; a "mask.png" in it is the mask."""
+    try:
+        files = [f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()]
+    except OSError as error:
+        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
+    # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
+    files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
+    if not files:
+        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found neither")
+    stamps = times
+    if stamps is None:
+        stamps = [time_of_name(f.stem) for f in files]
+        if None in stamps:
+            raise WlmError(
+                f"{folder}: {count_of(files, 'lightmap')} and no {SET_FILE}: give {count_of(files, 'time')} with "
+                f"--times ({files[stamps.index(None)].name} does not end in an hour such as _18_55h)"
+            )
+    _check_count(folder, files, stamps, "lightmap")
+    mask = folder / "mask.png"
+    return Listing(
+        name=folder.resolve().name,
+        where=folder,
+        times=stamps,
+        period=None,
+        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
+        atlases=(AtlasInfo(LIGHT.atlas, str(mask) if mask.is_file() else "all"),),
+        states=_plain_states(files),
+        labels=[file.name for file in files],
+        # Names do not have to sort by their hours ("_5.5h" before "_5.45h"): only times from the caller have an order.
+        warn_order=times is not None,
+    )
+
+
+def _has_light(folder: Path) -> bool:
+    return any(name[1].lower() == "light" for name, _ in _unity_files(folder))
+
+
+def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
+    """Returns the files of a folder that have Unity's names, with atlas and layer; hidden files are left out."""
+    found = [(match, path) for path in folder.iterdir() if (match := _UNITY.fullmatch(path.name))]
+    return [((match[1], match[2].lower()), path) for match, path in found if path.name[0] != "." and path.is_file()]
+
+
+def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[str] | None) -> Listing:
+    """Lists a folder with one state of light as Unity bakes it, or with a folder for each state."""
+    states = state_folders(folder)
+    found: list[dict[tuple[str, str], dict[str, Path]]] = []
+    for state in states:
+        files: dict[tuple[str, str], dict[str, Path]] = {}
+        for key, path in _unity_files(state):
+            files.setdefault(key, {})[path.suffix.lower()] = path
+        found.append(files)
+    everywhere = sorted({key for files in found for key in files}, key=lambda key: (natural(key[0]), key))
+    atlases = list(dict.fromkeys(atlas for atlas, _ in everywhere))
+    layers = [name for name in _UNITY_ENCODING if any(key[1] == name for key in everywhere)]
+    sources: list[dict[tuple[str, str], Source]] = [{} for _ in states]
+    keys = [(atlas, layer) for layer in layers if chosen is None or layer in chosen for atlas in atlases]
+    # Pictures that one state lacks and another has are reported first.
+    for key in sorted(keys, key=lambda key: key not in everywhere):
+        suffixes = [suffix for suffix in _UNITY_SUFFIXES if all(suffix in files.get(key, ()) for files in found)]
+        if not suffixes:
+            _refuse(folder, key, states, found)
+        for files, source in zip(found, sources, strict=True):
+            source[key] = _labelled(files[key][suffixes[0]])
+    stamps = times
+    if stamps is None:
+        stamps = [0.0] if len(states) == 1 else [time_of_name(state.name) for state in states]
+        if None in stamps:
+            names = ", ".join(state.name for state in states)
+            raise WlmError(
+                f"{folder}: {count_of(states, 'state')} of light and no {SET_FILE}: give {count_of(states, 'time')} "
+                f"with --times, in the order {names}"
+            )
+    _check_count(folder, states, stamps, "state")
+    return Listing(
+        name=folder.resolve().name,
+        where=folder,
+        times=stamps,
+        period=None,
+        layers=tuple(LayerInfo(name, _UNITY_ENCODING[name]) for name in layers),
+        atlases=tuple(AtlasInfo(name, None) for name in atlases),
+        states=sources,
+        labels=[state.name for state in states],
+        warn_order=times is not None,
+    )
+
+
+def _refuse(
+    folder: Path, key: tuple[str, str], states: list[Path], found: list[dict[tuple[str, str], dict[str, Path]]]
+) -> None:
+    """Raises an error that names the state that lacks a picture that another state has."""
+    name, has = f"{key[0]}_comp_{key[1]}", [bool(files.get(key)) for files in found]
+    if all(has):
+        raise WlmError(f"{folder}: {name} has no format that all states have; expected the same files in each")
+    without = states[has.index(False)].name
+    there = f"{states[has.index(True)].name} has it" if any(has) else "another atlas has that layer"
+    raise WlmError(
+        f"{folder}: {without} has no {name}, but {there}: all states and atlases need the same layers; choose some "
+        f"with --layers, or name the files in a {SET_FILE}"
+    )
+
+
+def _labelled(path: Path, *place: int) -> Source:
+    """Returns a picture whose label has the name of its folder, which tells the state."""
+    return Source(path, f"{path.parent.name}/{path.name}", *place)
+
+
+def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
+    """Reads a `set.json`."""
     content = read_set(path)
-    if "layers" in content:
-        raise WlmError(f"{path}: expected a set of one lightmap a time, found one with layers")
-    width = field(path, content, "width", "", is_size, "a whole number of texels above 0")
-    height = field(path, content, "height", "", is_size, "a whole number of texels above 0")
+    plain = "layers" not in content
+    if plain:
+        layers = (LayerInfo(LIGHT.layer, LIGHT.encoding),)
+        expected = "a whole number of texels above 0"
+        size = tuple(field(path, content, key, "", is_size, expected) for key in ("height", "width"))
+        atlases = (AtlasInfo(LIGHT.atlas, _mask(path, content, "", trust), size, _mesh(path, content, "", trust)),)
+    else:
+        named = _named(path, content, "layers", "an object of layers")
+        layers = tuple(_layer(path, name, value) for name, value in named.items())
+        named = _named(path, content, "atlases", "an object of atlases")
+        atlases = tuple(_atlas(path, name, value, trust) for name, value in named.items())
+    if len(layers) > MOST_CHANNELS or len(layers) * len(atlases) > MOST_SHEETS:
+        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers and {MOST_SHEETS} of all atlases together")
     entries = field(path, content, "lightmaps", "", is_list, "a list of lightmaps")
     name, period = name_of(path, content), period_of(path, content)
-    mask = "all"
-    if content.get("mask") is not None:
-        mask = field(path, content, "mask", "", is_text, 'the name of a PNG, "alpha" or "all"')
-        if mask not in ("all", "alpha"):
-            mask = str(named_file(path, mask, f"{path}: mask", trust))
-
-    mesh = None
-    if content.get("mesh") is not None:
-        mesh = named_file(path, field(path, content, "mesh", "", is_text, "the name of a mesh"), f"{path}: mesh", trust)
-
     if len(entries) > TIMES:
         raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
-    files, stamps, found = [], [], {}
+    states, stamps, found = [], [], {}
     for i, entry in enumerate(entries):
         place = f"lightmaps[{i}]"
         if not isinstance(entry, dict):
-            raise WlmError(f"{path}: {place}: expected an object (time_hours, file), got {kind(entry)}")
-        file = field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
-        if file not in found:  # links are followed once
-            found[file] = named_file(path, file, f"{path}: {place}.file", trust)
-        files.append(found[file])
+            keys = "time_hours, file" if plain else "time_hours, files"
+            raise WlmError(f"{path}: {place}: expected an object ({keys}), got {kind(entry)}")
+        if plain:
+            field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
+            source = _source(path, entry["file"], f"{place}.file", found, trust)
+            states.append({(LIGHT.atlas, LIGHT.layer): replace(source, label=source.path.name)})
+        else:
+            states.append(_state(path, entry, place, layers, atlases, found, trust))
         if times is None:
             stamps.append(float(field(path, entry, "time_hours", f"{place}.", is_number, "a finite number")))
     if times is not None:
-        check_count(path, files, times)
-        stamps = times
-    return Listing(name, files, stamps, mask, period, (height, width), path, True, mesh)
+        _check_count(path, states, times, "lightmap" if plain else "state")
+    labels = [source.label for state in states for source in state.values()] if plain else None
+    return Listing(
+        name=name,
+        where=path,
+        times=stamps if times is None else times,
+        period=period,
+        layers=layers,
+        atlases=atlases,
+        states=states,
+        labels=labels or [f"lightmaps[{i}]" for i in range(len(states))],
+    )
+
+
+def _state(
+    path: Path,
+    entry: dict[str, Any],
+    place: str,
+    layers: tuple[LayerInfo, ...],
+    atlases: tuple[AtlasInfo, ...],
+    found: dict[str, Path],
+    trust: bool,
+) -> dict[tuple[str, str], Source]:
+    """Reads the pictures of one time of a set with layers."""
+    files = field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
+    state = {}
+    for atlas in atlases:
+        of_atlas = field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
+        for layer in layers:
+            at = f"{place}.files.{atlas.name}."
+            value = field(path, of_atlas, layer.name, at, _is_source, "a file, or an object (file, slice, slices)")
+            state[atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
+    return state
+
+
+def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> dict[str, Any]:
+    """Returns an object of named entries, which must not be empty."""
+    values = field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
+    for name in values:
+        if not is_name(name):
+            raise WlmError(f"{path}: {key}: expected names of 1 to {MOST_NAME} printable characters")
+    return values
+
+
+def _layer(path: Path, name: str, value: Any) -> LayerInfo:
+    """Reads a layer: an encoding, or an object with `encoding` and optional `channels`."""
+    place, options = f"layers.{name}", {"encoding": value} if isinstance(value, str) else value
+    if not isinstance(options, dict):
+        raise WlmError(f"{path}: {place}: expected an encoding or an object (encoding, channels), got {kind(value)}")
+    names = ", ".join(VALUE_RANGES)
+    encoding = field(path, options, "encoding", f"{place}.", lambda text: text in list(VALUE_RANGES), f"one of {names}")
+    if options.get("channels") is None:
+        return LayerInfo(name, encoding)
+    channels = field(path, options, "channels", f"{place}.", is_list, f"a list of 1 to {MOST_CHANNELS} channels")
+    named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
+    if not named or len(set(channels)) < len(channels):
+        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names, each channel of a layer once")
+    return LayerInfo(name, encoding, tuple(channels))
+
+
+def _atlas(path: Path, name: str, value: Any, trust: bool) -> AtlasInfo:
+    """Reads an atlas: an object with optional `width` and `height`, `mask` and `mesh`."""
+    place = f"atlases.{name}"
+    if not isinstance(value, dict):
+        raise WlmError(f"{path}: {place}: expected an object (width, height, mask, mesh), got {kind(value)}")
+    size = None
+    if value.get("width") is not None or value.get("height") is not None:
+        expected = "a whole number of texels above 0"
+        size = tuple(field(path, value, key, f"{place}.", is_size, expected) for key in ("height", "width"))
+    place += "."
+    return AtlasInfo(name, _mask(path, value, place, trust), size, _mesh(path, value, place, trust))
+
+
+def _mask(path: Path, holder: dict[str, Any], place: str, trust: bool) -> str:
+    """Reads the mask of an atlas: "all", "alpha" or the path of a PNG; "all" if none is named."""
+    if holder.get("mask") is None:
+        return "all"
+    mask = field(path, holder, "mask", place, is_text, 'the name of a PNG, "alpha" or "all"')
+    return mask if mask in _MASK_WORDS else str(named_file(path, mask, f"{path}: {place}mask", trust))
+
+
+def _mesh(path: Path, holder: dict[str, Any], place: str, trust: bool) -> Path | None:
+    if holder.get("mesh") is None:
+        return None
+    file = field(path, holder, "mesh", place, is_text, "the name of a mesh")
+    return named_file(path, file, f"{path}: {place}mesh", trust)
+
+
+def _source(path: Path, value: Any, place: str, found: dict[str, Path], trust: bool) -> Source:
+    """Reads a picture: the name of a file, or an object that chooses a slice of one.
+
+    `found` holds the files that were named before, so that links are followed once.
+    """
+    options = {"file": value} if isinstance(value, str) else value
+    file = field(path, options, "file", f"{place}.", is_text, "the name of a picture")
+    if file not in found:
+        found[file] = named_file(path, file, f"{path}: {place}", trust)
+    if "slice" not in options and "slices" not in options:
+        return _labelled(found[file])
+    slices = field(path, options, "slices", f"{place}.", is_size, "a whole number above 0")
+    expected = f"a whole number from 0 to {slices - 1}"
+    index = field(path, options, "slice", f"{place}.", lambda at: at == 0 or (is_size(at) and at < slices), expected)
+    return _labelled(found[file], int(index), slices)
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _is_source(value: object) -> bool:
+    return is_text(value) or isinstance(value, dict)

@@ -1,13 +1,17 @@
-"""The GLSL that decodes an exported lightmap; `wlm.lightmap.exporter` writes it beside the textures."""
+"""The GLSL that decodes a lightmap from the textures and buffers of its bundle (`wlm.lightmap.bundle`)."""
 
 from wlm.bundle import sampler
-from wlm.lightmap.model import TILE, LightmapModel
-from wlm.lightmap.packed import CODES, HEAD, columns, fours, record
-from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.encodings.base import columns
+from wlm.lightmap.encodings.maps import fours
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.tiles import TILE
 from wlm.texels import REACH
 
 EXACT = "WLM_LIGHTMAP_EXACT"
-"""Macro that has texels fetched and mixed in floats."""
+"""Macro with which the shader fetches texels and mixes them in floats."""
+
+HEAD = 2
+"""Groups of four floats before the records of the tiles in the table of an hour."""
 
 _GELU = {
     "exact": """\
@@ -38,16 +42,16 @@ _HEAD = """\
 // sections 3.2 to 3.4). For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES
 // below `precision highp` of float, int, sampler2D and sampler2DArray.
 //
-// Once for each stored hour that is wanted: bind the hour's table, draw the map into a texture of linear light with
+// For each stored hour that is needed: bind the table of the hour, draw the map into a texture of linear light with
 // {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
 // charts that a filter reads at their edges. Materials mix two of these by the time between both hours (eq. 2).
 //
 // Textures; row 0 is v = 0. Filters are linear, without mip levels.
 {textures}//
-// Where WLM_LIGHTMAP_EXACT is defined four texels are fetched and mixed in floats; else the filter unit mixes four
-// texels, with the 8 or so bits that it gives to a place between two of them.
+// If WLM_LIGHTMAP_EXACT is defined, four texels are fetched and mixed in floats; otherwise the filter unit mixes four
+// texels, with about 8 bits for a position between two of them.
 //
-// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: where these are in
+// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
 // buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
 
 {samplers}{reads}
@@ -62,7 +66,6 @@ _TEXTURES = {
     "uvt": ("sampler2D", "uvt.dds, BC7, {side} x {side} texels for each of {slices} slices of a tile; filtered"),
     "planes": ("sampler2D", "planes.dds, RG8, {plane_columns} x {plane_rows} texels twice a tile; filtered"),
     "frames": ("sampler2DArray", "frames.dds, BC7, a layer for each stored time; fetched"),
-    "video": ("sampler2DArray", "video.dds, RGB10A2, a layer for each stored time; fetched"),
     "valid": ("sampler2D", "valid.png, R8, {width} x {height}, white inside charts; fetched"),
 }
 
@@ -108,7 +111,7 @@ vec3 wlm_lightmap_output(vec4 a[WLM_LIGHTMAP_FOURS], int start)
     return y.xyz;
 }}
 
-// Of a tile of maps: `record` is where its record lies, `inner` the texel in the tile.
+// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile.
 vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
@@ -136,7 +139,7 @@ _SUM = """\
 """
 
 _DYNAMIC = """\
-    if (int(tile.x) == {code}) {{
+    if (int(tile.x) == 2) {{
         vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
         x = wlm_lightmap_volume(row, place);
 {uvt_sum}        x = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
@@ -202,14 +205,14 @@ vec2 wlm_lightmap_plane(int image, float place)
 }}
 """
 
-_IMAGES = """
-// Colour of a tile of {name} in the first (1) or second (3) image of its record.
-vec3 wlm_lightmap_of_{name}(vec4 tile, int record, ivec2 inner)
+_FRAMES = """
+// Colour of a tile of frames in the first (1) or second (3) frame of its record.
+vec3 wlm_lightmap_of_frames(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
     vec4 least = wlm_lightmap_entry(record);
-    ivec2 at = ivec2(row % {across}, row / {across}) * {TILE} + inner;
-    vec3 level = texelFetch(WLM_LIGHTMAP_{upper}, ivec3(at, int(least.w)), 0).xyz;
+    ivec2 at = ivec2(row % {frames_columns}, row / {frames_columns}) * {TILE} + inner;
+    vec3 level = texelFetch(WLM_LIGHTMAP_FRAMES, ivec3(at, int(least.w)), 0).xyz;
     return mix(least.xyz, wlm_lightmap_entry(record + 1).xyz, level);
 }}
 """
@@ -227,17 +230,17 @@ vec3 wlm_colour(ivec2 texel)
 """
 
 _MAPPED_KIND = """\
-    if (int(tile.x) == {static} || int(tile.x) == {dynamic})
+    if (int(tile.x) == 1 || int(tile.x) == 2)
         return wlm_lightmap_mapped(tile, record, inner);
 """
 
-_IMAGE_KIND = """\
-    if (int(tile.x) == {code}) {{
-        vec3 early = wlm_lightmap_of_{name}(tile, record + 1, inner);
+_FRAMES_KIND = """\
+    if (int(tile.x) == 3) {{
+        vec3 early = wlm_lightmap_of_frames(tile, record + 1, inner);
         if (tile.w == 0.0)
             return early;
-        // Radiance is mixed, whatever networks do.
-        vec3 late = wlm_lightmap_of_{name}(tile, record + 3, inner);
+        // Radiance is mixed, even if networks interpolate.
+        vec3 late = wlm_lightmap_of_frames(tile, record + 3, inner);
         vec3 light = mix(pow(early, {gamma}), pow(late, {gamma}), tile.w);
         return pow(light, {inverse});
     }}
@@ -283,48 +286,46 @@ vec3 wlm_value(ivec2 texel)
 """
 
 
-def texture_names(model: LightmapModel) -> list[str]:
-    """The textures that a model's shader reads, in the order of their declarations."""
-    has = {kind: bool((model.kind == kind).any()) for kind in TileKind}
-    needed = {
-        "networks": has[TileKind.STATIC] or has[TileKind.DYNAMIC],
-        "uvt": has[TileKind.DYNAMIC],
-        "frames": has[TileKind.FRAMES],
-        "video": has[TileKind.VIDEO] or has[TileKind.LEVELS],
-    }
-    needed |= {"uv": needed["networks"], "planes": needed["uvt"]}
+def record_fours(model: SheetModel) -> int:
+    """Returns the number of groups of four floats in the record of a tile."""
+    return 3 + max(fours(model.profile), 2)
+
+
+def texture_names(model: SheetModel) -> list[str]:
+    """Returns the textures that the shader of a sheet reads, in the order of their declarations."""
+    maps, dynamic = bool(len(model.uv)), bool(len(model.uvt))
+    needed = {"networks": maps, "uv": maps, "uvt": dynamic, "planes": dynamic, "frames": bool(len(model.frames))}
     return [name for name in _TEXTURES if needed.get(name, True)]
 
 
-def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None) -> str:
-    """The shader text for a model: functions alone, to be included below `#version`.
+def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) -> str:
+    """Returns the shader of a sheet: functions to be included below `#version`.
 
     Args:
-        model: Its settings and its tiles choose the text and the constants in it.
-        values: What the levels 0 and 1 of a model without gamma stand for; None: the model is of radiance.
+        model: The sheet; its settings and its tiles choose the text and the constants in it.
+        values: Values of the levels 0 and 1 of a linear sheet; None: the sheet is of radiance.
 
     Returns:
-        GLSL 3.30 and ES 3.00, which Vulkan's dialect takes too where the bindings are defined.
+        GLSL 3.30 and ES 3.00; Vulkan's dialect takes it too if the bindings are defined.
     """
     profile, names = model.profile, texture_names(model)
-    dynamic = int((model.kind == TileKind.DYNAMIC).sum())
+    dynamic = len(model.uvt)
     side, slices = profile.uvt_resolution, profile.uvt_slices
     across = {
-        "uv": columns(len(model.mapped), TILE, TILE),
+        "uv": columns(len(model.uv), TILE, TILE),
         "uvt": columns(dynamic * slices, side, side),
         "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
-        "frames": columns(int((model.kind == TileKind.FRAMES).sum()), TILE, TILE),
-        "video": columns(len(model.unpacked), TILE, TILE),
+        "frames": columns(len(model.frames), TILE, TILE),
     }
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {
         "TILE": TILE,
         "width": model.width,
         "height": model.height,
-        "columns": model.tile_columns,
-        "record": record(model),
+        "columns": model.grid.cols,
+        "record": record_fours(model),
         "head": HEAD,
-        "fours": fours(model),
+        "fours": fours(profile),
         "hidden": profile.hidden,
         "side": side,
         "slices": slices,
@@ -333,6 +334,7 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
         "uv_columns": across["uv"],
         "uvt_columns": across["uvt"],
         "plane_across": across["planes"],
+        "frames_columns": across["frames"],
         "uvt_width": across["uvt"] * side,
         "uvt_height": -(-dynamic * slices // across["uvt"]) * side,
         "planes_width": across["planes"] * profile.plane_columns,
@@ -344,13 +346,9 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
         "inverse": f"vec3({inverse})",
     }
     mapped = "networks" in names
-    kinds = _MAPPED_KIND.format(static=CODES[TileKind.STATIC], dynamic=CODES[TileKind.DYNAMIC]) if mapped else ""
-    images = ""
-    for name, kind in (("frames", TileKind.FRAMES), ("video", TileKind.VIDEO)):
-        if name in names:
-            own = words | {"name": name, "upper": name.upper(), "across": across[name], "code": CODES[kind]}
-            images += _IMAGES.format(**own)
-            kinds += _IMAGE_KIND.format(**own)
+    kinds, images = _MAPPED_KIND if mapped else "", ""
+    if "frames" in names:
+        kinds, images = kinds + _FRAMES_KIND.format(**words), _FRAMES.format(**words)
     text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value"})
     if "uvt" in names:
         text += _MAPS.format(**words)
@@ -361,10 +359,8 @@ def decode_glsl(model: LightmapModel, values: tuple[float, float] | None = None)
         ]
         temporal = ""
         if "uvt" in names:
-            code = CODES[TileKind.DYNAMIC]
-            temporal = _DYNAMIC.format(code=code, uvt_sum=sums[1], plane_sum=sums[2], **words)
-        gelu = _GELU["exact" if profile.gelu == "exact" else "tanh"]
-        text += _NETWORK.format(gelu=gelu, sum=sums[0], dynamic=temporal, **words)
+            temporal = _DYNAMIC.format(uvt_sum=sums[1], plane_sum=sums[2], **words)
+        text += _NETWORK.format(gelu=_GELU[profile.gelu], sum=sums[0], dynamic=temporal, **words)
     text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
     if values is None:
         return text + _RADIANCE.format(**words)

@@ -1,8 +1,11 @@
-"""What a batch of tiles is fitted to: normalised colour and its weights."""
+"""The training data of a batch of tiles: normalised colour and weights."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.lightmap.tiles import TILE
+from wlm.lightmap.profile import Profile, TimeAxis
+from wlm.lightmap.tiles import TILE, TileCut
 from wlm.workers import each
 
 
@@ -17,7 +20,7 @@ class Targets:
         weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3].
         scale: float32 [N, T, 3].
-        range: float32 [N, T], of radiance, or the peak.
+        range: float32 [N, T], range of the radiance, or the peak.
     """
 
     def __init__(
@@ -27,10 +30,8 @@ class Targets:
         mask: np.ndarray,
         scale: np.ndarray,
         affine: np.ndarray,
-        gamma: float,
-        metric_weight: float,
-        peak: float | None = None,
-    ):
+        profile: Profile,
+    ) -> None:
         """Normalises and weights colour.
 
         Args:
@@ -39,8 +40,9 @@ class Targets:
             mask: bool [N, 128, 128], valid texels.
             scale: float32 [N, T, 3], as rounded for the file.
             affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
-            gamma, metric_weight, peak: Of the `Profile`.
+            profile: The settings: `gamma`, `metric_weight` and `peak`.
         """
+        gamma, metric_weight, peak = profile.gamma, profile.metric_weight, profile.peak
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
         self.scale = scale
@@ -66,12 +68,37 @@ class Targets:
                 span = np.full_like(span, peak)
             self.range[i] = span
             if metric_weight > 0:
-                # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is
-                # the texel's emphasis. A tile without range is not scored, so it has no weight.
+                # d radiance / d y = gamma (colour / scale)^(gamma - 1) scale^gamma spread; the middle factor is the
+                # texel's emphasis. A tile without a range is not scored and gets no weight.
                 slope = gamma * scale[i] ** gamma * self.spread[i] / np.where(span > 0, span, 1.0)[:, None]
                 self.weight[i] = np.where(span[:, None] > 0, slope, 0.0) ** (2.0 * metric_weight)
 
         list(each(fill, range(n)))
-        # A black channel has scale 0: whatever the network's output, it decodes to 0.
+        # A black channel has scale 0: it decodes to 0 whatever the network's output is.
         self.weight *= scale > 0
         self.emphasis = 2.0 * (gamma - 1.0) * metric_weight
+
+
+@dataclass(frozen=True, eq=False)
+class TileJob:
+    """A batch of N tiles of one kind as it is sent to a worker, which then does the costly part of the preparation.
+
+    Attributes:
+        tiles: The tiles as they are cut from their sheet.
+        dynamic: Whether they are dynamic instead of static.
+        scale, affine: See `Targets`.
+        profile: The settings.
+        axis: The time axis.
+    """
+
+    tiles: TileCut
+    dynamic: bool
+    scale: np.ndarray
+    affine: np.ndarray
+    profile: Profile
+    axis: TimeAxis
+
+    def targets(self) -> Targets:
+        """Computes the training data."""
+        tiles = self.tiles.encoded(self.profile.gamma)
+        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.profile)

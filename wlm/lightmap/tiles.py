@@ -1,4 +1,4 @@
-"""Cutting a lightmap set into tiles, and the least model that each needs.
+"""Tiles: how a lightmap is cut into them, and which of them need feature maps.
 
 A tile is the unit of streaming and of fitting, with a model of its own (neural-dynamic-gi, sections 3.5 and 9).
 """
@@ -15,31 +15,32 @@ from enum import IntEnum
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.lightmap.data import LightmapSet
+from wlm.lightmap.data import SheetFrames
 from wlm.texels import check_size, fill_gaps
 from wlm.workers import each
 
-TILE = 128  # texels a side: the paper's tile (Table 1)
+TILE = 128
+"""Texels along a side of a tile, as in table 1 of the paper."""
 
 # A colour that was encoded and decoded again in float32 is off by a few parts in 10^6; a half float's step is at
 # least 488 such parts, so one step with this slack is never mistaken for two.
 _STEP_SLACK = 1.01
-_FLAT_DB = 50.0  # between half and one level of 8 bits
-_OUTLIER = 4.0  # a single texel of another value is within the budget of most tiles, and not what it means
+_FLAT_DB = 50.0  # an error between half a level and one level of 8 bits
+_OUTLIER = 4.0  # largest error of one texel, so that a single texel of another value does not count as flat
 _HALF_MIN_EXPONENT = -14  # below 2**-14 half floats are subnormal and their step no longer shrinks
 _HALF_MANTISSA_BITS = 10
 
 
 @dataclass(frozen=True)
 class TileGrid:
-    """How tiles cover a map: row-major; the last row and column reach past its end where its size is no multiple of
-    a tile's.
+    """The tiles of a map, row-major. The last row and column reach past the map's end if its size is not a multiple of
+    128.
 
     Attributes:
         height: Height of the map in texels.
         width: Width of the map in texels.
-        rows: Tiles from top to bottom.
-        cols: Tiles from left to right.
+        rows: Number of tiles from top to bottom.
+        cols: Number of tiles from left to right.
     """
 
     height: int
@@ -56,7 +57,7 @@ class TileGrid:
             width: In texels, at least 1.
 
         Raises:
-            WlmError: A size is below 1, or beyond what `wlm.texels.check_size` allows.
+            WlmError: A size is below 1 or larger than `wlm.texels.check_size` allows.
         """
         check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
@@ -67,10 +68,10 @@ class TileGrid:
         return self.rows * self.cols
 
     def origin(self, index: int) -> tuple[int, int]:
-        """Returns row and column of a tile's first texel.
+        """Returns the row and the column of the first texel of a tile.
 
         Args:
-            index: Number of the tile, row-major, in [0, count).
+            index: Number of the tile in [0, count).
 
         Raises:
             WlmError: The number is outside the grid.
@@ -80,10 +81,19 @@ class TileGrid:
         row, column = divmod(int(index), self.cols)
         return row * TILE, column * TILE
 
+    def window(self, index: int) -> tuple[slice, slice]:
+        """Returns the rows and the columns of the map that a tile covers.
+
+        Raises:
+            WlmError: The number is outside the grid.
+        """
+        y, x = self.origin(index)
+        return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
+
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """A batch of N tiles, ready for fitting.
+    """N tiles in the form in which they are fitted.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
@@ -100,12 +110,12 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class TileCut:
-    """N tiles of a set as they are in it.
+    """N tiles as views of the lightmaps that they are cut from.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
-        light: Of each tile `[T, h, w, 3]` float32, irradiance; h and w are 128, or less at the map's end.
-        mask: Of each `[h, w]` bool, true where a texel is valid.
+        light: For each tile `[T, h, w, 3]` float32, irradiance; h and w are 128, or less at the map's end.
+        mask: For each tile `[h, w]` bool, true where a texel is valid.
     """
 
     index: np.ndarray
@@ -113,7 +123,7 @@ class TileCut:
     mask: list[np.ndarray]
 
     def encoded(self, gamma: float) -> TileData:
-        """The tiles ready for fitting; they take N * T * 192 KiB of memory."""
+        """Returns the tiles in the form in which they are fitted, N * T * 192 KiB."""
         colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
 
         def encode(i: int) -> None:
@@ -132,34 +142,26 @@ class TileCut:
 
 
 class TileKind(IntEnum):
-    """The least model that a tile needs; the numbers are those in files."""
+    """How a tile is stored. The numbers are written to files."""
 
     EMPTY = 0
     """No valid texel: nothing is stored."""
     CONSTANT = 1
     """One colour per time."""
     STATIC = 2
-    """One colour per time and one pattern for all times."""
+    """One colour per time and one pattern for all times: F_uv and a network."""
     DYNAMIC = 3
-    """The full model."""
+    """All feature maps and a network."""
     FRAMES = 4
-    """The lightmap of each time as BC7, see `wlm.lightmap.frames`."""
-    VIDEO = 5
-    """The lightmaps of all times as a part of an AV1 stream, see `wlm.lightmap.video`."""
-    LEVELS = 6
-    """The lightmap of each time as levels that are coded without loss, see `wlm.lightmap.levels`."""
+    """The lightmap of each time as BC7, see `wlm.lightmap.encodings.frames`."""
 
 
-UNPACKED = (TileKind.VIDEO, TileKind.LEVELS)
-"""Kinds whose levels of 10 bits are unpacked when a file is read: one for decoders, shaders and engines."""
-
-
-def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
-    """Cuts a set into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
+def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
+    """Cuts a sheet into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
 
     Args:
-        lightmaps: The set, `[T, H, W, 3]`.
-        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on the dark; above 0.
+        lightmaps: The sheet, frames `[T, H, W, 3]`.
+        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on dark values; above 0.
         tiles: Numbers of the tiles, in the order of the result; None for all. They take N * T * 192 KiB of memory.
 
     Returns:
@@ -173,11 +175,11 @@ def split(lightmaps: LightmapSet, gamma: float, tiles: Sequence[int] | None = No
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 
 
-def cut(lightmaps: LightmapSet, index: np.ndarray) -> TileCut:
-    """Cuts tiles out of a set, without a copy.
+def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
+    """Cuts tiles out of a sheet without a copy.
 
     Args:
-        lightmaps: The set, `[T, H, W, 3]`.
+        lightmaps: The sheet, frames `[T, H, W, 3]`.
         index: `[N]` int64, numbers of the tiles.
 
     Raises:
@@ -185,26 +187,22 @@ def cut(lightmaps: LightmapSet, index: np.ndarray) -> TileCut:
     """
     grid = TileGrid.of(*lightmaps.mask.shape)
     check_index(index, grid)
-    windows = []
-    for tile in index:
-        y, x = grid.origin(tile)
-        windows.append((slice(y, min(y + TILE, grid.height)), slice(x, min(x + TILE, grid.width))))
+    windows = [grid.window(tile) for tile in index]
     return TileCut(index, [lightmaps.frames[:, *at] for at in windows], [lightmaps.mask[at] for at in windows])
 
 
 def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
-    """The valid texels of a tile, bool [128, 128]; none past the map's end.
+    """Returns the valid texels of a tile, bool [128, 128]; false past the map's end.
 
     Args:
         mask: bool [H, W], true where a texel is valid.
-        number: Of the tile in the grid.
+        number: Number of the tile in the grid.
     """
-    y, x = TileGrid.of(*mask.shape).origin(number)
-    return _whole(mask[y : y + TILE, x : x + TILE])
+    return _whole(mask[TileGrid.of(*mask.shape).window(number)])
 
 
 def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Mean of each channel of each tile at each time, over the valid texels (neural-dynamic-gi, section 4).
+    """Computes the mean of each channel of each tile at each time over the valid texels (section 4).
 
     Args:
         colour: `[N, T, 128, 128, 3]`, as in `TileData`.
@@ -222,12 +220,12 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Pattern of each tile whose product with the means approximates a tile whose light only changes in strength.
+    """Computes the pattern of each tile whose product with the means approximates a tile that only changes in strength.
 
-    It is the sum over t of colour over the sum over t of means: weighted by the means, so that a nearly black time,
-    whose texels are a few steps of half float apart, hardly counts, and a mean of 0 is never divided by.
-    `means * pattern` is exact where the tile is the product of one colour per time and a pattern, in gamma-encoded
-    and so in linear space.
+    It is the sum of the colours over time divided by the sum of the means: times count in proportion to their means, so
+    that a nearly black time, whose texels are a few steps of half float apart, hardly counts, and nothing is divided by
+    a mean of 0. `means * pattern` is exact if the tile is the product of one colour per time and a pattern, in gamma
+    space and so in linear space.
 
     Args:
         colour: `[N, T, 128, 128, 3]`, as in `TileData`.
@@ -244,32 +242,32 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
-    """Finds the least model that each tile needs, from a stated error budget.
+    """Finds the smallest model that represents each tile within an error budget.
 
     In linear space, over the valid texels:
 
-    - `EMPTY`: there is none.
-    - `CONSTANT`: at every time no channel spans more than one step of half float, as wide as it is at the
-      channel's least value. A half-float source holds nothing finer. An all-zero tile is one.
-    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at
-      that time as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any
-      texel is more than one step of half float off. The second covers times whose range is zero or so small
-      that the PSNR would measure the half float. A set of one time is such a product exactly.
-    - `DYNAMIC`: the rest.
+    - `EMPTY`: the tile has no valid texel.
+    - `CONSTANT`: at every time no channel spans more than one step of half float, measured at the channel's least
+      value. A half-float source holds nothing finer. An all-zero tile is constant.
+    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at that time
+      as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any texel is off by more
+      than one step of half float. The second condition covers times whose range is zero or so small that the PSNR would
+      measure the half float. A set of one time is such a product exactly.
+    - `DYNAMIC`: all other tiles.
 
-    With a peak, of values that aren't light, the PSNR's peak is that one, and a tile is constant as well where at every
-    time its channels' means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the error that
-    this allows: sources of 8 bits are never flat.
+    For values that are not light, `peak` replaces the range, and a tile is also constant if at every time the means of
+    its channels have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the error that this allows:
+    sources of 8 bits are never exactly flat.
 
     Args:
         tiles: From `split`.
-        gamma: The one given to `split`.
-        static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only what is within a
-            step of half float.
-        peak: Of `wlm.lightmap.model.Profile`.
+        gamma: The gamma given to `split`.
+        static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only tiles within a step
+            of half float.
+        peak: See `wlm.lightmap.profile.Profile.peak`.
 
     Returns:
-        `[N]` int64 of `TileKind`.
+        `TileKind` of each tile, `[N]` int64.
 
     Raises:
         WlmError: Gamma is not above 0, or the budget is NaN.
@@ -296,7 +294,7 @@ def check_index(index: np.ndarray, grid: TileGrid) -> None:
     """Checks numbers of tiles, `[N]`.
 
     Raises:
-        WlmError: There is none, one is outside the grid, or one is given twice.
+        WlmError: There is no number, a number is outside the grid, or a number is given twice.
     """
     if not index.size:
         raise WlmError("tiles: expected at least one tile, got none")
@@ -341,16 +339,16 @@ def parse_tiles(text: str, count: int) -> list[int]:
 
 
 def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
-    """Puts tiles back into a map; the inverse of `split`.
+    """Puts tiles together to a map; the inverse of `split`.
 
     Args:
         tiles: `[N, 128, 128, C]`, any dtype.
         index: `[N]`, number of each tile in the grid.
         grid: The map's.
-        fill: Value of the texels of tiles that `index` lacks.
+        fill: Value of the texels of tiles that are not in `index`.
 
     Returns:
-        `[H, W, C]`, of the tiles' dtype. What the tiles hold past the map's end is dropped.
+        `[H, W, C]`, of the tiles' dtype. Texels past the map's end are dropped.
 
     Raises:
         WlmError: Shapes do not fit, or a number is outside the grid or given twice.
@@ -372,18 +370,17 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
 
     Args:
         image: `[H, W, C]`, written.
-        tiles: `[N, 128, 128, C]`. What they hold past the map's end is dropped.
+        tiles: `[N, 128, 128, C]`. Texels past the map's end are dropped.
         index: `[N]`, number of each tile in the grid.
         grid: The map's.
     """
     for tile, number in zip(tiles, index, strict=True):
-        y, x = grid.origin(number)
-        part = image[y : y + TILE, x : x + TILE]
+        part = image[grid.window(number)]
         part[...] = tile[: part.shape[0], : part.shape[1]]
 
 
 def _whole(valid: np.ndarray) -> np.ndarray:
-    """The valid texels of a tile [h, w] as [128, 128]."""
+    """Returns the valid texels of a tile [h, w] as [128, 128]."""
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask
@@ -395,7 +392,7 @@ def _check_gamma(gamma: float) -> None:
 
 
 def _half_step(value: np.ndarray) -> np.ndarray:
-    """Distance from each non-negative value to the next larger half float, at any magnitude."""
+    """Returns the distance from each non-negative value to the next larger half float."""
     # frexp gives value = m 2^e with m in [0.5, 1): the leading bit is worth 2^(e - 1).
     exponent = np.frexp(value)[1] - 1
     exponent = np.where(value > 0, np.maximum(exponent, _HALF_MIN_EXPONENT), _HALF_MIN_EXPONENT)
@@ -403,7 +400,7 @@ def _half_step(value: np.ndarray) -> np.ndarray:
 
 
 def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
-    """Whether no channel of [T, 128, 128, 3] spans more than a step of half float at any time."""
+    """Returns whether no channel of [T, 128, 128, 3] spans more than a step of half float at any time."""
     encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
     # Decoding is monotonic, so the extremes are taken before it.
     low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
@@ -411,7 +408,7 @@ def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
 
 
 def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
-    """Whether the channels' means are near all texels of [T, 128, 128, 3] at every time, see `classify`."""
+    """Returns whether the means of the channels are near all texels at every time, see `classify`."""
     linear = colour[:, valid].astype(np.float64) ** gamma
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
@@ -426,7 +423,7 @@ def _is_static(
     budget_db: float,
     set_peak: float | None,
 ) -> bool:
-    """Whether one colour per time, multiplied by one pattern, meets the budget at every time."""
+    """Returns whether one colour per time, multiplied by one pattern, meets the budget at every time."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
     for frame, mean in zip(colour, means, strict=True):
         linear = frame[valid].astype(np.float64) ** gamma

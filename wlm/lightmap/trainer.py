@@ -1,8 +1,10 @@
 """Training of one batch of tiles on a device: its parameters, its optimisers and its steps."""
 
 import math
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,33 +14,37 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm.lightmap.model import Profile, TimeAxis, encode_time
-from wlm.lightmap.targets import Targets
+from wlm.lightmap.profile import Profile, TimeAxis, encode_time
+from wlm.lightmap.targets import Targets, TileJob
 from wlm.lightmap.tiles import TILE
 from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.gather import gather_maps, gather_net, update_maps, update_net
 
-# What a checkpoint keeps: attributes of a trainer, and of each of torch's Adam's parameters.
+# The parts of a state: attributes of a trainer, and of each parameter of torch's Adam.
 _STATE = ("maps", "hidden", "output", "loss", "control")
 _ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 _MOMENTUM = 0.9  # Adam's decay of gradients
-_VECTOR = 16  # numbers of the widest vector of a CPU that torch knows (AVX-512)
-CPU_LANES = 2  # ranges of samples with separate sums; fixed, so that results don't depend on the number of cores
+_ADAM_EPSILON = 1e-8  # the loss is a mean over the samples and channels of a tile
+_VECTOR = 16  # numbers in the widest vector of a CPU that torch uses (AVX-512)
+_CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
+
+CPU_LANES = 2
+"""Ranges of samples with separate sums; fixed, so that results do not depend on the number of cores."""
 
 
 def _padded(count: int) -> int:
-    """Numbers that an optimiser's tensor of `count` has.
+    """Returns the length of an optimiser's tensor of `count` numbers.
 
-    Torch's fused Adam treats what is left over from whole vectors in a loop of its own, which rounds otherwise on some
-    CPUs: with no remainder, a tile is the same in any batch.
+    Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
+    CPUs: without a remainder, a tile is the same in any batch.
     """
     return -(-count // _VECTOR) * _VECTOR
 
 
 def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Zeros as an optimiser takes them, flat and padded, and a view of them in their shape; each has its gradient."""
+    """Returns zeros for an optimiser, flat and padded, and a view of them in their shape; both have gradients."""
     count = math.prod(shape)
     stored = torch.zeros(_padded(count), device=device).requires_grad_()
     stored.grad = torch.zeros_like(stored)
@@ -50,16 +56,16 @@ def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch
 class Trainer:
     """Trains N tiles of one kind together; see `Profile` for the stages.
 
-    `state` holds everything that a later step depends on, so that a resumed fit goes on exactly.
+    `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
     Attributes:
         profile: The settings.
         axis: The time axis.
         device: As `interop.check_device` returns it.
-        temporal: Whether the tiles are DYNAMIC rather than STATIC.
+        temporal: Whether the tiles are DYNAMIC instead of STATIC.
         numbers: int32 [N], numbers of the tiles in their grid.
         tiles: N.
-        inputs: Inputs of the network.
+        inputs: Number of inputs of the network.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
         maps, maps_grad: float32 [M], all maps and their gradients, padded.
         hidden, output: The networks, see `wlm_kernels.mlp`.
@@ -84,10 +90,10 @@ class Trainer:
             profile: The settings.
             axis: The time axis.
             targets: The training data.
-            temporal_maps: Whether the tiles are DYNAMIC rather than STATIC.
-            seed: Of the initial parameters and of all samples.
+            temporal_maps: Whether the tiles are DYNAMIC instead of STATIC.
+            seed: Seed of the initial parameters and of all samples.
             device: As `interop.check_device` returns it.
-            track: Whether to sum what `psnr` needs.
+            track: Whether to sum the errors that `psnr` needs.
         """
         self._track = track
         self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
@@ -99,7 +105,7 @@ class Trainer:
         )
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
         if not self._cuda:
-            # Before two lanes launch them at once, which would compile them twice into one file.
+            # Two lanes that launch them at once would compile them twice into one file.
             self._kernels.load(device)
             wp.load_module(gather, device)
         with interop.stream(device):
@@ -177,7 +183,7 @@ class Trainer:
             if self._cuda
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
-        # What the kernels read: the networks, or their levels.
+        # Kernels read the networks, or the networks on 8-bit levels.
         nets = self.hidden.detach(), self.output.detach()
         self._on_levels = tuple(torch.empty_like(values) for values in nets)
         self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
@@ -191,7 +197,7 @@ class Trainer:
         net_grads = wrap(self.hidden.grad.view(-1)), wrap(self.output.grad.view(-1))
         maps = wrap(self.maps), wrap(self.maps_grad)
         if self._cuda:
-            # What `update_maps` and `update_net` take, to their last arguments.
+            # The last arguments of `update_maps` and `update_net`.
             self._maps_update = (wrap(self._acc), adams[0], *maps, wrap(rates))
             flat = (wrap(values.view(-1)) for values in nets)
             moved = *adams[1:], *flat, wrap(self.loss), wrap(self.control)
@@ -204,10 +210,10 @@ class Trainer:
         return ("hidden", self.hidden), ("output", self.output)
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
-        """Adam on a GPU for one array of parameters, with moments of 0."""
+        """Returns Adam on a GPU for one array of parameters, with moments of 0."""
         adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self.profile.adam_decay)
-        adam.epsilon = self.profile.adam_epsilon
+        adam.epsilon = _ADAM_EPSILON
         for key, field in (("exp_avg", "first"), ("exp_avg_sq", "second")):
             moments = torch.zeros(values.numel(), device=self.device)
             self._moments[f"adam_{name}.{key}"] = moments
@@ -215,11 +221,11 @@ class Trainer:
         return adam
 
     def _torch_adams(self, nets: list[torch.Tensor]) -> dict[str, torch.optim.Adam]:
-        """Adam on the CPU: torch's."""
+        """Returns torch's Adam, for the CPU."""
         maps = self.maps.detach().requires_grad_()
         maps.grad = self.maps_grad
         betas = (_MOMENTUM, self.profile.adam_decay)
-        options = {"lr": 1.0, "betas": betas, "eps": self.profile.adam_epsilon, "fused": True}
+        options = {"lr": 1.0, "betas": betas, "eps": _ADAM_EPSILON, "fused": True}
         return {"adam_maps": torch.optim.Adam([maps], **options), "adam_net": torch.optim.Adam(nets, **options)}
 
     def _upload(self, targets: Targets, seed: int) -> None:
@@ -254,7 +260,7 @@ class Trainer:
         self.batch = batch
 
     def _rates_over_steps(self) -> wp.array:
-        """The schedule as `gather.update_maps` takes it."""
+        """Returns the schedule of learning rates for `gather.update_maps`."""
         p = self.profile
         share = np.linspace(0.0, 1.0, p.steps)
         values = p.final_rate + (1.0 - p.final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
@@ -263,7 +269,7 @@ class Trainer:
         return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:
-        """Draws the initial parameters; each tile has its own generator, so that it is the same in any batch."""
+        """Draws the initial parameters. Each tile has its own generator, so that it is the same in any batch."""
         hidden, inputs = self.profile.hidden, self.inputs
         maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
         w = np.zeros(tuple(self.hidden.shape), np.float32)
@@ -288,13 +294,13 @@ class Trainer:
         return int(self.control.item())
 
     def stage(self, step: int) -> int:
-        """Stage of a step: 0, continuous maps with noise; 1, maps on their exact levels; 2, maps frozen."""
+        """Returns the stage of a step: 0 continuous maps with noise, 1 maps on their exact levels, 2 maps frozen."""
         p = self.profile
         return int(step >= round(p.quantise_from * p.steps)) + int(step >= self.frozen)
 
     @property
     def frozen(self) -> int:
-        """The first step at which the network alone is trained."""
+        """The first step at which only the network is trained."""
         return round(self.profile.freeze_from * self.profile.steps)
 
     def run(self, steps: int) -> None:
@@ -303,7 +309,7 @@ class Trainer:
         threads = torch.get_num_threads()
         try:
             if not self._cuda:
-                # Torch's second thread would spin between torch's calls, on the core that a lane needs.
+                # A second thread of torch would spin between its calls, on the core that a lane needs.
                 torch.set_num_threads(1)
             with interop.stream(self.device):
                 for step in range(first, first + steps):
@@ -312,7 +318,7 @@ class Trainer:
             torch.set_num_threads(threads)
 
     def _step(self, quantised: bool, move_maps: bool) -> None:
-        self.batch.quantised = self.profile.map_step if quantised else 0
+        self.batch.quantised = int(quantised)
         on_levels = quantised and self.profile.net_bits == 8
         if on_levels:
             levels.put_on_levels(*self._levels_args)
@@ -344,15 +350,15 @@ class Trainer:
                 adam.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs `work(lane)` for each lane on the CPU's threads; a launch releases the interpreter's lock."""
+        """Runs `work(lane)` for each lane in threads; a launch releases Python's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
     def losses(self) -> np.ndarray:
-        """Running mean of each tile's loss over about 50 steps, float32 [N]."""
+        """Returns the running mean of each tile's loss over about 50 steps, float32 [N]."""
         return self.loss.cpu().numpy()
 
     def psnr(self) -> float:
-        """Mean PSNR over tiles and stored times of the samples since the last call; NaN without `track`."""
+        """Returns the mean PSNR over tiles and times of the samples since the last call; NaN without `track`."""
         with interop.stream(self.device):
             sums = self._tracked.sum(0).cpu()
             self._tracked.zero_()
@@ -361,11 +367,11 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """The maps and networks as the file holds them.
+        """Returns the maps and networks as the file holds them.
 
         Returns:
-            `net` and `uv`, of dynamic tiles also `uvt`, `ut` and `vt`, as `LightmapModel` has them; `net`
-            is `net_static` of static tiles.
+            `net` and `uv`, and for dynamic tiles `uvt`, `ut` and `vt`, as in `SheetModel`; `net` is `net_static` of
+            static tiles.
         """
         nets = self.hidden.detach(), self.output.detach()
         if self.profile.net_bits == 8:
@@ -378,28 +384,27 @@ class Trainer:
             uvt = self._blocks("uvt")
             result["uvt"] = uvt.reshape(self.tiles, -1, *uvt.shape[1:])
             for key in ("ut", "vt"):
-                plane, step = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0), np.float32(self.profile.map_step)
-                level = np.floor(plane * np.float32(255.0) / step + np.float32(0.5))
-                result[key] = (np.minimum(level, 256 / step - 1) * step).astype(np.uint8)
+                plane = np.clip(self.views[key].cpu().numpy(), 0.0, 1.0)
+                result[key] = np.floor(plane * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
-        """A map as BC7 blocks, uint8 [S, H/4, W/4, 16]."""
+        """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]."""
         endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
         with interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
             index = wp.empty(weights.shape, dtype=wp.uint8, device=self.device)
-            blocks.quantise(endpoints, weights, levels, index, self.profile.map_step)
+            blocks.quantise(endpoints, weights, levels, index)
         s, h, w = index.shape
         # Texels [S, H, W] -> blocks [S, H/4, W/4, 16], row-major in the block.
         index = index.numpy().reshape(s, h // 4, 4, w // 4, 4).swapaxes(2, 3).reshape(s, h // 4, w // 4, 16)
         return pack_mode6(levels.numpy(), index)
 
     def check(self) -> None:
-        """Holds that the fit is sound.
+        """Checks that the fit is sound.
 
         Raises:
-            WlmError: It diverged: a tile's loss or maps are not finite, or its network is not in half floats.
+            WlmError: It diverged: the loss or maps of a tile are not finite, or its network is not in half floats.
         """
         broken = ~torch.isfinite(self.loss)
         for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
@@ -411,27 +416,27 @@ class Trainer:
             )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that later steps depend on.
+        """Returns everything that later steps depend on.
 
         Raises:
-            WlmError: As `check`.
+            WlmError: As for `check`.
         """
         self.check()
         result = {key: getattr(self, key) for key in _STATE} | self._moments
         for name, adam in self._adams.items():
             for i, values in enumerate(adam.state.values()):
                 result |= {f"{name}.{i}.{key}": values[key] for key in _ADAM_STATE}
-        # Copies, and numbers stay without a dimension.
+        # Copies; numbers keep no dimension.
         return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """The parts of a `state` after so many steps."""
+        """Returns the types and shapes of a `state` after `step` steps."""
         table = {key: Part(np.float32, tuple(getattr(self, key).shape)) for key in _STATE}
         table["control"] = Part(np.int32, (1,), least=step, most=step)
         for key, values in self._moments.items():
             table[key] = Part(np.float32, tuple(values.shape), least=0.0 if key.endswith("_sq") else None)
         for name, adam in self._adams.items():
-            # Maps that are frozen from the start have no optimiser.
+            # Maps that are frozen from the start have no state of an optimiser.
             if step == 0 or (name == "adam_maps" and self.stage(0) == 2):
                 continue
             for i, parameter in enumerate(adam.param_groups[0]["params"]):
@@ -444,10 +449,10 @@ class Trainer:
         return table
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a `state`.
+        """Restores a `state`.
 
         Raises:
-            ValueError: A part is missing, of another shape or out of its range; the trainer is as it was.
+            ValueError: A part is missing, of another shape or out of its range; the trainer is unchanged.
         """
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
         parts = check_parts(state, self.table(int(done[0])))
@@ -463,6 +468,99 @@ class Trainer:
                         adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
-        """Ends the CPU lanes' threads."""
+        """Ends the threads of the CPU lanes."""
         if self._pool is not None:
             self._pool.shutdown()
+
+
+@dataclass(frozen=True, eq=False)
+class Advance:
+    """The progress of a batch.
+
+    Attributes:
+        step: Steps done.
+        loss, psnr: Means over its tiles of the latest samples, see `Trainer`; NaN if they are not tracked. At the end
+            they are of the maps as the file holds them.
+        parts: The maps and networks as the file holds them, once the batch is done.
+    """
+
+    step: int
+    loss: float = math.nan
+    psnr: float = math.nan
+    parts: dict[str, np.ndarray] | None = None
+
+
+class Fitter:
+    """Fits batches of tiles one after another, in this process or in another one (`wlm.workers`)."""
+
+    def __init__(self, seed: int, device: str, track: bool) -> None:
+        """Takes the settings that all batches share.
+
+        Args:
+            seed: Seed of the fit.
+            device: "cpu", "cuda" or "cuda:N".
+            track: Whether to report the PSNR during the fit.
+
+        Raises:
+            WlmError: There is no such device.
+        """
+        self._seed, self._track, self._device = seed, track, interop.check_device(device)
+        self._trainer: Trainer | None = None
+
+    def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
+        """Begins a batch, or continues it.
+
+        Args:
+            job: Its tiles.
+            state: State of the batch at an earlier step; None: from the first step.
+
+        Raises:
+            ValueError: The state is not of this batch.
+        """
+        self.close()
+        options = job.dynamic, self._seed, self._device, self._track
+        self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)
+        # All kernels of a batch are compiled before its first steps are reported.
+        wp.load_module(blocks, self._device)
+        if state is not None:
+            self._trainer.load(state)
+        return Advance(self._trainer.step)
+
+    def advance(self, seconds: float) -> Advance:
+        """Trains for some seconds, at least a few steps, or to the end of the batch.
+
+        Raises:
+            WlmError: The fit diverged.
+        """
+        trainer = self._trainer
+        chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.profile.steps
+        step, end = trainer.step, time.monotonic() + seconds
+        while step < steps:
+            count = min(chunk, steps - step)
+            trainer.run(count)
+            step += count
+            if time.monotonic() >= end:
+                break
+            if self._track and step - count < frozen <= step < steps:
+                trainer.psnr()  # samples before the maps were frozen do not count
+        figures = (float(trainer.losses().mean()), trainer.psnr()) if self._track else (math.nan, math.nan)
+        if step < steps:
+            return Advance(step, *figures)
+        trainer.check()
+        parts = trainer.quantised()
+        self.close()
+        return Advance(step, *figures, parts)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Returns everything that later steps of the batch depend on.
+
+        Raises:
+            WlmError: The fit diverged.
+        """
+        return self._trainer.state()
+
+    def close(self) -> None:
+        """Drops the batch."""
+        if self._trainer is not None:
+            self._trainer.close()
+            self._trainer = None

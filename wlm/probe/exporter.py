@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.folder import made_parents, rounded, staged, write_index
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.data import save_probes
@@ -22,7 +23,6 @@ from wlm.probe.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.sphere import sh_count
 from wlm.probe.transform import Transform
 from wlm.probe.transform_export import LIGHT_FILE, light_bytes, transform_document, transform_glsl
-from wlm.shading import ENDINGS, check_language, translate
 
 FORMAT = "wlm-probe-export"
 _VERSION = 1
@@ -84,7 +84,7 @@ def export(
         directory: The folder; made if it isn't there.
         device: Where the reference is decoded.
         position: [N, 3], of a transform's own probes; None: those that are stored with it.
-        shader: One of `wlm.shading.LANGUAGES`: `probe.glsl`, `probe.hlsl`, `probe.metal` or `probe.wgsl`.
+        shader: One of `wlm.export.shading.LANGUAGES`: `probe.glsl`, `probe.hlsl`, `probe.metal` or `probe.wgsl`.
 
     Returns:
         The files written, `probe.json` last.

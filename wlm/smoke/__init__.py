@@ -19,7 +19,7 @@ _PLACES = {
     "TrainSettings": "wlm.smoke.network.settings",
     "bake": "wlm.smoke.march.fine",
     "evaluate": "wlm.smoke.evaluation",
-    "export": "wlm.smoke.network.onnx_file",
+    "export_onnx": "wlm.smoke.network.onnx_file",
     "guide": "wlm.smoke.march.coarse",
     "load": "wlm.smoke.data",
     "load_frames": "wlm.smoke.data",

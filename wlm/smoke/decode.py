@@ -30,7 +30,6 @@ class Decoder:
     Attributes:
         height, width: H and W of the images.
         device: Where it runs.
-        emission: Whether the network predicts emission.
         guide: Kind of guiding map, a key of `planes.GUIDES`.
         half: Whether it computes in half floats.
     """
@@ -52,7 +51,7 @@ class Decoder:
             raise ValueError(f"expected at least one pixel, got {height} x {width}")
         settings = model.settings
         self.device = check_device(device)
-        self.height, self.width, self.emission, self.guide = height, width, settings.emission, settings.guide
+        self.height, self.width, self.guide = height, width, settings.guide
         self.half = half and self.device != "cpu"
         dtype = torch.float16 if self.half else torch.float32
         with torch.no_grad():
@@ -192,7 +191,7 @@ class _Body:
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
         """All heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W] that is padded."""
         settings, stem = self.settings, self.settings.stem
-        padded = F.pad(guide, self.padding)[:, : settings.channels]
+        padded = F.pad(guide, self.padding)
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
         x = x.contiguous(memory_format=torch.channels_last)
         skips = []
@@ -227,10 +226,10 @@ class _Tail:
         self.device, self.stem, area = device, settings.stem, settings.stem**2
         order = [PLANES.index(name) for name in network.names]
         adapters = [i for i, group in enumerate(network.groups) for _ in group]
-        # For each plane its adapter, -1 if it isn't predicted, and its first channel.
-        places = torch.tensor([[-1, 0]] * len(PLANES), dtype=torch.int32)
+        # The adapter of each plane, and its first channel.
+        places = torch.zeros(len(PLANES), 2, dtype=torch.int32)
         places[order] = torch.tensor([[adapter, n * area] for n, adapter in enumerate(adapters)], dtype=torch.int32)
-        filters = network.filter.weight if settings.residual else torch.zeros(len(order), 0, 1, 1)
+        filters = network.filter.weight
         edge = filters.shape[-1]
         # Columns first, in the order in which a thread reads them.
         taps = torch.zeros(filters.shape[1], edge, edge, len(PLANES))

@@ -165,7 +165,7 @@ class _Run:
         self.best_step = self.first_skipped = 0  # step of the best; steps skipped before this round
         self.score: Score | None = None
         self.loss = math.nan
-        self.columns = ["step", "seconds", "rate", "loss", *self.settings.losses.parts, "skipped"]
+        self.columns = ["step", "seconds", "rate", "loss", *self.settings.losses, "skipped"]
         self.columns += [*_SCORES, *PLANES]
         self.curve = np.zeros((0, len(self.columns)))
         if not checkpoint.restore(0, self._load):

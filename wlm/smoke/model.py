@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from torch import nn
+
+from wlm.bundle import Bundle
 from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
@@ -17,7 +20,7 @@ class SmokeModel(Model):
 
     Attributes:
         network: The network in float32.
-        summary: Facts of its training, JSON values; "dataset" holds the settings of its samples.
+        summary: Facts about the training as JSON values; "dataset" holds the settings of its samples.
     """
 
     SYSTEM: ClassVar[str] = "smoke-network"
@@ -27,16 +30,25 @@ class SmokeModel(Model):
 
     @property
     def settings(self) -> NetworkSettings:
-        """The network's shape."""
+        """Shape of the network."""
         return self.network.settings
 
     @property
     def dataset(self) -> DatasetSettings:
-        """The settings of the samples that it was trained on, which say how to make its guiding maps.
+        """Settings of the samples that the network was trained on, by which its guiding maps must be made.
 
         Raises:
-            WlmError: The summary lacks them, or they don't fit.
+            WlmError: The summary lacks them, or a setting is wrong.
         """
         if "dataset" not in self.summary:
             raise WlmError("summary.dataset: expected the settings of the network's samples, found none")
         return check_settings(DatasetSettings, self.summary["dataset"], "summary.dataset.")
+
+    def bundle(self, device: str = "cpu", **_: object) -> Bundle:
+        """Raises WlmError: a network has no textures; see `wlm.smoke.export_onnx` and `wlm.smoke.bundle`."""
+        raise WlmError("a network has no textures: export it by export_onnx, or bundle a flip book of its lightmaps")
+
+
+def parameter_count(network: nn.Module) -> int:
+    """Number of trained parameters."""
+    return sum(parameter.numel() for parameter in network.parameters())

@@ -116,8 +116,6 @@ def compare(
         return _lightmaps(paths, models, original, device, progress)
     if systems[0] == "probe":
         return _probes(paths, models, original, key, device, progress)
-    if systems[0] == "lightmap-layers":
-        raise WlmError(f"{paths[0]}: expected lightmaps without layers; wlm lightmap evaluate scores each layer")
     if systems[0] == "atlas":
         return _atlases(paths, models, original, device, progress)
     raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")

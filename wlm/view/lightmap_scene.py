@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm.formats.geometry import Geometry
-from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.decode import Decoder
+from wlm.lightmap.data import SheetFrames
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
-from wlm.lightmap.model import LightmapModel, TimeAxis
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.texels import exposure, fill_gaps
 from wlm.view.scene import Slider, State
@@ -21,8 +22,6 @@ _COLOURS = {
     TileKind.STATIC: (0.2, 0.8, 0.35),
     TileKind.DYNAMIC: (1.0, 0.45, 0.1),
     TileKind.FRAMES: (0.65, 0.35, 0.9),
-    TileKind.VIDEO: (0.95, 0.85, 0.2),
-    TileKind.LEVELS: (0.3, 0.85, 0.85),
 }
 _NAMED = {
     TileKind.EMPTY: "grey",
@@ -30,14 +29,12 @@ _NAMED = {
     TileKind.STATIC: "green",
     TileKind.DYNAMIC: "orange",
     TileKind.FRAMES: "violet",
-    TileKind.VIDEO: "yellow",
-    TileKind.LEVELS: "cyan",
 }
 
 
 def lightmap_scene(
-    model: LightmapModel | None,
-    lightmaps: LightmapSet | None,
+    model: SheetModel | None,
+    lightmaps: SheetFrames | None,
     *,
     title: str,
     geometry: Geometry | None = None,
@@ -84,12 +81,12 @@ def lightmap_scene(
 
 @dataclass(kw_only=True)
 class _LightmapScene(SurfaceScene):
-    model: LightmapModel | None
-    lightmaps: LightmapSet | None
+    model: SheetModel | None
+    lightmaps: SheetFrames | None
 
     def __post_init__(self) -> None:
         self._shown: tuple[float, dict[str, np.ndarray], str] | None = None
-        self._decoder = None if self.model is None else Decoder(self.model)
+        self._decoder = None if self.model is None else SheetDecoder(self.model)
         if self.lightmaps is not None:
             given = self.lightmaps
             self._axis = TimeAxis(given.times, given.period, "frames")
@@ -127,7 +124,7 @@ class _LightmapScene(SurfaceScene):
         outside = "" if self.mask is None or self.mask[row, column] else "outside of the mask"
         if self.model is None:
             return outside
-        number = row // TILE * self.model.tile_columns + column // TILE
+        number = row // TILE * self.model.grid.cols + column // TILE
         told = f"tile {number} ({TileKind(self.model.kind[number]).name.lower()})"
         return "   ".join(filter(None, (told, outside)))
 

@@ -19,8 +19,8 @@ from wlm.view.scene import Scene
 
 if TYPE_CHECKING:
     from wlm.atlas.model import AtlasModel
-    from wlm.lightmap.data import LightmapSet
-    from wlm.lightmap.model import LightmapModel
+    from wlm.lightmap.data import SheetFrames
+    from wlm.lightmap.model import SheetModel
     from wlm.view.probe_scene import Probes
 
 
@@ -109,15 +109,17 @@ class _Request:
 
     def model(self) -> Scene:
         model = load(self.path)
-        if model.SYSTEM in ("lightmap", "lightmap-layers"):
-            from wlm.lightmap.front import load_light
+        if model.SYSTEM == "lightmap":
+            from wlm.lightmap.data import load as load_set
+            from wlm.lightmap.sheet import LIGHT, first_light
 
             self._refuse("key", "walk", "block", "extinction")
-            sheet, model = model.shown() if model.SYSTEM == "lightmap-layers" else (None, model)
-            given = None if self.original is None else load_light(self.original, sheet)
+            sheet = first_light(model.sheets)
+            model = model.sheets[sheet]
+            given = None if self.original is None else load_set(self.original).find(sheet)
             if given is not None:
                 self._check_size(given.mask.shape, (model.height, model.width))
-            return self._lightmaps(model, given, "" if sheet is None else f": {sheet.label}")
+            return self._lightmaps(model, given, "" if sheet == LIGHT else f": {sheet.label}")
         if model.SYSTEM == "probe":
             from wlm.probe.places import probes_of
             from wlm.view.probe_scene import Probes
@@ -130,10 +132,10 @@ class _Request:
         raise WlmError(f"{self.path}: a network has no picture of its own; expected the lightmaps that it predicts")
 
     def lightmap_set(self) -> Scene:
-        from wlm.lightmap.front import load_light
+        from wlm.lightmap.data import load as load_set
 
         self._refuse("original", "key", "walk", "block", "extinction")
-        return self._lightmaps(None, load_light(self.path))
+        return self._lightmaps(None, load_set(self.path).light)
 
     def lightmap(self) -> Scene:
         self._refuse("original", "key", "walk", "block", "extinction")
@@ -141,7 +143,7 @@ class _Request:
             from wlm.lightmap.data import from_arrays
 
             return self._lightmaps(
-                None, from_arrays(read_light(self.path)[0][None, ..., :3], [0.0], name=self.path.name)
+                None, from_arrays(read_light(self.path)[0][None, ..., :3], [0.0], name=self.path.name).light
             )
         from wlm.atlas.data import load as load_mesh
         from wlm.view.atlas_scene import input_scene
@@ -193,7 +195,7 @@ class _Request:
                 f"{self.original}: expected a lightmap of {expected[1]}x{expected[0]}, found {found[1]}x{found[0]}"
             )
 
-    def _lightmaps(self, model: LightmapModel | None, lightmaps: LightmapSet | None, which: str = "") -> Scene:
+    def _lightmaps(self, model: SheetModel | None, lightmaps: SheetFrames | None, which: str = "") -> Scene:
         from wlm.view.lightmap_scene import lightmap_scene
 
         geometry = None if self.mesh is None else read_geometry(self.mesh)

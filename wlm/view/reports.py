@@ -12,11 +12,11 @@ from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import Report as AtlasReport
 from wlm.atlas.model import AtlasModel
 from wlm.atlas.views import scene_views
-from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.decode import Decoder as LightmapDecoder
+from wlm.lightmap.data import LightmapSet, SheetFrames
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import Report as LightmapReport
-from wlm.lightmap.model import TILE, LightmapModel
-from wlm.lightmap.tiles import TileGrid
+from wlm.lightmap.evaluation import SheetReport
+from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.metrics.error import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import Report as ProbeReport
@@ -24,9 +24,8 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.transform import Transform
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
-from wlm.smoke.model import SmokeModel
+from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.planes import EMISSION_PLANE, PLANES, decode_lightmaps
-from wlm.smoke.network.unet import parameter_count
 from wlm.smoke.shading import Light
 from wlm.view.atlas import draw, original
 from wlm.view.display import Display, white_of
@@ -54,10 +53,11 @@ def lightmap_report(
     Raises:
         WlmError: The file can't be written.
     """
-    kinds = ", ".join(f"{count} {kind}" for kind, count in report.kinds.items() if count)
+    light = report.light
+    kinds = ", ".join(f"{count} {kind}" for kind, count in light.kinds.items() if count)
     rows = [
         ("PSNR", _number(report.psnr, ".2f", "dB")),
-        ("worst tile and hour", _number(report.worst_psnr, ".2f", "dB")),
+        ("worst tile and hour", _number(light.worst_psnr, ".2f", "dB")),
         ("SSIM", _number(report.ssim, ".4f")),
         ("FLIP", _number(report.flip, ".4f")),
         ("file", f"{report.bytes:,} bytes"),
@@ -65,21 +65,21 @@ def lightmap_report(
         ("tiles", kinds),
     ]
     page = _begin(model.name, report.profile, report.warnings, rows)
-    by_time = {"texels": report.psnr_by_time}
-    if np.isfinite(report.seen_by_time).any():
-        page.table("As it is seen", ("", "", "worst"), _seen_rows(report))
-        by_time["seen"] = report.seen_by_time
-    page.lines("PSNR by hour, mean of the tiles", "dB", report.time_values, by_time)
-    if np.isfinite(report.flip_by_time).any():
-        page.lines("FLIP by hour, mean of the tiles", "FLIP", report.time_values, {"FLIP": report.flip_by_time})
-    if np.isfinite(report.psnr_by_tile).any():
-        page.grid("PSNR by tile, mean of the hours", "dB", report.psnr_by_tile)
-        _worst_tiles(page, model, lightmaps, report)
+    by_time = {"texels": light.psnr_by_time}
+    if np.isfinite(light.seen_by_time).any():
+        page.table("As it is seen", ("", "", "worst"), _seen_rows(light))
+        by_time["seen"] = light.seen_by_time
+    page.lines("PSNR by hour, mean of the tiles", "dB", report.times, by_time)
+    if np.isfinite(light.flip_by_time).any():
+        page.lines("FLIP by hour, mean of the tiles", "FLIP", report.times, {"FLIP": light.flip_by_time})
+    if np.isfinite(light.psnr_by_tile).any():
+        page.grid("PSNR by tile, mean of the hours", "dB", light.psnr_by_tile)
+        _worst_tiles(page, model.light, lightmaps.light, light, report.device)
     page.table("Bytes of the file", ("part", "bytes"), [(name, f"{size:,}") for name, size in report.parts.items()])
     return page.write(path)
 
 
-def _seen_rows(report: LightmapReport) -> list[tuple[str, str, str]]:
+def _seen_rows(report: SheetReport) -> list[tuple[str, str, str]]:
     def place(worst: dict[str, float | int] | None) -> str:
         if worst is None:
             return ""
@@ -98,14 +98,13 @@ def _seen_rows(report: LightmapReport) -> list[tuple[str, str, str]]:
     return [row for row in rows if not row[1].startswith("–")]
 
 
-def _worst_tiles(page: Document, model: LightmapModel, lightmaps: LightmapSet, report: LightmapReport) -> None:
-    decoder, grid = LightmapDecoder(model, report.device), TileGrid.of(model.height, model.width)
+def _worst_tiles(page: Document, model: SheetModel, lightmaps: SheetFrames, report: SheetReport, device: str) -> None:
+    decoder = SheetDecoder(model, device)
     scores = report.psnr_by_tile.ravel()
     for number in np.argsort(np.where(np.isfinite(scores), scores, np.inf))[:_WORST_TILES].tolist():
         if not np.isfinite(scores[number]):
             continue
-        row, column = grid.origin(number)
-        window = slice(row, min(row + TILE, model.height)), slice(column, min(column + TILE, model.width))
+        window = model.grid.window(number)
         mask = lightmaps.mask[window]
         found = []
         for i, time in enumerate(model.times):

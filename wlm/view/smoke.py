@@ -1,7 +1,6 @@
 """Pictures of smoke: frames under a scene's lights with its obstacles, guiding maps, lightmaps, training samples."""
 
 import math
-import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,14 +12,12 @@ from wlm.ops.raster import rasterize
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import Guide
-from wlm.smoke.network.planes import GUIDES, PLANES
-from wlm.smoke.network.pool import Pool
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
 from wlm.smoke.transport.lighting import LitSmoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
-from wlm.view.pictures import MOST_COLUMNS, contact_sheet, spread, to_bytes
+from wlm.view.pictures import to_bytes
 from wlm_kernels.smoke import picture as kernels
 
 # Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
@@ -279,43 +276,6 @@ def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
     }
 
 
-def pool_sheet(path: str | os.PathLike[str], pool: Pool, *, columns: int = MOST_COLUMNS) -> tuple[int, ...]:
-    """Writes a contact sheet of training samples: guiding maps, lightmaps and motion of the later frames, as encoded.
-
-    Motion to the right is red, motion upwards green, the opposite directions dark; grey-yellow is no motion. The
-    fastest motion in the pool has the full colour.
-
-    Args:
-        path: The PNG to write; its folder must exist.
-        pool: At least one sample.
-        columns: Most samples shown, evenly spread.
-
-    Returns:
-        Indices of the samples shown.
-
-    Raises:
-        ValueError: The pool is empty.
-        WlmError: The file cannot be written.
-    """
-    if not len(pool):
-        raise ValueError("pool: expected at least one sample, got none")
-    chosen = spread(len(pool), columns)
-    planes = next(names for names in GUIDES.values() if len(names) == pool.guides.shape[2])
-    rows = {f"guide: {name}": [_grey(pool.guides[i, 1, k]) for i in chosen] for k, name in enumerate(planes)}
-    rows |= {name: [_grey(pool.targets[i, 1, k]) for i in chosen] for k, name in enumerate(PLANES)}
-    fastest = max(float(pool.motion.abs().max()), 1e-6)
-    rows["motion"] = [_motion_colour(pool.motion[i], fastest) for i in chosen]
-    titles = [f"{i} of {int(pool.sequence[i])}" for i in chosen]
-    contact_sheet(path, rows, titles, columns=len(chosen))
-    return tuple(chosen)
-
-
 def _grey(plane: torch.Tensor) -> np.ndarray:
     levels = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
     return np.repeat(levels[..., None], 3, axis=2)
-
-
-def _motion_colour(motion: torch.Tensor, fastest: float) -> np.ndarray:
-    right, down = (motion.float() / fastest).cpu().numpy()
-    colour = 0.5 + 0.5 * np.stack([right, -down, np.zeros_like(right)], -1)
-    return (np.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -4,8 +4,7 @@ A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoint
 weight in [0, 1] a texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
 endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
 
-`quantised` above 0 evaluates the map on exactly those levels, so that what is trained is what the file decodes to: 1 on
-all of them, a greater power of two on those alone whose endpoints are multiples of it, which are cheaper to store. The
+`quantised` evaluates the map on exactly those levels, so that training sees the texels that the file decodes to. The
 adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that
 Adam can bring them back. `wlm.ops.plain.bc7_texels` is the same in a few lines of torch.
 
@@ -46,23 +45,14 @@ def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
 
 
 @wp.func
-def level(v: float, step: int) -> float:
-    """The nearest of a byte's multiples of a power of two."""
-    s = float(step)
-    return wp.min(wp.floor(v / s + 0.5), 256.0 / s - 1.0) * s
-
-
-@wp.func
-def endpoint_byte(e: wp.vec4, step: int) -> wp.vec4:
-    """The stored bytes (as floats 0..255) of an endpoint: the better of the two shared lowest bits, or multiples."""
+def endpoint_byte(e: wp.vec4) -> wp.vec4:
+    """The stored bytes (as floats 0..255) of an endpoint, with the better of the two shared lowest bits."""
     v = wp.vec4(
         wp.clamp(e[0], 0.0, 1.0) * 255.0,
         wp.clamp(e[1], 0.0, 1.0) * 255.0,
         wp.clamp(e[2], 0.0, 1.0) * 255.0,
         wp.clamp(e[3], 0.0, 1.0) * 255.0,
     )
-    if step > 1:
-        return wp.vec4(level(v[0], step), level(v[1], step), level(v[2], step), level(v[3], step))
     even = endpoint_with_bit(v, 0.0)
     odd = endpoint_with_bit(v, 1.0)
     if wp.length_sq(odd - v) < wp.length_sq(even - v):
@@ -80,7 +70,7 @@ def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
             wp.clamp(e[2], 0.0, 1.0),
             wp.clamp(e[3], 0.0, 1.0),
         )
-    return endpoint_byte(e, quantised) / 255.0
+    return endpoint_byte(e) / 255.0
 
 
 @wp.func
@@ -194,7 +184,6 @@ def _quantise(
     # in:
     endpoints: wp.array4d[wp.vec4],
     weights: wp.array3d[float],
-    step: int,
     # out:
     bytes_out: wp.array4d[wp.vec4ub],
     index_out: wp.array3d[wp.uint8],
@@ -202,7 +191,7 @@ def _quantise(
     s, y, x = wp.tid()
     index_out[s, y, x] = wp.uint8(weight_index(weights[s, y, x]))
     if x % 4 == 0 and y % 4 < 2:  # two of a block's texels write one endpoint each
-        q = endpoint_byte(endpoints[s, y // 4, x // 4, y % 4], step)
+        q = endpoint_byte(endpoints[s, y // 4, x // 4, y % 4])
         bytes_out[s, y // 4, x // 4, y % 4] = wp.vec4ub(wp.uint8(q[0]), wp.uint8(q[1]), wp.uint8(q[2]), wp.uint8(q[3]))
 
 
@@ -233,20 +222,19 @@ def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weig
     wp.launch(_reconstruct_backward, endpoints.shape[:3], inputs=inputs, outputs=outputs, device=weights.device)
 
 
-def quantise(endpoints, weights, bytes_out, index_out, step: int = 1) -> None:
-    """The integers that the file stores: the levels on which `quantised=step` evaluates.
+def quantise(endpoints, weights, bytes_out, index_out) -> None:
+    """Writes the integers that the file stores: the levels on which `quantised` evaluates.
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2].
         weights: float [S, H, W].
         bytes_out: vec4ub [S, H/4, W/4, 2], each endpoint's bytes with their shared lowest bit.
         index_out: uint8 [S, H, W], 0 to 15.
-        step: What endpoints are multiples of, a power of two.
     """
     wp.launch(
         _quantise,
         weights.shape,
-        inputs=[endpoints, weights, step],
+        inputs=[endpoints, weights],
         outputs=[bytes_out, index_out],
         device=weights.device,
     )

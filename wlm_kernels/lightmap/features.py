@@ -13,7 +13,7 @@ Read first: `tests/reference/temporal.py`, `train_features`.
 import warp as wp
 
 from wlm_kernels.interpolate import axis_index, cell, fraction
-from wlm_kernels.lightmap.blocks import level, texel
+from wlm_kernels.lightmap.blocks import texel
 
 TEMPORAL_INPUTS = 16
 STATIC_INPUTS = 4
@@ -50,7 +50,7 @@ def ste_byte(v: float, quantised: int) -> float:
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
-    return level(c * 255.0, quantised) / 255.0
+    return wp.floor(c * 255.0 + 0.5) / 255.0
 
 
 @wp.func

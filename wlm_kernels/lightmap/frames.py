@@ -1,12 +1,14 @@
-"""Decoding tiles that are stored as frames: BC7 blocks of any mode, their levels between two bounds of a tile's colour.
+"""Decoding tiles that are stored as frames: BC7 blocks of any mode, their levels between two bounds of the tile's
+colour.
 
 Blocks are `[N T, 32, 32, 2]` of uint64, the T frames of a tile one after another: the low and the high half of 16
-little-endian bytes. The format's tables are arrays (`wlm.formats.bc7_modes` has them and says what they are).
+little-endian bytes. The tables of the format are arrays, which `wlm.formats.bc7_modes` defines and describes.
 """
 
 import warp as wp
 
-from wlm_kernels.lightmap.images import image_kernels
+from wlm_kernels.lightmap.decode import bytes_over
+from wlm_kernels.shared_exponent import pack_rgb9e5
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,7 +29,7 @@ class StoredFrames:
 
     blocks: wp.array4d[wp.uint64]  # [N T, 32, 32, 2]
     least: wp.array1d[wp.vec3]  # [N T], colour of level 0
-    span: wp.array1d[wp.vec3]  # [N T], that of level 1 less it
+    span: wp.array1d[wp.vec3]  # [N T], colour of level 1 minus colour of level 0
     tables: Tables
     times: int
     gamma: float
@@ -35,7 +37,7 @@ class StoredFrames:
 
 @wp.func
 def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
-    """Bits at .. at + count - 1 of a block; fewer than 31."""
+    """Bits `at` to `at + count - 1` of a block; fewer than 31."""
     word = low
     if at >= 64:
         word = wp.rshift(high, wp.uint64(at - 64))
@@ -64,7 +66,7 @@ def share_of(
 
 @wp.func
 def end_of(value: int, count: int, lowest: int) -> int:
-    """The byte of an endpoint's channel; `lowest` is its P bit, or -1."""
+    """The byte of a channel of an endpoint; `lowest` is its P bit, or -1 without one."""
     v = value
     n = count
     if lowest >= 0:
@@ -152,5 +154,90 @@ def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
     return stored.least[frame] + wp.cw_mul(level, stored.span[frame])
 
 
-FRAMES = image_kernels(StoredFrames, frame_colour)
-"""Decodes frames."""
+@wp.func
+def power(colour: wp.vec3, exponent: float) -> wp.vec3:
+    return wp.vec3(wp.pow(colour[0], exponent), wp.pow(colour[1], exponent), wp.pow(colour[2], exponent))
+
+
+@wp.func
+def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
+    """The linear radiance of a texel between two frames (eq. 2)."""
+    light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
+    if share > 0.0:
+        other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)
+        light = (1.0 - share) * light + share * other
+    return light
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _decode_radiance(
+    # in:
+    stored: StoredFrames,
+    early: int,
+    late: int,
+    share: float,
+    tiles: wp.array1d[int],
+    # out:
+    out: wp.array3d[wp.vec3],
+):
+    i, y, x = wp.tid()
+    out[i, y, x] = frame_radiance(stored, early, late, share, tiles[i], y, x)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _decode_bytes(
+    # in:
+    stored: StoredFrames,
+    early: int,
+    late: int,
+    share: float,
+    tiles: wp.array1d[int],
+    inverse_bounds: wp.array1d[float],
+    # out:
+    out: wp.array3d[wp.uint32],
+):
+    i, y, x = wp.tid()
+    n = tiles[i]
+    if share > 0.0:
+        colour = power(frame_radiance(stored, early, late, share, n, y, x), 1.0 / stored.gamma)
+    else:
+        colour = frame_colour(stored, n * stored.times + early, y, x)
+    out[i, y, x] = bytes_over(colour, inverse_bounds[n])
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _decode_shared(
+    # in:
+    stored: StoredFrames,
+    early: int,
+    late: int,
+    share: float,
+    tiles: wp.array1d[int],
+    # out:
+    out: wp.array3d[wp.uint32],
+):
+    i, y, x = wp.tid()
+    out[i, y, x] = pack_rgb9e5(frame_radiance(stored, early, late, share, tiles[i], y, x))
+
+
+KERNELS = (_decode_radiance, _decode_bytes, _decode_shared)
+"""All kernels: to radiance, to 8 bits and to RGB9E5."""
+
+
+def decode(stored: StoredFrames, early: int, late: int, share: float, tiles, out, inverse_bounds=None) -> None:
+    """Decodes tiles with one launch.
+
+    Args:
+        stored: The frames.
+        early, late, share: The two frames around the time, and the share of the second one in [0, 1).
+        tiles: int [n], the tiles to decode.
+        out: [n, 128, 128], written: linear radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` colour in
+            gamma space relative to the bound, uint32, RGBA from the lowest byte, alpha 255.
+        inverse_bounds: float [N], 1 / the bound of each tile; 0 for a black one.
+    """
+    inputs = [stored, early, late, share, tiles]
+    if inverse_bounds is not None:
+        kernel, inputs = _decode_bytes, [*inputs, inverse_bounds]
+    else:
+        kernel = _decode_shared if out.dtype == wp.uint32 else _decode_radiance
+    wp.launch(kernel, out.shape, inputs=inputs, outputs=[out], device=out.device)

@@ -1,9 +1,9 @@
-"""What follows a decode to 8 bits between two stored times: both are mixed in radiance.
+"""Mixing of two decodes at stored times to the light between them, in radiance.
 
-Tiles are uint32 [n, 128 * 128], RGBA from the lowest byte, each with a bound of its own: radiance is
+Tiles of 8 bits are uint32 [n, 128 * 128], RGBA from the lowest byte, each with its own bound: radiance is
 (byte / 255 * bound) ** gamma.
 
-Read first: `wlm.lightmap.decode.Decoder.tiles_8bit`, the same on the host.
+The same on the host: `wlm.lightmap.decode.SheetDecoder.tiles_8bit`.
 """
 
 import warp as wp
@@ -20,7 +20,7 @@ def byte_at(word: wp.uint32, c: int) -> float:
 
 @wp.func
 def with_byte(word: wp.uint32, c: int, share: float) -> wp.uint32:
-    """A word with channel c at a share of 255."""
+    """Sets channel c of a word to a share of 255."""
     return word | wp.lshift(wp.uint32(int(wp.clamp(share, 0.0, 1.0) * 255.0 + 0.5)), wp.uint32(8 * c))
 
 
@@ -38,16 +38,14 @@ def _blend(
     late: wp.array2d[wp.uint32],
     early_inverse: wp.array1d[float],
     late_inverse: wp.array1d[float],
-    places: wp.array1d[int],
     share: float,
     gamma: float,
     # out:
     out: wp.array2d[wp.uint32],
 ):
     i, j = wp.tid()
-    place = places[i]
-    a = bound_of(early_inverse[place])
-    b = bound_of(late_inverse[place])
+    a = bound_of(early_inverse[i])
+    b = bound_of(late_inverse[i])
     most = wp.max(a, b)
     word = wp.lshift(wp.uint32(255), wp.uint32(24))
     if most > 0.0:
@@ -71,18 +69,17 @@ def _blend_shared(
     out[i] = pack_rgb9e5((1.0 - share) * unpack_rgb9e5(early[i]) + share * unpack_rgb9e5(late[i]))
 
 
-def blend(early, late, early_inverse, late_inverse, places, share: float, gamma: float, out) -> None:
+def blend(early, late, early_inverse, late_inverse, share: float, gamma: float, out) -> None:
     """Mixes two decodes in radiance (neural-dynamic-gi, eq. 2).
 
     Args:
         early, late: uint32 [n, 128 * 128], the tiles at two stored times.
-        early_inverse, late_inverse: float [N_m], 1 / the bound of each mapped tile at those times; 0 for a black one.
-        places: int [n], the tiles' places among the mapped ones.
-        share: Of the later time, 0 to 1.
-        gamma: Of the colours.
+        early_inverse, late_inverse: float [n], 1 / the bound of each tile at those times; 0 for a black one.
+        share: Share of the later time, 0 to 1.
+        gamma: Gamma of the colours.
         out: uint32 [n, 128 * 128], written; its bound is the larger of the two.
     """
-    inputs = [early, late, early_inverse, late_inverse, places, share, gamma]
+    inputs = [early, late, early_inverse, late_inverse, share, gamma]
     wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
 
 
@@ -91,7 +88,7 @@ def blend_shared(early, late, share: float, out) -> None:
 
     Args:
         early, late: uint32 [n], texels at two stored times.
-        share: Of the later time, 0 to 1.
+        share: Share of the later time, 0 to 1.
         out: uint32 [n], written.
     """
     wp.launch(_blend_shared, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)

@@ -161,8 +161,8 @@ class PlaneKernels:
             its eight neighbours has smoke; elsewhere a NaN stays one. In: T [G, ceil(H / stem), ceil(W / stem), N] or
             larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
             first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; for
-            each plane the group and the first of its stem x stem outputs, int [PLANES, 2], or a group below 0 where
-            the plane is left out and is 0; stem; `near`. Out: float [PLANES, H, W].
+            each plane the group and the first of its stem x stem outputs, int [PLANES, 2]; stem; `near`. Out: float
+            [PLANES, H, W].
     """
 
     lanes: int
@@ -263,7 +263,7 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
                 r = row + y
                 if r < out.shape[1]:
                     value = float(0.0)
-                    if blocks > 0 and group >= 0:
+                    if blocks > 0:
                         place = places[k, 1] + (r % stem) * stem + column % stem
                         value = _at_least_zero(total[y, k] + float(heads[group, r // stem, column // stem, place]))
                         value = wp.where(k < wp.static(LIGHTS), value, _at_most_one(value))

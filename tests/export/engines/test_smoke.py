@@ -16,9 +16,9 @@ from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_fr
 from PIL import Image
 
 from wlm.export import ENGINES, export
-from wlm.export.bundles import bundle_of
 from wlm.export.engines import kit
 from wlm.inspection import inspect
+from wlm.smoke.bundle import bundle
 
 TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".py", ".import"}
 STEP = 1.6 / 255
@@ -26,7 +26,7 @@ STEP = 1.6 / 255
 
 
 def export_smoke(book, folder, engine, name="smoke"):
-    return export(dataclasses.replace(bundle_of(book, "cpu"), name=name), folder, engine)
+    return export(bundle(book, name=name), folder, engine)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_what_cannot_be_exported(frames, tmp_path, monkeypatch):
     book, out = random_book(frames), tmp_path / "deep" / "out"
     assert "engine: expected one of three" in error_of(export_smoke, book, out, "cry")
     bare = [dataclasses.replace(frame, transparency=None, emission=None) for frame in frames]
-    assert "the smoke has no opacity" in error_of(export_smoke, random_book(bare), out, "three")
+    assert "jet: has no opacity" in error_of(export_smoke, random_book(bare), out, "three", name="jet")
     o3de = dataclasses.replace(book, layout="o3de")
     assert "layout: expected unity for unreal" in error_of(export_smoke, o3de, out, "unreal")
     broken = dataclasses.replace(book, second=book.second * np.float32("nan"))

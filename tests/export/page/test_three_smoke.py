@@ -5,7 +5,7 @@ import pytest
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
 
 from wlm.export import export
-from wlm.export.bundles import bundle_of
+from wlm.smoke.bundle import bundle
 
 _PAGE = """<!doctype html>
 <script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
@@ -53,7 +53,7 @@ def opened(tmp_path, browser, serve):
     pages, errors = [], []
 
     def open_book(book):
-        export(bundle_of(book, "cpu"), tmp_path, "three")
+        export(bundle(book), tmp_path, "three")
         (tmp_path / "index.html").write_text(_PAGE)
         page = browser.new_page()
         pages.append(page)

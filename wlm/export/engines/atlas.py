@@ -25,9 +25,9 @@ from wlm.export.engines.kit import (
     write_texts,
 )
 from wlm.export.files import decode_texture, write_texture
+from wlm.export.shading import custom_node, translate
 from wlm.formats.dds import DXGI_FORMATS
 from wlm.formats.exr import write_exr
-from wlm.shading import custom_node, translate
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:

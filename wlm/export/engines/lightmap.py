@@ -20,8 +20,8 @@ from wlm.export.engines.kit import (
     write_texts,
 )
 from wlm.export.files import decode_texture, write_buffer, write_texture
+from wlm.export.shading import custom_node, translate
 from wlm.formats.exr import write_exr
-from wlm.shading import custom_node, translate
 
 _ROW = 1024  # RGBA texels in a row of a buffer that is stored as a picture
 # `wlm_hour` is the index of the stored hour in the picture of all hours.

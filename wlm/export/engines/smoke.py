@@ -20,7 +20,7 @@ from wlm.export.engines.kit import (
     write_texts,
 )
 from wlm.export.files import decode_texture
-from wlm.shading import custom_node, translate
+from wlm.export.shading import custom_node, translate
 
 _LAYOUT = "unity"
 _NO_MIPS = "The shader reads no mips of the textures; `--mips 3` of the export makes room for some around the frames."

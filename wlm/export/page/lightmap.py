@@ -9,17 +9,16 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.export.bundles import bundle_of
 from wlm.export.engines.kit import filled
 from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5
-from wlm.lightmap.data import LightmapSet
-from wlm.lightmap.decode import Decoder
+from wlm.lightmap.bundle import sheet_bundle
+from wlm.lightmap.data import SheetFrames, load
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
-from wlm.lightmap.front import load_light
-from wlm.lightmap.layers.sheet import Sheet
-from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.sheet import LIGHT, first_light
 from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, fill_gaps
 
@@ -38,22 +37,20 @@ def lightmap_page(
     hours: int = 6,
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
-    sheet: Sheet | None = None,
-    others: int = 0,
 ) -> Page:
-    """Makes the page of a lightmap model.
+    """Makes the page of the first sheet of light of a lightmap model.
 
     Args:
         model: The model.
-        file_bytes: Size of its file, or of its part of a layered one.
+        file_bytes: Size of its file.
         mesh, original, hours, up, progress: As for `wlm.export.page.pages.make_page`.
-        sheet: Which sheet of a layered file it is; None: of none.
-        others: How many sheets more that file has.
 
     Raises:
         WlmError: The mesh or the set can't be read, or the set is of another size.
     """
-    bundle = bundle_of(model, "cpu")
+    sheet, others = first_light(model.sheets), len(model.sheets) - 1
+    whole, model = model, model.sheets[sheet]
+    bundle = sheet_bundle(sheet, model, whole.name, whole.source)
     textures = {name: texture for name, texture in bundle.textures.items() if name != "valid"}
     described = {name: bundle.document[name] for name in _DESCRIBED}
     described["textures"] = {
@@ -66,7 +63,7 @@ def lightmap_page(
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None
     if original is not None:
-        reference, originals = _originals(model, load_light(original, sheet), original, hours, progress)
+        reference, originals = _originals(model, load(original).find(sheet), original, hours, progress)
         arrays |= originals
         # A page begins where its original is.
         time = min(reference["times"], key=lambda stored: abs(stored - time))
@@ -74,7 +71,7 @@ def lightmap_page(
         "width": model.width,
         "height": model.height,
         "shader": bundle.shader,
-        "exposure": exposure(Decoder(model).frame(time)),
+        "exposure": exposure(SheetDecoder(model).frame(time)),
         "time": time,
         "lightmap": described,
     }
@@ -93,15 +90,15 @@ def lightmap_page(
     if reference is not None:
         manifest["reference"] = reference
     note = "Lightmaps over the day, decoded on this GPU."
-    if sheet is not None:
+    if sheet != LIGHT or others:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
         note += f" Shown is {sheet.label}{rest}."
-    return Page("lightmap", model.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
+    return Page("lightmap", whole.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
 
 
 def _originals(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
+    model: SheetModel,
+    lightmaps: SheetFrames,
     path: str | os.PathLike[str],
     hours: int,
     progress: OnProgress | None,
@@ -118,7 +115,7 @@ def _originals(
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
     # Texels outside of it were never compressed: they have no error.
     arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
-    times, decoder, scores = lightmaps.times[chosen].tolist(), Decoder(model), []
+    times, decoder, scores = lightmaps.times[chosen].tolist(), SheetDecoder(model), []
     meter = Meter(progress, "score", len(times))
     for number, time in zip(chosen.tolist(), times, strict=True):
         scores.append(psnr_of(model, lightmaps, number, decoder.frame(time)))

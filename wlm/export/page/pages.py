@@ -82,15 +82,6 @@ def make_page(
         return lightmap_page(
             model, path.stat().st_size, mesh=mesh, original=original, hours=hours, up=up, progress=progress
         )
-    if model.SYSTEM == "lightmap-layers":
-        from wlm.export.page.lightmap import lightmap_page
-        from wlm.lightmap.layers.codec import sheet_bytes
-
-        _refuse(path, key=key)
-        sheet, own = model.shown()
-        size = sheet_bytes(model)[sheet]
-        options = {"mesh": mesh, "original": original, "hours": hours, "up": up, "progress": progress}
-        return lightmap_page(own, size, sheet=sheet, others=len(model.sheets) - 1, **options)
     if model.SYSTEM == "probe":
         from wlm.export.page.probe import probe_page
 

@@ -3,7 +3,6 @@
 import math
 
 from wlm.bundle import sampler
-from wlm.shading import LANGUAGES, translate
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.flipbook.book import Book
 from wlm.smoke.flipbook.motion import ZERO, mip_levels
@@ -112,7 +111,6 @@ _NEAREST = 1e-12  # squared distance to a light below which it counts the same
 
 
 def smoke_shader(
-    language: str,
     layout: str,
     *,
     rows: int,
@@ -128,7 +126,6 @@ def smoke_shader(
     """Writes the shader of a flip book.
 
     Args:
-        language: One of `wlm.shading.LANGUAGES`.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
         rows, columns, count: Of cells, and of frames in them.
         size: Height and width of a frame in pixels, without padding.
@@ -138,11 +135,10 @@ def smoke_shader(
         motion, depth: The scales of its textures of motion and of depth; None: it has none.
 
     Raises:
-        ValueError: No such language or layout.
+        ValueError: Unknown layout.
     """
-    if language not in LANGUAGES or layout not in LAYOUTS:
-        known = f"{', '.join(LANGUAGES)} and of {', '.join(LAYOUTS)}"
-        raise ValueError(f"expected one of {known}, got {language!r} and {layout!r}")
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
     places = {
         name: f"{texture}.{letter}"
         for texture, names in zip(("first", "second"), LAYOUTS[layout], strict=True)
@@ -171,7 +167,7 @@ def smoke_shader(
         text += _DEPTH.format(zero=_literal(ZERO), reach=_literal(2.0 * depth))
     if motion is not None:
         text += _MOTION.format(zero=_literal(ZERO), reach=_literal(2.0 * motion))
-    return translate(text, language)
+    return text
 
 
 def _literal(number: float) -> str:
@@ -241,27 +237,21 @@ _MOVE = """\
     vec2 late = wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0);"""
 
 
-def book_functions(book: Book, language: str = "glsl") -> str:
-    """Writes the functions of `smoke_shader` for a flip book, in one of `wlm.shading.LANGUAGES`."""
+def book_functions(book: Book) -> str:
+    """Writes the functions of `smoke_shader` for a flip book."""
     names = ("rows", "columns", "count", "size", "padding", "gain", "hot")
     values = {name: getattr(book, name) for name in names}
-    return smoke_shader(language, book.layout, **values, motion=book.scale, depth=book.reach)
+    return smoke_shader(book.layout, **values, motion=book.scale, depth=book.reach)
 
 
-def billboard_shader(book: Book, language: str = "glsl") -> str:
+def billboard_shader(book: Book) -> str:
     """Writes the shader of a flip book on a billboard.
 
     Its textures are `wlm_smoke_first_map`, `wlm_smoke_second_map` and, with motion, `wlm_smoke_motion_map`.
 
     Args:
         book: The flip book.
-        language: One of `wlm.shading.LANGUAGES`.
-
-    Raises:
-        ValueError: No such language.
     """
-    if language not in LANGUAGES:
-        raise ValueError(f"expected one of {', '.join(LANGUAGES)}, got {language!r}")
     textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
     text = _READ.format(
         last=book.count - 1,
@@ -269,7 +259,7 @@ def billboard_shader(book: Book, language: str = "glsl") -> str:
         share=f"{0.25 / math.pi:.9g}",
         glow=_glow(book.ramp) if book.hot else "    return vec3(0.0, 0.0, 0.0);",
     )
-    return translate(f"{book_functions(book)}\n{textures}{text}", language)
+    return f"{book_functions(book)}\n{textures}{text}"
 
 
 def _glow(ramp: Ramp | None) -> str:

@@ -1,4 +1,4 @@
-"""A trained network as ONNX, for engines."""
+"""Export of a trained network as ONNX."""
 
 import logging
 import os
@@ -17,28 +17,28 @@ from wlm.smoke.network.unet import SixWayNetwork
 _OPSET = 20
 
 
-def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
+def export_onnx(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
     """Writes a network as ONNX for one image size: `guide` [1, C, H, W] to `lightmaps` [1, 8, H, W], float32.
 
-    Both are encoded planes, as `wlm.smoke.network.planes` defines them; the lightmaps aren't clamped.
+    Both are encoded planes, as defined in `wlm.smoke.network.planes`; the lightmaps are not clamped.
 
     Args:
         model: The network.
-        path: The file, whole or not at all.
+        path: The file, which is written atomically.
         height, width: H and W.
 
     Returns:
         The size of the file, bytes.
 
     Raises:
-        ValueError: A size below 1.
-        WlmError: The extra `onnx` isn't installed, or the file can't be written.
+        ValueError: A size is below 1.
+        WlmError: The extra `onnx` is not installed, or the file cannot be written.
     """
     if height < 1 or width < 1:
         raise ValueError(f"expected at least one pixel, got {height} x {width}")
     for package in ("onnx", "onnxscript"):
         need(package, "onnx")
-    # A copy: the exporter changes what it traces.
+    # A copy: the exporter modifies the network that it traces.
     network = SixWayNetwork(model.settings)
     network.load_state_dict(model.network.state_dict())
     guide = torch.zeros(1, len(GUIDES[model.settings.guide]), height, width)
@@ -60,7 +60,7 @@ def export(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silences the exporter's notes on packages that these networks don't need."""
+    """Silences the exporter's messages about packages that these networks do not need."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

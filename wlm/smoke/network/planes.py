@@ -1,4 +1,4 @@
-"""Guiding maps and lightmaps as the network reads and learns them: planes in sRGB and of about the same range."""
+"""Encoding of guiding maps and lightmaps for the network: planes in sRGB, of about the same range."""
 
 import torch
 
@@ -7,53 +7,47 @@ from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import guide, march_planes
-from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import FOOT, FOOT_CODE
 from wlm_kernels.smoke.settings import March
 
 PLANES = (*DIRECTIONS, "opacity", "emission")
-"""The planes that the network learns, in order."""
+"""Planes that the network predicts, in order."""
 
 GUIDES = {
     "paper": ("light", "opacity", "depth"),
-    "front": ("light", "opacity", "depth"),
-    "sides": ("light", "opacity", "depth"),
     "six": (*DIRECTIONS, "emission", "opacity", "depth"),
 }
-"""Planes of each kind of guiding map, opacity and depth last. The light is that of the front, the top and the bottom
-together, as in the paper; of the front alone; or of the front, the right and the left. "six" is ours: the coarse march,
-with its lights kept apart."""
-
-_LIT = {"front": ("front",), "sides": ("front", "right", "left")}
+"""Planes of each kind of guiding map; opacity and depth are last. The paper's has the light from the front, the top and
+the bottom in one plane; "six" is ours: the coarse march, with a plane for each light."""
 
 OPACITY_PLANE, EMISSION_PLANE = PLANES.index("opacity"), PLANES.index("emission")
 
 VISIBLE = 0.05
-"""Opacity from which on a pixel counts as smoke."""
+"""Least opacity of a pixel that counts as smoke."""
 
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
-    """Linear light to sRGB's curve, continued above 1; values below 0 count as 0."""
-    # Kept off 0, where the power's slope is infinite and would turn a gradient into NaN.
+    """Encodes linear light by sRGB's curve, continued above 1; values below 0 count as 0."""
+    # Clamped away from 0, where the power's slope is infinite and would turn a gradient into NaN.
     curve = 1.055 * linear.clamp(min=FOOT) ** (1 / 2.4) - 0.055
     return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)
 
 
 def from_srgb(code: torch.Tensor) -> torch.Tensor:
-    """The inverse of `to_srgb`; values below 0 count as 0."""
+    """Inverse of `to_srgb`; values below 0 count as 0."""
     curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
     return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
 
 
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
-    """Distances from the camera at which the ball around the volume's box begins and ends.
+    """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
 
-    A camera that turns about the box's centre has one span for all its turns, so that a depth means the same in each.
-    In an orthographic camera distances are along its axis, in perspective from the eye.
+    A camera that turns about the box's centre has the same span in all positions, so that depths are comparable. For an
+    orthographic camera distances are along its axis, in perspective from the eye.
 
     Returns:
-        Near and far in the world's unit, near < far; near is below 0 where the camera is within the ball.
+        Near and far in the world's unit, near < far; near is below 0 where the camera is within the sphere.
     """
     away = torch.as_tensor(camera.position, dtype=torch.float64) - torch.as_tensor(volume.centre)
     if camera.perspective:
@@ -65,7 +59,7 @@ def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
 
 
 def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
-    """A guiding map as the network reads it: all three planes are 0 where there is no smoke.
+    """Encodes a guiding map for the network; all three planes are 0 where there is no smoke.
 
     Args:
         maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
@@ -75,7 +69,7 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
         [..., 3, H, W]: light in sRGB; opacity; depth as a share of the span, 1 at its near end, 0 without a surface.
 
     Raises:
-        ValueError: Another number of planes, or a span of no length.
+        ValueError: The number of planes is wrong, or the span has no length.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected [..., 3, H, W], got {tuple(maps.shape)}")
@@ -91,19 +85,19 @@ def _check_span(near: float, far: float) -> None:
 
 
 def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
-    """Marches through smoke and encodes a guiding map of a kind.
+    """Renders and encodes a guiding map.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
         kind: One of `GUIDES`.
-        march: As for `guide` where the kind is "paper", else as for `wlm.smoke.march.coarse.bake_coarse`.
+        march: Settings, as for `guide` if the kind is "paper", else as for `bake_coarse`.
 
     Returns:
-        float32 [C, H, W], the planes of `GUIDES`, all 0 where there is no smoke, but for an emission without any.
+        float32 [C, H, W], the planes of `GUIDES`, 0 where there is no smoke, except emission of fire without smoke.
 
     Raises:
-        ValueError: No such kind, or a camera in perspective.
+        ValueError: The kind is unknown, or the camera is in perspective.
     """
     near, far = span(volume, camera)
     if kind == "paper":
@@ -111,26 +105,22 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
     if kind not in GUIDES:
         raise ValueError(f"kind: expected one of {', '.join(GUIDES)}, got {kind!r}")
     planes = march_planes(volume, camera, march)
-    if kind == "six":
-        _check_span(near, far)
-        with stream(device_name(volume.device)):
-            encoded = torch.empty_like(planes)
-            smoke_planes.encode_six(to_warp(planes), near, far, volume.temperature is not None, to_warp(encoded))
-        return encoded
-    of = dict(zip(march_coarse.PLANES, planes, strict=True))
-    light = sum(of[name] for name in _LIT[kind])
-    return encode_guide(torch.stack([light, of["transparency"], of["depth"]]), near, far)
+    _check_span(near, far)
+    with stream(device_name(volume.device)):
+        encoded = torch.empty_like(planes)
+        smoke_planes.encode_six(to_warp(planes), near, far, volume.temperature is not None, to_warp(encoded))
+    return encoded
 
 
 def encode_lightmaps(six: SixWay) -> torch.Tensor:
-    """Lightmaps as the network learns them.
+    """Encodes lightmaps for the network.
 
     Returns:
         [8, H, W] in the order of `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
         where the smoke is cold.
 
     Raises:
-        ValueError: The transparency isn't known.
+        ValueError: The transparency is unknown.
     """
     if six.transparency is None:
         raise ValueError("six: expected lightmaps with transparency")
@@ -140,15 +130,15 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """The inverse of `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
+    """Inverse of `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
 
     Args:
         planes: [8, H, W].
-        hot: Whether there is emission; False leaves that plane out.
-        camera: The view of the lightmaps, if it is known.
+        hot: Whether the smoke emits light; False leaves that plane out.
+        camera: The view of the lightmaps; None: unknown.
 
     Raises:
-        ValueError: Another number of planes.
+        ValueError: The number of planes is wrong.
     """
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
         raise ValueError(f"planes: expected [{len(PLANES)}, H, W], got {tuple(planes.shape)}")

@@ -66,8 +66,7 @@ class SmokePredictor:
             seed: Of the guiding map's jitter.
 
         Returns:
-            The lightmaps on the network's device, with emission if the smoke has a temperature and the network makes
-            it.
+            The lightmaps on the network's device, with emission if the smoke has a temperature.
 
         Raises:
             ValueError: The camera is in perspective.
@@ -87,7 +86,7 @@ class SmokePredictor:
         if decoder.guide == "six":
             with stream(self.device):
                 planes = self._gated(_as_planes(guide), planes, smoke, camera, march)
-        return decode_lightmaps(planes, hot=decoder.emission and smoke.temperature is not None, camera=camera)
+        return decode_lightmaps(planes, hot=smoke.temperature is not None, camera=camera)
 
     def _gated(
         self, guide: torch.Tensor, planes: torch.Tensor, smoke: DensityVolume, camera: Camera, march: March
@@ -142,7 +141,7 @@ def predict(
         seed: Of the guiding map's jitter.
 
     Returns:
-        The lightmaps, with emission if the smoke has a temperature and the network makes it.
+        The lightmaps, with emission if the smoke has a temperature.
 
     Raises:
         ValueError: The camera is in perspective.

@@ -1,4 +1,4 @@
-"""Settings of the network's training: samples, losses, optimiser; and the units in which scenes are drawn."""
+"""Settings of the network and of its training: shape, samples, optimiser; and the units in which scenes are drawn."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,12 +12,13 @@ from wlm.system import Settings
 from wlm_kernels.smoke.settings import March
 
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
-"""The box's edge in metres; the fastest air in metres a second, and the same speed in cells per air step."""
+"""Edge of the box in metres; speed of the fastest air in metres per second, and the same speed in cells per air
+step."""
 
 PERIOD = 2
-"""Solver steps that one CUDA graph holds: after two, the solver's buffers have swapped back."""
+"""Solver steps in one CUDA graph: after two steps the solver's buffers have swapped back."""
 
-GuideKind = Literal["paper", "front", "sides", "six"]
+GuideKind = Literal["paper", "six"]
 """Keys of `planes.GUIDES`."""
 
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -26,18 +27,15 @@ _Range = tuple[_Positive, _Positive]
 
 
 class NetworkSettings(BaseModel):
-    """The network's shape.
+    """Shape of the network.
 
     Attributes:
-        width: Channels of the first level; each level has twice those of the one before, at half the resolution.
+        width: Channels of the first level. Each further level has twice the channels at half the resolution.
         levels: Levels of the U-Net, the lowest included.
-        adapters: Whether each of the four groups of planes has a NAFBlock; otherwise all share one.
-        emission: Whether emission is predicted; otherwise it is 0.
+        adapters: Whether each of the four groups of planes has its own NAFBlock; otherwise all planes share one.
         guide: Kind of the guiding map.
-        depth: Whether the guide's depth, its last plane, is read.
         stem: Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the
             network at half the resolution, for a quarter of the work.
-        residual: Whether the filtered guide is added to the output.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -45,33 +43,30 @@ class NetworkSettings(BaseModel):
     width: int = Field(16, ge=8, le=64, multiple_of=8)
     levels: int = Field(5, ge=2, le=6)
     adapters: bool = True
-    emission: bool = True
     guide: GuideKind = "paper"
-    depth: bool = True
     stem: Literal[1, 2] = 1
-    residual: bool = True
 
     @property
     def channels(self) -> int:
-        """Planes of the guide that are read."""
-        return len(GUIDES[self.guide]) - (not self.depth)
+        """Number of planes of the guide."""
+        return len(GUIDES[self.guide])
 
     @property
     def multiple(self) -> int:
-        """Pixels: images are padded with zeros to multiples of this."""
+        """Images are padded with zeros to multiples of this number of pixels."""
         return self.stem * 2 ** (self.levels - 1)
 
 
 class DatasetSettings(BaseModel):
-    """How samples are made. Lengths are shares of the box's edge; times are multiples of the time to cross it.
+    """Settings of the samples. Lengths are shares of the box's edge; times are multiples of the time to cross it.
 
     Attributes:
         cells: Velocity cells along each edge of the box.
-        least_cells: Fewest cells of a training sequence, whose number is drawn log-uniformly between this and
-            `cells`: coarse grids give smooth smoke, of which a guiding map's steps miss less. None, and in
-            validation: always `cells`.
+        least_cells: Fewest cells of a training sequence. The number is drawn log-uniformly between this and `cells`:
+            coarse grids give smooth smoke, in which the steps of a guiding map miss less. None: always `cells`, as in
+            validation.
         refine: Density voxels along the edge of a cell.
-        substeps: Air steps per smoke step; even, as CUDA graphs need it.
+        substeps: Air steps per smoke step; even, for CUDA graphs.
         resolution: Pixels along an image's edges.
         frames: Frame pairs taken from a sequence.
         views, arc: Number of fixed views, spread evenly over `arc` degrees; the paper has 9 over 90.
@@ -80,23 +75,23 @@ class DatasetSettings(BaseModel):
         zoom: Smallest and largest edge of a random view's image.
         guide: Kind of guiding map.
         guide_step: Ray step h of the guiding map; the paper's is 10 of 400 voxels.
-        guide_spacing: Distance of the nodes that hold the light from the sides, for guides with separate lights; None:
+        guide_spacing: Distance between the nodes of the lattice of light from the sides, for guide `six`; None:
             `guide_step`.
         jitter: Share of a step by which a pixel's samples are shifted.
-        surface: Optical depth across the box, at one voxel's density, from which smoke counts as a surface.
+        surface: Smoke whose density would have this optical depth across the whole box counts as a surface.
         reference_step: Step of the march that renders the target lightmaps, in voxels.
         extinction: Optical depth of density 1 across the box.
         density_scales: Smallest and largest random factor on the extinction.
-        sequences: Sequences of a round.
+        sequences: Number of sequences per round.
         hot: Share of sequences with emission.
-        moving: Share of sequences with obstacles in which one moves; such a solver waits for the device at each step.
+        moving: Share of the sequences with obstacles in which one obstacle moves; these wait for the device each step.
         warmup: Mean time before a sequence's first pair.
         interval: Time between the two frames of a pair, rounded to whole steps.
         apart: Time between two pairs.
-        least_coverage: Share of the image below which a frame counts as almost empty.
+        least_coverage: Share of the image that must show smoke; frames below it count as almost empty.
         kept_empty: Share of almost empty frames that are kept.
-        validation_sequences, validation_seed: The validation set, by which the best network is selected.
-        test_seed: Seed of an equally large test set, which is held out from model selection.
+        validation_sequences, validation_seed: Size and seed of the validation set, which selects the best network.
+        test_seed: Seed of a test set of the same size, which takes no part in model selection.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -163,11 +158,11 @@ class DatasetSettings(BaseModel):
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 
     def look(self, shape: Sequence[int], seed: int = 0) -> March:
-        """The march of a guiding map through a grid.
+        """Returns the march of a guiding map through a grid.
 
         Args:
             shape: Voxels along x, y, z.
-            seed: Of the jitter.
+            seed: Seed of the jitter.
         """
         longest = max(shape)
         spacing = None if self.guide_spacing is None else self.guide_spacing * longest
@@ -175,57 +170,22 @@ class DatasetSettings(BaseModel):
         return March(self.guide_step * longest, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
 
 
-class LossSettings(BaseModel):
-    """Weights of eq. 10, of which the paper gives none. A part of weight 0 isn't computed; one must be above 0.
-
-    Attributes:
-        mse: Weight of the reconstruction.
-        srgb: Whether the reconstruction compares light in sRGB, as eq. 7 does; otherwise linear light, in which errors
-            in dark places count for less.
-        temporal: Weight of the temporal part, for which a batch is half as many pairs of frames.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    mse: float = Field(1.0, ge=0.0)
-    srgb: bool = True
-    temporal: float = Field(0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _check(self) -> "LossSettings":
-        if not self.parts:
-            raise PydanticCustomError("weights", "expected mse or temporal above 0, found 0 for both")
-        return self
-
-    @property
-    def pairs(self) -> bool:
-        """Whether a step needs both frames of a sample."""
-        return self.temporal > 0
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the parts that are computed."""
-        return tuple(name for name in ("mse", "temporal") if getattr(self, name) > 0)
-
-
 class TrainSettings(BaseModel):
-    """The optimisation.
+    """Settings of the optimisation.
 
     Attributes:
-        rounds: Number of pools, one after the other.
+        rounds: Number of pools of samples, one after the other.
         steps: Steps per round.
         batch: Frames per step; with a temporal loss, twice the number of pairs.
         rate: Adam's highest learning rate; the paper's is 1e-3.
         floor: Share of `rate` at the end of half a cosine.
         warmup: Steps over which the rate rises from 0.
         average: Decay of the running mean of the weights, which is what is validated and saved.
-        mirror: Random mirrors of samples: left to right ("sides"), and upside down too ("both"). Both are exact: the
-            planes of opposite lights are exchanged.
         half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
-        graph: Whether CUDA replays a step from a graph.
-        crop: Edge in pixels of the random crop, which contains smoke, that a step learns from; None: whole images.
+        crop: Edge in pixels of the random crop, which contains smoke, that a step trains on; None: whole images.
         validate_every: Rounds between validations; the last round is always validated.
-        losses: Weights of the loss's parts.
+        temporal: Weight of the temporal loss relative to the reconstruction (eq. 10, for which the paper gives no
+            numbers); above 0 a batch is half as many pairs of frames.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -237,30 +197,35 @@ class TrainSettings(BaseModel):
     floor: float = Field(0.01, ge=0.0, le=1.0)
     warmup: int = Field(100, ge=0)
     average: float = Field(0.999, ge=0.0, lt=1.0)
-    mirror: Literal["none", "sides", "both"] = "sides"
     half: bool = True
-    graph: bool = True
     crop: int | None = Field(None, ge=16, multiple_of=16)
     validate_every: int = Field(1, ge=1)
-    losses: LossSettings = LossSettings()
+    temporal: float = Field(0.0, ge=0.0)
 
     @property
     def total(self) -> int:
         """Steps of all rounds."""
         return self.rounds * self.steps
 
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Names of the losses that are computed."""
+        return ("mse", "temporal") if self.temporal > 0 else ("mse",)
+
     def rate_at(self, step: int) -> float:
-        """The learning rate of a step, from 0."""
+        """The learning rate of a step; steps count from 0."""
         rise = min(1.0, (step + 1) / (self.warmup + 1))
         return rise * self.rate * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * step / self.total)))
 
 
 class Profile(Settings):
-    """What `configs/smoke-network-*.yaml` hold.
+    """A profile, a file `configs/smoke-network-*.yaml`.
 
     Attributes:
         name: Shown in reports.
-        network, training, dataset: Settings of the parts.
+        network: Shape of the network.
+        training: Settings of the optimisation.
+        dataset: Settings of the samples.
     """
 
     FILES: ClassVar[str] = "smoke-network"
@@ -282,16 +247,16 @@ class Profile(Settings):
         return self
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """As `Settings.override`, inside the parts too: `{"training": {"steps": 500}}` leaves their other settings.
+        """As `Settings.override`, also within the parts: `{"training": {"steps": 500}}` keeps its other settings.
 
         Raises:
-            WlmError: Unknown or out of range.
+            WlmError: A setting is unknown or out of range.
         """
         return super().override(_merged(self.model_dump(), values), prefix) if values else self
 
 
 def _merged(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with some values replaced, in nested mappings too."""
+    """Returns settings with some values replaced, also in nested mappings."""
 
     def value_of(name: str) -> Any:
         old, new = settings.get(name), values[name]

@@ -1,4 +1,4 @@
-"""The steps of a training, and the order in which they take their samples (neural-six-way-lightmaps, section 4.4)."""
+"""Training steps, and the order in which they use the samples (neural-six-way-lightmaps, section 4.4)."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ import torch.nn.functional as F
 
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import StepGraph
-from wlm.smoke.network.losses import Losses
+from wlm.smoke.network.losses import losses
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import NetworkSettings, TrainSettings
 from wlm.smoke.network.unet import SixWayNetwork
 
-_BLOCK = 16  # edge in pixels of the blocks in which crops look for smoke
-
-# Planes that a mirror exchanges: left to right, then upside down.
-_MIRRORED = ({"right": "left", "left": "right"}, {"top": "bottom", "bottom": "top"})
+_BLOCK = 16  # edge in pixels of the blocks that crops search for smoke
+_MIRRORED = {"right": "left", "left": "right"}  # planes that a mirror exchanges
 
 
 class Trainer:
@@ -29,16 +27,11 @@ class Trainer:
     Attributes:
         network: The network in training, on the device.
         average: The running mean of its weights, which is validated and saved.
-        losses: The loss.
-        step: Steps done, skipped ones included.
+        step: Number of steps done, skipped steps included.
     """
 
     def __init__(self, network: NetworkSettings, settings: TrainSettings, *, seed: int, device: str) -> None:
-        """Starts at step 0; one seed gives the same initial weights on all devices.
-
-        Raises:
-            WlmError: A part of the loss needs a package that isn't installed.
-        """
+        """Starts at step 0; a seed gives the same initial weights on all devices."""
         self.settings, self.device, self.step = settings, device, 0
         self._cuda = device != "cpu"
         with torch.random.fork_rng(devices=[]):
@@ -47,7 +40,6 @@ class Trainer:
         layout = torch.channels_last if self._cuda else torch.contiguous_format
         self.network = untrained.to(device, memory_format=layout)
         self.average = copy.deepcopy(self.network).requires_grad_(False).eval()
-        self.losses = Losses(settings.losses, emission=network.emission).to(device)
         self._weights = list(self.network.parameters())
         self._means = list(self.average.parameters())
         rate = torch.zeros((), device=device)
@@ -56,22 +48,22 @@ class Trainer:
         # Fused Adam skips its update where this is 1.
         self._adam.found_inf = torch.zeros((), device=device)
         self._blend = torch.zeros((), device=device)
-        self._sums = torch.zeros(1 + len(settings.losses.parts), device=device)
+        self._sums = torch.zeros(1 + len(settings.losses), device=device)
         self._skipped = torch.zeros((), device=device)
-        # On the device, where indexing by them doesn't wait for the host.
-        self._swaps = _mirrored(PLANES, device)
-        self._guide_swaps = _mirrored(GUIDES[network.guide], device)
-        self._signs = [torch.tensor(sign, device=device)[:, None, None] for sign in ((-1.0, 1.0), (1.0, -1.0))]
+        # On the device: indexing by them then does not wait for the host.
+        self._swap = _mirrored(PLANES, device)
+        self._guide_swap = _mirrored(GUIDES[network.guide], device)
+        self._sign = torch.tensor((-1.0, 1.0), device=device)[:, None, None]
         self._batch: tuple[torch.Tensor, ...] | None = None
-        self._run = StepGraph(self._work, device) if self._cuda and settings.graph else self._work
+        self._run = StepGraph(self._work, device)
 
     @property
     def skipped(self) -> int:
-        """Steps without an update, since their gradient wasn't finite; waits for the device."""
+        """Number of steps without an update because their gradient was not finite; waits for the device."""
         return int(self._skipped)
 
     def take_losses(self) -> list[float]:
-        """Sums of the loss and its parts over the steps since the last `clear_losses`; waits for the device."""
+        """Returns sums of the loss and its parts since the last `clear_losses`; waits for the device."""
         return self._sums.tolist()
 
     def clear_losses(self) -> None:
@@ -83,9 +75,9 @@ class Trainer:
 
         Args:
             pool: The samples, on any device.
-            plan: Rows of `plan_round`, one per step.
+            plan: Rows of the result of `plan_round`, one per step.
         """
-        # Deterministic kernels, so that one seed gives one result.
+        # Deterministic kernels, so that a seed gives one result.
         flags = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": self.settings.half}
         with torch.backends.cudnn.flags(**flags):
             for i in range(len(plan.samples)):
@@ -95,17 +87,17 @@ class Trainer:
                 for buffer, part in zip(self._batch, batch, strict=True):
                     buffer.copy_(part)
                 self._rate.fill_(self.settings.rate_at(self.step))
-                # The mean is over few steps at first, so that it forgets the initial weights.
+                # At first the mean is over few steps, so that it forgets the initial weights.
                 decay = min(self.settings.average, (1 + self.step) / (10 + self.step))
                 self._blend.fill_(1 - decay)
                 self._run()
                 self.step += 1
 
     def _gather(self, pool: Pool, plan: Plan, i: int) -> tuple[torch.Tensor, ...]:
-        """A step's batch: guides [N, K, C, H, W], targets [N, K, 8, H, W] and motion [N, 2, H, W], float32."""
+        """Returns a step's batch: guides [N, K, C, H, W], targets [N, K, 8, H, W], motion [N, 2, H, W], all float32."""
         samples, flips = plan.samples[i], plan.flips[i].to(self.device)
         frames = [slice(None)] * len(samples)
-        if not self.settings.losses.pairs:
+        if not self.settings.temporal:
             frames = [slice(frame, frame + 1) for frame in plan.frames[i].tolist()]
         windows = [(slice(None), slice(None))] * len(samples)
         if plan.corners is not None:
@@ -116,24 +108,20 @@ class Trainer:
             for n, k, (y, x) in zip(samples.tolist(), frames, windows, strict=True)
         ]
         guides, targets, motion = (torch.stack(part).to(self.device).float() for part in zip(*parts, strict=True))
-        # A mirror from left to right flips the last axis and negates the motion's x; upside down, the axis before it
-        # and y.
-        mirrors = zip(flips.unbind(1), (-1, -2), self._swaps, self._guide_swaps, self._signs, strict=True)
-        for flip, axis, swap, guide_swap, sign in mirrors:
-            flip = flip[:, None, None, None]
-            guides = torch.where(flip[..., None], guides[:, :, guide_swap].flip(axis), guides)
-            targets = torch.where(flip[..., None], targets[:, :, swap].flip(axis), targets)
-            motion = torch.where(flip, sign * motion.flip(axis), motion)
-        return guides, targets, motion
+        # A mirror exchanges the planes of opposite lights and negates the motion's x, which is exact.
+        flip = flips[:, None, None, None]
+        guides = torch.where(flip[..., None], guides[:, :, self._guide_swap].flip(-1), guides)
+        targets = torch.where(flip[..., None], targets[:, :, self._swap].flip(-1), targets)
+        return guides, targets, torch.where(flip, self._sign * motion.flip(-1), motion)
 
     def _work(self) -> None:
-        """One step on the batch in `_batch`, without waiting for the device."""
+        """Does one step on the batch in `_batch`, without waiting for the device."""
         guides, targets, motion = self._batch
         for weight in self._weights:
             weight.grad = None
         with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=self._cuda and self.settings.half):
             planes = self.network(guides.flatten(0, 1))
-            parts = self.losses(planes.unflatten(0, guides.shape[:2]), targets, motion)
+            parts = losses(planes.unflatten(0, guides.shape[:2]), targets, motion, self.settings.temporal)
         parts["loss"].backward()
         with torch.no_grad():
             norms = torch.stack(torch._foreach_norm([weight.grad for weight in self._weights]))
@@ -144,22 +132,22 @@ class Trainer:
             change = torch._foreach_sub(self._weights, self._means)
             torch._foreach_mul_(change, self._blend)
             torch._foreach_add_(self._means, change)
-            losses = torch.stack([part.detach() for part in parts.values()])
-            self._sums.add_(torch.where(finite, losses, torch.zeros_like(losses)))
+            values = torch.stack([part.detach() for part in parts.values()])
+            self._sums.add_(torch.where(finite, values, torch.zeros_like(values)))
             self._skipped.add_(~finite)
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that the next step depends on."""
+        """Returns everything that the next step depends on."""
         tensors = {"step": torch.tensor(self.step), "sums": self._sums, "skipped": self._skipped}
         for kind, network in (("network", self.network), ("average", self.average)):
             tensors |= {f"{kind}.{name}": value for name, value in network.state_dict().items()}
         for name, weight in self.network.named_parameters():
             tensors |= {f"adam.{key}.{name}": value for key, value in self._adam.state[weight].items()}
-        # Copied: on the CPU a tensor's array is the tensor's own memory.
+        # Copied: on the CPU a tensor's array shares the tensor's memory.
         return {name: np.array(value.detach().cpu().numpy(), order="C") for name, value in tensors.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """The parts of a `state` after so many steps."""
+        """Returns the table of the parts of a `state` after a number of steps."""
         table = {
             "step": Part(np.int64, (), least=step, most=step),
             "sums": Part(np.float32, tuple(self._sums.shape)),
@@ -181,7 +169,7 @@ class Trainer:
         """Restores a `state`.
 
         Raises:
-            ValueError: A part is missing, of another shape or out of its range; the trainer is as it was.
+            ValueError: A part is missing, has a wrong shape or is out of its range; the trainer is unchanged.
         """
         done = check_part(state, "step", Part(np.int64, (), least=0, most=self.settings.total))
         state = check_parts(state, self.table(int(done)))
@@ -200,9 +188,9 @@ class Trainer:
             self._adam.state[weight] = moments
 
 
-def _mirrored(planes: tuple[str, ...], device: str) -> list[torch.Tensor]:
-    """For each of the two mirrors, the index of the plane that takes each plane's place."""
-    return [torch.tensor([planes.index(swap.get(n, n)) for n in planes], device=device) for swap in _MIRRORED]
+def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
+    """Returns the index of the plane that replaces each plane in a mirrored image."""
+    return torch.tensor([planes.index(_MIRRORED.get(name, name)) for name in planes], device=device)
 
 
 @dataclass(frozen=True)
@@ -211,8 +199,8 @@ class Plan:
 
     Attributes:
         samples: int [steps, B], indices of a pool.
-        frames: int [steps, B], which of a sample's two frames, for steps that take single frames.
-        flips: bool [steps, B, 2], whether a sample is mirrored left to right, and upside down.
+        frames: int [steps, B], the frame of a sample, 0 or 1, for steps on single frames.
+        flips: bool [steps, B], whether a sample is mirrored left to right.
         corners: int [steps, B, 2], row and column of the crop's corner; None: no crops.
     """
 
@@ -222,30 +210,29 @@ class Plan:
     corners: torch.Tensor | None
 
     def part(self, begin: int, end: int) -> Plan:
-        """Some of the steps."""
+        """Returns the plan of some of the steps."""
         corners = None if self.corners is None else self.corners[begin:end]
         return Plan(self.samples[begin:end], self.frames[begin:end], self.flips[begin:end], corners)
 
 
 def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) -> Plan:
-    """Draws the samples of a round's steps: in random order, each once before any is repeated.
+    """Draws the samples of a round's steps in random order; each is used once before any is repeated.
 
     Args:
-        settings: The training's.
+        settings: Settings of the training.
         pool: The samples.
-        seed, round: Determine the order.
+        seed, round: Seed of the order.
 
     Raises:
         ValueError: The samples are smaller than the crops.
     """
-    count, size = len(pool), settings.batch // 2 if settings.losses.pairs else settings.batch
+    count, size = len(pool), settings.batch // 2 if settings.temporal else settings.batch
     random = np.random.default_rng([seed, round])
     total = settings.steps * size
     order = np.concatenate([random.permutation(count) for _ in range(-(-total // count))])[:total]
     order = order.reshape(settings.steps, size)
     frames = random.integers(0, 2, (settings.steps, size))
-    flips = random.random((settings.steps, size, 2)) < 0.5
-    flips &= np.array([settings.mirror != "none", settings.mirror == "both"])
+    flips = random.random((settings.steps, size, 2))[..., 0] < 0.5
     corners = None
     if settings.crop is not None:
         image = np.array(pool.targets.shape[-2:])
@@ -257,12 +244,12 @@ def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) ->
 
 
 def _corners(pool: Pool, samples: np.ndarray, draws: np.ndarray, image: np.ndarray, crop: int) -> np.ndarray:
-    """Corners int [..., 2] of crops that contain smoke: each contains a block with smoke, drawn uniformly.
+    """Returns corners int [..., 2] of crops that contain a block with smoke, drawn uniformly.
 
     Args:
         pool: All samples.
         samples: int [...], indices of the pool.
-        draws: [..., 3], uniform in [0, 1): which block, and where in the crop it lies.
+        draws: [..., 3], uniform in [0, 1): the block, and its place in the crop.
         image: Rows and columns of a sample.
         crop: Edge of a crop, pixels.
     """
@@ -270,7 +257,7 @@ def _corners(pool: Pool, samples: np.ndarray, draws: np.ndarray, image: np.ndarr
     for targets in pool.targets:
         opacity = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()
         smoke = F.max_pool2d(opacity[None], _BLOCK, ceil_mode=True)[0, 0] > VISIBLE
-        # Without smoke, any block will do.
+        # Without smoke any block is used.
         blocks.append((smoke if smoke.any() else ~smoke).nonzero().cpu().numpy())
     first = np.cumsum([0, *map(len, blocks)])
     begin, end = first[samples], first[samples + 1]

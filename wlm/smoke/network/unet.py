@@ -5,12 +5,12 @@ into planes: each is a NAFBlock (Chen et al. 2022), either one for each two oppo
 only nonlinearity is the product of the two halves of its channels; its channel attention multiplies by a linear map of
 the channels' means over the whole image.
 
-Two facts are built in rather than learned:
+Two properties are built in rather than learned:
 
-- Opacity and light differ little from the guide's but for the noise of its jitter. So the output is a learned filter of
-  the guide's planes, initialised by a least squares fit, plus the U-Net's output, initialised to 0.
+- Opacity and light differ little from the guide's, except for the noise of its jitter. The output is therefore a
+  learned filter of the guide's planes, initialised by a least squares fit, plus the U-Net's output, initialised to 0.
 - Far from smoke all planes are 0. Outputs are multiplied by a mask, which is 1 within 8 to 16 pixels of smoke in the
-  guide: its large steps can miss a wisp in one pixel and hit it in the next.
+  guide: the guide's large steps can miss a wisp in one pixel and hit it in the next.
 """
 
 import torch
@@ -24,15 +24,15 @@ ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity",
 """The planes of each adapter."""
 
 REACH = 8
-"""Pixels around smoke in the guide within which lightmaps may differ from 0, at least."""
+"""Smallest distance in pixels from smoke in the guide within which lightmaps may differ from 0."""
 
 EPSILON = 1e-6
 """Added to the variance in a channel norm."""
 
 _FILTER = 5  # edge of the guide's filter, pixels
 
-# Initial weights on the guide's light, opacity and depth of planes that the guide lacks: least squares over plumes of
-# optical depths 1 to 30 and the paper's guide, rounded, and alike for opposite sides.
+# Initial weights of the guide's light, opacity and depth for planes that the guide lacks: least squares over plumes of
+# optical depths 1 to 30 with the paper's guide, rounded, and equal for opposite sides.
 _START = {
     "right": (0.45, 0.0, 0.1),
     "left": (0.45, 0.0, 0.1),
@@ -47,7 +47,7 @@ _START = {
 class ChannelNorm(nn.Module):
     """Layer norm over the channels of each pixel, [N, C, H, W].
 
-    torch's own needs the channels contiguous in memory, and gives a GPU a block of threads per pixel, for 16 numbers.
+    torch's own norm needs the channels contiguous in memory, and uses a block of GPU threads per pixel for 16 numbers.
     """
 
     def __init__(self, channels: int) -> None:
@@ -68,7 +68,7 @@ def _normalised(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class _Norm(torch.autograd.Function):
-    """With a hand-written backward pass: autograd's goes through the variance and keeps twice as much."""
+    """The norm with a hand-written backward pass; autograd's differentiates the variance and stores twice as much."""
 
     @staticmethod
     def forward(ctx, x, weight, bias):
@@ -88,9 +88,9 @@ class _Norm(torch.autograd.Function):
 
 
 class NafBlock(nn.Module):
-    """Adds two corrections to its input, one that mixes neighbours and one that mixes channels; both start at 0.
+    """Adds two corrections to its input, one that mixes neighbouring pixels and one that mixes channels.
 
-    It has 7 c^2 + 33 c parameters for c channels.
+    Both start at 0. The block has 7 c^2 + 33 c parameters for c channels.
     """
 
     def __init__(self, channels: int) -> None:
@@ -110,7 +110,7 @@ class NafBlock(nn.Module):
         y = self.depthwise(self.expand(self.norm1(x)))
         left, right = y.chunk(2, 1)
         y = left * right
-        # In float32: summed over a whole image, half floats would overflow.
+        # In float32: half floats would overflow in the sum over a whole image.
         mean = y.mean((2, 3), dtype=torch.float32)
         y = y * self.attend(mean.to(self.attend.weight.dtype))[:, :, None, None].to(y.dtype)
         x = x + self.beta * self.project(y)
@@ -119,13 +119,13 @@ class NafBlock(nn.Module):
 
 
 def support(opacity: torch.Tensor) -> torch.Tensor:
-    """The mask of where smoke may be: within `REACH` to twice `REACH` pixels of smoke in the guide.
+    """Returns the mask of where smoke may be: within `REACH` to twice `REACH` pixels of smoke in the guide.
 
     Args:
         opacity: [N, 1, H, W] of the guide.
 
     Returns:
-        [N, 1, H, W], 0 or 1, of the opacity's type.
+        [N, 1, H, W], 0 or 1, in the opacity's type.
     """
     height, width = opacity.shape[-2:]
     coarse = F.max_pool2d(opacity, REACH, ceil_mode=True)
@@ -134,13 +134,13 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 
 
 class SixWayNetwork(nn.Module):
-    """Encoded guiding maps to encoded lightmaps, at any resolution.
+    """Maps encoded guiding maps to encoded lightmaps, at any resolution.
 
-    Outputs aren't clamped, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
+    Outputs are not clamped, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
 
     Attributes:
         groups: The planes of each adapter.
-        names: All of these, in order.
+        names: The planes of all adapters, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -150,31 +150,27 @@ class SixWayNetwork(nn.Module):
         first, area = widths[0], settings.stem**2
         inputs = [settings.channels * area, *widths[:-1]]
         self.encoder = nn.ModuleList(_twice(before, c) for before, c in zip(inputs, widths, strict=True))
-        # After repeating pixels; transposed 2 x 2 convolutions would have four times the weights.
+        # They follow a repetition of pixels; transposed 2 x 2 convolutions would have four times the weights.
         self.up = nn.ModuleList(nn.Conv2d(2 * c, c, 1) for c in widths[:-1])
         self.decoder = nn.ModuleList(_twice(2 * c, c) for c in widths[:-1])
-        groups = [tuple(name for name in group if settings.emission or name != "emission") for group in ADAPTERS]
-        self.groups = groups if settings.adapters else [sum(groups, ())]
+        self.groups = list(ADAPTERS) if settings.adapters else [sum(ADAPTERS, ())]
         self.names = [name for group in self.groups for name in group]
         self.adapters = nn.ModuleList(NafBlock(first) for _ in self.groups)
         self.heads = nn.ModuleList(nn.Conv2d(first, len(group) * area, 3, padding=1) for group in self.groups)
-        if settings.residual:
-            # A plane that the guide has starts as that, another one as a mix.
-            guide = GUIDES[settings.guide]
-            mixes = [[float(p == name) for p in guide] if name in guide else _START[name] for name in self.names]
-            self.filter = nn.Conv2d(settings.channels, len(mixes), _FILTER, padding=_FILTER // 2, bias=False)
-            with torch.no_grad():
-                self.filter.weight.zero_()
-                self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = torch.tensor(mixes)[:, : settings.channels]
-            for head in self.heads:
-                nn.init.zeros_(head.weight)
-                nn.init.zeros_(head.bias)
+        # A plane that the guide has starts as the guide's, another plane as a mix of the guide's.
+        guide = GUIDES[settings.guide]
+        mixes = [[float(p == name) for p in guide] if name in guide else _START[name] for name in self.names]
+        self.filter = nn.Conv2d(settings.channels, len(mixes), _FILTER, padding=_FILTER // 2, bias=False)
+        with torch.no_grad():
+            self.filter.weight.zero_()
+            self.filter.weight[:, :, _FILTER // 2, _FILTER // 2] = torch.tensor(mixes)
+        for head in self.heads:
+            nn.init.zeros_(head.weight)
+            nn.init.zeros_(head.bias)
 
     def features(self, guide: torch.Tensor) -> torch.Tensor:
-        """The U-Net's output, [N, C, H / stem, W / stem], of a guide whose sides are multiples of `multiple`."""
-        x = guide[:, : self.settings.channels]
-        if self.settings.stem > 1:
-            x = F.pixel_unshuffle(x, self.settings.stem)
+        """Returns the U-Net's output, [N, C, H / stem, W / stem], of a guide with sides that `multiple` divides."""
+        x = F.pixel_unshuffle(guide, self.settings.stem) if self.settings.stem > 1 else guide
         x = x.contiguous(memory_format=torch.channels_last)
         skips = []
         for level, convolutions in enumerate(self.encoder):
@@ -189,10 +185,10 @@ class SixWayNetwork(nn.Module):
         """Predicts the planes.
 
         Args:
-            guide: [N, C, H, W], encoded, of the settings' kind.
+            guide: [N, C, H, W], encoded, of the kind in the settings.
 
         Returns:
-            [N, 8, H, W] in the order of `PLANES`, of the guide's type.
+            [N, 8, H, W] in the order of `PLANES`, in the guide's type.
         """
         height, width = guide.shape[-2:]
         multiple = self.settings.multiple
@@ -201,21 +197,13 @@ class SixWayNetwork(nn.Module):
         planes = torch.cat([head(adapter(x)) for adapter, head in zip(self.adapters, self.heads, strict=True)], 1)
         if self.settings.stem > 1:
             planes = F.pixel_shuffle(planes, self.settings.stem)
-        if self.settings.residual:
-            planes = planes + self.filter(padded[:, : self.settings.channels])
+        planes = planes + self.filter(padded)
         planes = (planes[:, :, :height, :width] * support(guide[:, -2:-1])).to(guide.dtype)
-        predicted = dict(zip(self.names, planes.unbind(1), strict=True))
-        zero = torch.zeros_like(planes[:, 0])  # for planes that aren't predicted
-        return torch.stack([predicted.get(name, zero) for name in PLANES], 1)
-
-
-def parameter_count(network: nn.Module) -> int:
-    """Number of trained parameters."""
-    return sum(parameter.numel() for parameter in network.parameters())
+        return torch.stack([planes[:, self.names.index(name)] for name in PLANES], 1)
 
 
 def _twice(before: int, after: int) -> nn.Sequential:
-    """Two convolutions with ReLU that keep the scale of activations."""
+    """Makes two convolutions with ReLU that keep the scale of activations."""
     layers = []
     for inputs in (before, after):
         convolution = nn.Conv2d(inputs, after, 3, padding=1)

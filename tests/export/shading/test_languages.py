@@ -1,0 +1,370 @@
+"""Every shader that we export, in every language that runs here, beside what Python decodes."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from builders.atlas_meshes import charts
+from builders.atlas_models import KINDS, MIXED, WIDE
+from builders.atlas_models import random_model as random_atlas
+from builders.metal import run_metal
+from builders.probe_models import random_model as random_probes
+from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
+from builders.shader_subjects import POINTS, Subject, points_of
+from builders.smoke_shader_subjects import smoke_subjects
+from builders.synthetic import random_model as random_lightmap
+from wlm.lightmap.exporter import export as export_lightmap
+
+from wlm import probe
+from wlm.atlas.colour import quantise
+from wlm.atlas.exact import decode64
+from wlm.atlas.decode import Decoder as SceneDecoder
+from wlm.atlas.scene.exporter import factor_texels, sheet_texels
+from wlm.atlas.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
+from wlm.atlas.scene.shader import scene_glsl
+from wlm.atlas.shader import atlas_glsl
+from wlm.errors import WlmError
+from wlm.export.shading import LANGUAGES, translate
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.lightmap.decode import Decoder as LightmapDecoder
+from wlm.probe.light import StoredLight
+from wlm.probe.shader import probe_glsl
+from wlm.probe.volume import Volume
+from wlm.probe.volume_export import export_volume
+from wlm.probe.volume_shader import volume_glsl
+
+
+def lightmap(kinds, folder, **settings) -> Subject:
+    model = random_lightmap(kinds, **settings)
+    export_lightmap(model, folder)
+    uniforms, hour = lightmap_uniforms(folder)
+    expected = LightmapDecoder(model).frame(float(model.times[2]))
+    main = "vec4 shown(ivec2 pixel) { return vec4(wlm_radiance(wlm_source(pixel)), 1.0); }\n"
+    text, step = (folder / "decode.glsl").read_text(), expected.max() / 255
+    return Subject(text, main, expected, uniforms | hour(2), "WLM_LIGHTMAP_EXACT", 0.01 * step, step)
+
+
+def atlas(kind, _) -> Subject:
+    model = random_atlas(charts(), kind)
+    uv = np.random.default_rng(0).uniform(-0.1, 1.1, (1000, 2)).astype(np.float32)
+    uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
+    if model.method == "tiles":
+        # A point on a border of tiles may be read from either.
+        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    bound = {"u_points": points_of(uv), "wlm_atlas_colour": rgba(model.texels)}
+    if model.method != "plain":
+        tiles = model.method == "tiles"
+        bound["wlm_atlas_lut"] = model.lut.astype(np.uint16) if tiles else (model.lut / 65535).astype(np.float32)
+    if kind == MIXED:
+        bound["wlm_atlas_blocks"] = rgba(model.block_texels)
+    main = POINTS + "vec4 shown(ivec2 pixel) { return vec4(wlm_atlas(texelFetch(u_points, pixel, 0).xy), 1.0); }\n"
+    # Neighbouring texels differ by up to 3, and a 512th of a step is lost along each axis. Where a table is filtered
+    # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
+    filtered = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
+    return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
+
+
+def mips(kind, _) -> Subject:
+    """The light of the model where a pixel is small, of the tail where it is large, in between of both.
+
+    The tail has a margin, and rises along u where the lightmap is.
+    """
+    near = atlas(kind, None)
+    model = replace(random_atlas(charts(), kind), tail=np.zeros((1, 16), np.uint8))
+    texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
+    near.bound["u_change"] = points_of(np.stack([texels / model.width, 0 * texels], 1))
+    rows, columns = -(-model.height // 16) * 4 + 4, -(-model.width // 16) * 4 + 4
+    tail = np.zeros((rows, columns, 4), np.float16)
+    tail[:] = (np.arange(columns) / columns)[None, :, None]
+    near.bound["wlm_atlas_tail"] = tail
+    points = near.bound["u_points"][0, :, :2]
+    place = points[:, 0].astype(np.float64) * model.width / 4 - 0.5
+    far = (np.clip(place, 0, columns - 1) / columns)[:, None]
+    place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
+    if len(model.uv):
+        place = f"vec2(texelFetch(u_points, pixel, 0).xy), {place}"
+    main = f"vec4 shown(ivec2 pixel) {{ return vec4(wlm_atlas_grad({place}), 1.0); }}\n"
+    share = np.clip(np.log2(np.maximum(texels, 1.0)) - 1.0, 0.0, 1.0)[:, None]
+    expected = (1.0 - share) * near.expected + share * far
+    return replace(near, text=atlas_glsl(model), main=f"{POINTS}uniform sampler2D u_change;\n{main}", expected=expected)
+
+
+def rgba(texels: np.ndarray) -> np.ndarray:
+    return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
+
+
+def random_scene(short: bool, mixed: bool, apart: bool) -> SceneModel:
+    """Two sheets, the first with two smaller levels.
+
+    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks;
+    apart: each state has tiles of its own, which lie elsewhere in the table.
+    """
+    random = np.random.default_rng(1)
+    texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
+    size = random.integers(1, 8, (13, 11, 2))
+    count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
+    first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
+    second, blocks = {}, False
+    if mixed:
+        pages = [quantise(random.random((16, 24, 3)), "bc6h") for _ in range(2)]
+        second = {"blocks": np.stack([page["blocks"] for page in pages])}
+        second |= {"block_texels": np.stack([page["texels"] for page in pages])}
+        blocks = random.random((13, 11)) < 0.5
+        whole = random.integers(1, 3, (13, 11, 2))
+        size = np.where(blocks[..., None], 4 * whole, size)
+        most = np.array([6, 4]) - whole * np.stack([np.maximum(count, 1), np.ones_like(count)], 2)
+        first = np.where(blocks[..., None], 4 * random.integers(0, most + 1), first)
+    coarse = np.where(blocks, random.integers(0, count + 1), 0)
+    page = random.integers(0, 2, (13, 11))
+    lut = pack_tiles(first, size, random.integers(0, 5, (13, 11)), count, page, blocks, coarse)
+    sheets = (SheetPlace("a", 29, 36, 0, 0, 5, 6, 2), SheetPlace("b", 22, 29, 5, 4, 4, 5))
+    levels = (SheetPlace("a", 8, 9, 9, 0, 2, 2, 3), SheetPlace("a", 4, 4, 11, 0, 1, 1))
+    factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
+    if short:
+        factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
+    parts = (sheets, factor, texels, lut, levels)
+    if apart:
+        rows = enumerate((*sheets, *levels) * 2)
+        second["later"] = tuple(
+            replace(row, row=(row.row + n) % 8, column=(row.column + n) % 5, smaller=row.smaller and row.smaller + at)
+            for n, row in rows
+            for at in [4 + 4 * (n // 4)]
+        )
+    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), *parts, **second)
+
+
+def scene(short, mixed, apart, _) -> Subject:
+    model, random = random_scene(short, mixed, apart), np.random.default_rng(2)
+    decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
+    uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
+    texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
+    lod = torch.from_numpy(np.log2(np.maximum(texels, 1.0)).astype(np.float32))
+    points = torch.from_numpy(uv), torch.from_numpy(number)
+    expected = decoder.read(*points, 1.25, lod).numpy()
+    main = f"""{POINTS}vec4 shown(ivec2 pixel)
+{{
+    vec4 at = texelFetch(u_points, pixel, 0);
+    if (at.w == 0.0)
+        return vec4(wlm_scene(at.xy, int(at.z), 1.25), 1.0);
+    return vec4(wlm_scene_grad(at.xy, vec2(0.0, at.w), vec2(0.0, 0.0), int(at.z), 1.25), 1.0);
+}}
+"""
+    heights = np.array([each.height for each in model.sheets])[number]
+    bound = {
+        "u_points": points_of(np.column_stack([uv, number, texels / heights])),
+        "wlm_scene_sheets": sheet_texels(model),
+        "wlm_scene_lut": model.lut,
+        "wlm_scene_factors": factor_texels(model),
+        # Of one layer wgpu would make no array.
+        "wlm_scene_colour": np.stack([rgba(unpack_rgb9e5(layer)) for layer in (*model.texels, model.texels[0])]),
+    }
+    if mixed:
+        bound["wlm_scene_blocks"] = np.stack([rgba(page) for page in model.block_texels])
+    return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
+
+
+def volume(folder) -> Subject:
+    random = np.random.default_rng(0)
+    position = random.uniform(-1, 1, (400, 3)) * [9.0, 1.0, 9.0] + [4000.0, -30.0, 0.0]
+    made = Volume(position, StoredLight(random.normal(size=(400, 27))), side=8, budget=40)
+    for _ in range(6):
+        made.update([4000.3, -29.0, 0.2])
+    export_volume(made, folder)
+    reference, document = (json.loads((folder / f"{name}.json").read_text()) for name in ("reference", "volume"))
+    points = np.array(reference["position"])
+    normals = random.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ahead = made.read(points, normals)
+    head, pages, pool = (np.fromfile(folder / f"{name}.bin", kind) for name, kind in KINDS_OF_BUFFERS)
+    expected = np.column_stack([ahead.weight, ahead.values[:, [0, 5, 26]] * ahead.weight[:, None]])
+    main = (
+        POINTS
+        + """uniform sampler2D u_normals;
+vec4 shown(ivec2 pixel)
+{
+    float values[27];
+    float weight = wlm_volume_read(texelFetch(u_points, pixel, 0).xyz, texelFetch(u_normals, pixel, 0).xyz, values);
+    return vec4(weight, weight * values[0], weight * values[5], weight * values[26]);
+}
+"""
+    )
+    bound = {"u_points": points_of(points - document["viewpoint"]), "u_normals": points_of(normals)}
+    bound |= {"wlm_volume_head": head, "wlm_volume_page": pages, "wlm_volume_pool": pool}
+    return Subject(volume_glsl(27), main, expected[None], bound, "", 3e-5, as_textures=VOLUME)
+
+
+KINDS_OF_BUFFERS = (("volume", "<u4"), ("pages", "<i4"), ("pool", "<f4"))
+VOLUME = "".join(
+    f"uniform {kind} u_{name};\n#define WLM_VOLUME_{name.upper()}(i) {before}texelFetch(u_{name}, ivec2((i) & 1023, "
+    f"(i) >> 10), 0).r{after}\n"
+    for name, kind, before, after in (
+        ("head", "usampler2D", "", ""),
+        ("page", "usampler2D", "int(", ")"),
+        ("pool", "sampler2D", "", ""),
+    )
+)
+
+
+SH = (
+    POINTS
+    + """vec4 shown(ivec2 pixel)
+{
+    vec3 sh[9];
+    wlm_probe_sh(texelFetch(u_points, pixel, 0).xyz, sh);
+    return vec4(sh[0].x, sh[4].y, sh[8].z, 1.0);
+}
+"""
+)
+
+
+def probes(folder) -> Subject:
+    model = random_probes(seed=3)
+    probe.export(model, folder)
+    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    expected = model.decoder().decode(position)[:, [0, 13, 26]]
+    bound = {"u_points": points_of(position)}
+    bound |= {f"wlm_probe_{name}": np.fromfile(folder / f"{name}.bin", "<u4") for name in ("gaussians", "network")}
+    scale = float(np.abs(expected).max())
+    return Subject(probe_glsl(model), SH, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
+
+
+def transformed_probes(folder) -> Subject:
+    random = np.random.default_rng(5)
+    place = random.uniform(0.0, 4.0, (90, 3))
+    light = 1.0 + np.sin(place @ random.normal(size=(3, 27)))
+    model = probe.compress(probe.from_arrays(place, light), target_psnr=60, positions=True)
+    probe.export(model, folder)
+    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    expected = model.decoder().decode(position)[:, [0, 13, 26]]
+    bound = {"u_points": points_of(position), "wlm_probe_light": np.fromfile(folder / "light.bin", "<u4")}
+    # Half floats.
+    tolerance = 2e-3 * float(np.abs(expected).max())
+    text = (folder / "probe.glsl").read_text()
+    return Subject(text, SH, expected[None], bound, "", tolerance, as_textures=PROBES, version=430)
+
+
+PROBES = "".join(
+    f"uniform usampler2D u_{name};\n#define WLM_PROBE_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, "
+    f"(i) >> 10), 0).r\n"
+    for name in ("gaussians", "network", "light")
+)
+
+LONG = "probes of a transform"
+SUBJECTS: dict[str, Callable[..., Subject]] = {
+    "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
+    "lightmap of video": lambda folder: lightmap((5, 3, 6, 0), folder, gelu="exact", period=None, hidden=10),
+    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED, WIDE)},
+    "atlas mips": partial(mips, MIXED),
+    "atlas cascade mips": partial(mips, "cascade"),
+    "scene": partial(scene, False, False, False),
+    "scene of one component": partial(scene, True, False, False),
+    "scene mixed": partial(scene, False, True, False),
+    "scene apart": partial(scene, True, False, True),
+    **smoke_subjects(),
+    "volume": volume,
+    "probes": probes,
+    LONG: transformed_probes,
+}
+
+
+def as_texture(values: np.ndarray) -> np.ndarray:
+    """A buffer in rows of 1,024."""
+    return np.pad(values, (0, -len(values) % 1024)).reshape(-1, 1024, 1)
+
+
+def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
+    defined = [subject.exact] if exact and subject.exact else []
+    size, text = subject.expected.shape[:2], subject.text + subject.main
+    if language.startswith("glsl"):
+        bound, uniforms = {}, {}
+        for name, values in subject.bound.items():
+            if values.ndim == 1:
+                kind = values if values.dtype == np.float32 else values.view(np.uint32)
+                bound["u_" + name.split("_")[-1]] = as_texture(kind)
+            elif values.ndim == 2:
+                uniforms[name] = [tuple(row[:3].tolist()) for row in values]
+            else:
+                bound[name] = values
+        head = "".join(f"#define {name}\n" for name in defined) + subject.as_textures
+        return run_glsl(head + text, "light = shown(pixel);", size, bound, language, uniforms, subject.version)
+    text = translate(text, language, defined)
+    if language == "msl":
+        return run_metal(text, "shown(pixel)", size, subject.bound, folder)
+    if language == "wgsl":
+        return run_wgsl(text, "shown(pixel)", size, subject.bound)
+    return run_hlsl(text, "shown(pixel)", size, subject.bound, folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "language"),
+    [
+        # Its GLSL is run by the tests of its export, too.
+        pytest.param(name, language, marks=[pytest.mark.slow] * (name == LONG and language in HEADS))
+        for name in SUBJECTS
+        for language in (*HEADS, "hlsl", "wgsl")
+    ],
+)
+def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
+    subject = SUBJECTS[name](tmp_path)
+    channels = subject.expected.shape[-1]
+    found = shown(subject, language, True, tmp_path)[..., :channels]
+    np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
+    # WebGPU filters no 32-bit floats, and its core has no 16-bit levels: a table of coordinates is fetched there.
+    if subject.filtered is not None and (not name.startswith("atlas cascade") or language.startswith("glsl")):
+        found = shown(subject, language, False, tmp_path)[..., :channels]
+        np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "lightmap",
+        "atlas cascade",
+        "atlas tiles mixed",
+        "atlas mips",
+        "scene",
+        "smoke unity",
+        "smoke billboard",
+        "volume",
+        "probes",
+        "probes of a transform",
+    ],
+)
+def test_metal_as_the_cpp_that_it_is(name, tmp_path):
+    subject = SUBJECTS[name](tmp_path)
+    channels = subject.expected.shape[-1]
+    found = shown(subject, "msl", False, tmp_path)[..., :channels]
+    # Filters mix in floats here.
+    np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
+
+
+def test_heads_tell_what_other_languages_hold(tmp_path):
+    """Macros are decided there, and nothing is of GLSL."""
+    for name in ("lightmap", "atlas mips", "scene", "probes", "volume"):
+        text = SUBJECTS[name](tmp_path / name).text
+        for defined in ((), ("WLM_ATLAS_EXACT", "WLM_LIGHTMAP_EXACT")):
+            written = translate(text, "hlsl", defined)
+            assert not re.search(r"//.*(_EXACT|before this file|GLSL|#version|WLM_\w+\(\w\))", written), name
+            exact = "our texels are fetched and mixed in floats." in written
+            assert exact == (bool(defined) and name in ("lightmap", "atlas mips"))
+
+
+def test_what_is_no_shader_of_ours():
+    with pytest.raises(WlmError, match="shader: expected one of glsl, .* got 'cg'"):
+        translate("", "cg")
+    for text, words in (
+        ("#pragma once\n", "expected ifdef"),
+        ("mat4 f() { return x; }", "expected"),
+        ("float f() { return 1.0 $ 2.0; }", "expected a word"),
+        ("float f() { return ; ", "expected"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            translate(text, "wgsl")
+    assert set(LANGUAGES) == {*HEADS, "hlsl", "msl", "wgsl"}

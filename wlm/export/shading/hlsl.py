@@ -1,0 +1,80 @@
+"""HLSL of shader model 5 and later."""
+
+from wlm.export.shading.tree import VECTORS, Node, Variable
+from wlm.export.shading.writer import Writer
+
+_TEXTURES = {
+    "sampler2D": "Texture2D<float4>",
+    "usampler2D": "Texture2D<uint4>",
+    "sampler2DArray": "Texture2DArray<float4>",
+}
+_HALVES = """\
+float2 wlm_halves(uint word)
+{
+    return float2(f16tof32(word & 65535u), f16tof32(word >> 16));
+}
+"""
+_SIZE = """\
+int2 wlm_size_of_{name}()
+{{
+    uint width, height;
+    {name}.GetDimensions(width, height);
+    return int2(width, height);
+}}
+"""
+
+
+class HlslWriter(Writer):
+    """Writes HLSL functions to be included. One sampler reads all textures; Unity creates it from its name."""
+
+    names = {
+        **{name: f"{kind}{n}" for name, (kind, n) in VECTORS.items()},
+        "mix": "lerp",
+        "uintBitsToFloat": "asfloat",
+        "unpackHalf2x16": "wlm_halves",
+    }
+
+    def head(self) -> list[str]:
+        return [f"SamplerState {self.linear};"] if self.filters else []
+
+    def outer(self, variable: Variable) -> list[str]:
+        if variable.type in _TEXTURES:
+            return [f"{_TEXTURES[variable.type]} {variable.name};"]
+        if variable.way == "buffer":
+            return [f"StructuredBuffer<{self.kind(variable.type)}> {variable.name};"]
+        if variable.way == "uniform":
+            # A float3 in an array of a constant buffer takes the space of a float4.
+            return [f"cbuffer {variable.name}_values", "{", f"    {self.local(variable)};", "};"]
+        return [f"static const {self.local(variable)};"]
+
+    def parameter(self, variable: Variable) -> str:
+        way = "" if variable.way == "in" else f"{variable.way} "
+        return way + self.local(variable)
+
+    def make(self, name: str, values: list[str]) -> str:
+        # HLSL has no vector constructor with one argument; a cast does the same.
+        if len(values) == 1 and name in VECTORS:
+            return f"(({self.kind(name)})({values[0]}))"
+        return super().make(name, values)
+
+    def fetch(self, texture: Variable, place: Node) -> str:
+        whole = "int4" if texture.type == "sampler2DArray" else "int3"
+        return f"{texture.name}.Load({whole}({self.write(place)}, 0))"
+
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
+        return f"{texture.name}.SampleLevel({self.linear}, {self.write(place)}, {level})"
+
+    def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
+        return f"{texture.name}.SampleGrad({self.linear}, {place}, {dx}, {dy})"
+
+    def size(self, texture: Variable) -> str:
+        self._measured.setdefault(texture.name, texture)
+        return f"wlm_size_of_{texture.name}()"
+
+    def text(self) -> str:
+        self._measured: dict[str, Variable] = {}
+        text = super().text()
+        for texture in self._measured.values():
+            declared = f"{_TEXTURES[texture.type]} {texture.name};\n"
+            text = text.replace(declared, declared + _SIZE.format(name=texture.name), 1)
+        return f"{_HALVES}\n{text}" if "wlm_halves(" in text else text

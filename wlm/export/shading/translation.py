@@ -1,0 +1,58 @@
+"""Translates exported shaders from GLSL into the shading languages of engines."""
+
+from collections.abc import Iterable
+
+from wlm.errors import WlmError
+from wlm.export.shading.heads import decided
+from wlm.export.shading.hlsl import HlslWriter
+from wlm.export.shading.metal import MetalWriter
+from wlm.export.shading.source import read_words
+from wlm.export.shading.tree import read_shader
+from wlm.export.shading.wgsl import WgslWriter
+
+LANGUAGES = ("glsl", "glsl-es", "hlsl", "msl", "wgsl")
+"""Languages in which shaders are exported."""
+
+ENDINGS = {"glsl": ".glsl", "glsl-es": ".glsl", "hlsl": ".hlsl", "msl": ".metal", "wgsl": ".wgsl"}
+"""Endings of shader files by language."""
+
+_WRITERS = {"hlsl": HlslWriter, "msl": MetalWriter, "wgsl": WgslWriter}
+_VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "msl": "Metal 2 and later", "wgsl": "WGSL"}
+_PRECISIONS = "".join(
+    f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D", "usampler2D", "sampler2DArray")
+)
+
+
+def check_language(language: str) -> None:
+    """Checks the name of a shading language.
+
+    Raises:
+        WlmError: It is not in `LANGUAGES`.
+    """
+    if language not in LANGUAGES:
+        raise WlmError(f"shader: expected one of {', '.join(LANGUAGES)}, got {language!r}")
+
+
+def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
+    """Translates one of our shaders.
+
+    GLSL is not changed, except for macros and precisions at its head; conditional directives are left to the including
+    shader. In the other languages macros are expanded. They have functions of the same names, textures of the same
+    names, and one sampler, linear and clamped to the edge.
+
+    Args:
+        text: GLSL of this package, in the subset of the language that `wlm.export.shading.tree` parses.
+        language: One of `LANGUAGES`.
+        defined: Macros to define, for example `WLM_ATLAS_EXACT`.
+
+    Raises:
+        WlmError: Unknown language.
+        ValueError: The text uses GLSL outside the subset.
+    """
+    check_language(language)
+    if not language.startswith("glsl"):
+        defined = tuple(defined)
+        text = decided(text, _VERSIONS[language], defined)
+        return _WRITERS[language](read_shader(read_words(text, defined))).text()
+    defines = "".join(f"#define {name}\n" for name in defined)
+    return (_PRECISIONS if language == "glsl-es" else "") + defines + text

@@ -1,0 +1,225 @@
+"""Base class of the writers of shading languages."""
+
+from abc import ABC, abstractmethod
+
+from wlm.export.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
+
+_STRENGTH = {
+    mark: strength
+    for strength, marks in enumerate(
+        (("||",), ("&&",), ("|",), ("^",), ("&",), ("==", "!="), ("<", ">", "<=", ">="), ("<<", ">>"), ("+", "-"))
+    )
+    for mark in marks
+} | dict.fromkeys("*/%", 9)
+# Pairs of outer and inner operator that need no brackets in any language, WGSL included.
+_PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")}
+_COMPARED = ("<", ">", "<=", ">=", "==", "!=")
+
+
+class Writer(ABC):
+    """Writes a parsed shader in a C-like language; subclasses override the differences.
+
+    Attributes:
+        shader: The parsed shader.
+        linear: Name of the sampler that reads all filtered textures.
+    """
+
+    names: dict[str, str] = {}
+    """Names of types and functions that differ from GLSL."""
+
+    indent = ""
+    linear = "wlm_linear_clamp_sampler"
+
+    def __init__(self, shader: Shader) -> None:
+        self.shader, self.functions, self.bound = shader, shader.functions, shader.bound
+        self.scope: dict[str, Variable] = {}
+
+    def text(self) -> str:
+        """Writes the whole shader."""
+        lines: list[str] = []
+        for item, blank in self.shader.items:
+            if blank and lines:
+                lines.append("")
+            if isinstance(item, str):
+                lines.append(self.indent + item)
+            elif isinstance(item, Function):
+                lines += [self.indent + line if line else line for line in self.function(item)]
+            else:
+                lines += [self.indent + line for line in self.outer(item)]
+        return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
+
+    def head(self) -> list[str]:
+        """Lines before the first item."""
+        return []
+
+    def foot(self) -> list[str]:
+        """Lines after the last item."""
+        return []
+
+    @abstractmethod
+    def outer(self, variable: Variable) -> list[str]:
+        """Lines of a global constant, texture, uniform or buffer."""
+
+    def signature(self, function: Function) -> str:
+        """First line of a function."""
+        return f"{self.kind(function.type)} {function.name}({', '.join(map(self.parameter, function.parameters))})"
+
+    @abstractmethod
+    def parameter(self, variable: Variable) -> str:
+        """Declaration of a parameter."""
+
+    def kind(self, name: str) -> str:
+        """Name of a type."""
+        return self.names.get(name, name)
+
+    def function(self, function: Function) -> list[str]:
+        """Lines of a function."""
+        self.scope = {each.name: each for each in function.parameters}
+        return [self.signature(function), "{", *self.block(function.body, "    "), "}"]
+
+    def block(self, body: tuple[Statement, ...], indent: str) -> list[str]:
+        """Lines of statements."""
+        lines: list[str] = []
+        for statement in body:
+            if statement.blank and lines:
+                lines.append("")
+            lines += [indent + line for line in self.statement(statement)]
+        return lines
+
+    def statement(self, statement: Statement) -> list[str]:
+        """Lines of a statement."""
+        tail = f" {statement.tail}" if statement.tail else ""
+        if statement.kind == "comment":
+            return [statement.text]
+        if statement.kind == "block":
+            return ["{", *self.block(statement.bodies[0], "    "), "}"]
+        if statement.kind == "declare":
+            assert statement.variable is not None
+            return [f"{self.local(statement.variable)};{tail}"]
+        if statement.kind == "expression":
+            return [f"{self.write(statement.parts[0])};{tail}"]
+        if statement.kind == "return":
+            return [f"return{''.join(' ' + self.write(part) for part in statement.parts)};{tail}"]
+        if statement.kind == "if":
+            lines = [f"if ({self.write(statement.parts[0])}) {{", *self.block(statement.bodies[0], "    ")]
+            if len(statement.bodies) == 2:
+                lines += ["} else {", *self.block(statement.bodies[1], "    ")]
+            return [*lines, "}"]
+        assert statement.variable is not None
+        condition, step = map(self.write, statement.parts)
+        head = f"for ({self.local(statement.variable)}; {condition}; {step}) {{"
+        return [head, *self.block(statement.bodies[0], "    "), "}"]
+
+    def local(self, variable: Variable) -> str:
+        """Declaration of a local variable."""
+        size = "" if variable.size is None else f"[{self.write(variable.size)}]"
+        value = "" if variable.value is None else f" = {self.write(variable.value)}"
+        return f"{self.kind(variable.type)} {variable.name}{size}{value}"
+
+    def write(self, node: Node) -> str:
+        """Text of an expression."""
+        if node.kind in ("number", "name"):
+            return self.plain(node)
+        if node.kind == "call":
+            return self.call(node)
+        if node.kind == "member":
+            return f"{self.inside(node.parts[0])}.{node.text}"
+        if node.kind == "index":
+            return f"{self.inside(node.parts[0])}[{self.write(node.parts[1])}]"
+        if node.kind == "unary":
+            return node.text + self.inside(node.parts[0])
+        if node.kind == "step":
+            return f"{self.inside(node.parts[0])}{node.text}"
+        if node.kind == "assign":
+            return f"{self.write(node.parts[0])} {node.text} {self.write(node.parts[1])}"
+        if node.kind == "choice":
+            return " ".join(
+                [self.inside(node.parts[0]), "?", self.inside(node.parts[1]), ":", self.inside(node.parts[2])]
+            )
+        left, right = node.parts
+        return f"{self.side(node.text, left)} {node.text} {self.side(node.text, right, right=True)}"
+
+    def plain(self, node: Node) -> str:
+        """Text of a name or a number."""
+        return node.text
+
+    def inside(self, node: Node) -> str:
+        """Text of an operand of an operator that binds more strongly, in brackets if needed."""
+        text = self.write(node)
+        return f"({text})" if node.kind in ("binary", "choice", "assign", "unary", "step") else text
+
+    def side(self, mark: str, node: Node, right: bool = False) -> str:
+        """Text of an operand of a binary operator, in brackets if it needs them or is hard to read without."""
+        if node.kind != "binary":
+            return f"({self.write(node)})" if node.kind in ("choice", "assign") else self.write(node)
+        inner = node.text
+        alike = _STRENGTH[inner] == _STRENGTH[mark] and not right and mark not in ("<<", ">>", *_COMPARED)
+        compared = mark in _COMPARED and _STRENGTH[inner] >= _STRENGTH["+"]
+        joined = mark in ("&&", "||") and inner in _COMPARED
+        if alike or compared or joined or (mark, inner) in _PLAIN:
+            return self.write(node)
+        return f"({self.write(node)})"
+
+    def call(self, node: Node) -> str:
+        """Text of a call, a texture read or a constructor."""
+        arguments = node.parts
+        name = node.text
+        if name in ("texelFetch", "textureLod"):
+            texture = self.bound[arguments[0].text]
+            if name == "texelFetch":
+                return self.fetch(texture, arguments[1])
+            return self.filtered(texture, arguments[1], self.write(arguments[2]))
+        if name == "textureGrad":
+            return self.graded(self.bound[arguments[0].text], *(self.write(each) for each in arguments[1:]))
+        if name == "textureSize":
+            return self.size(self.bound[arguments[0].text])
+        if name in VECTORS or name in SCALARS:
+            return self.make(name, [self.write(each) for each in arguments])
+        return f"{self.names.get(name, name)}({', '.join(self.arguments(name, arguments))})"
+
+    def arguments(self, name: str, arguments: tuple[Node, ...]) -> list[str]:
+        """Texts of the arguments of a call."""
+        return [self.write(each) for each in arguments]
+
+    def make(self, name: str, values: list[str]) -> str:
+        """Text of a constructor of a vector or scalar."""
+        return f"{self.kind(name)}({', '.join(values)})"
+
+    @abstractmethod
+    def fetch(self, texture: Variable, place: Node) -> str:
+        """Text that fetches one texel."""
+
+    @abstractmethod
+    def filtered(self, texture: Variable, place: Node, level: str) -> str:
+        """Text that reads a texture through the filter at a mip level."""
+
+    @abstractmethod
+    def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
+        """Text that reads a texture through the filter, with derivatives that choose the mip level."""
+
+    @abstractmethod
+    def size(self, texture: Variable) -> str:
+        """Text that gives the size of a texture in texels, two integers."""
+
+    @property
+    def textures(self) -> list[Variable]:
+        """The textures that the shader declares."""
+        return [each for each in self.bound.values() if each.type in SAMPLERS]
+
+    @property
+    def filters(self) -> bool:
+        """Whether any texture is read through the filter."""
+
+        def reads(node: Node) -> bool:
+            called = node.kind == "call" and node.text in ("textureLod", "textureGrad")
+            return called or any(map(reads, node.parts))
+
+        def among(body: tuple[Statement, ...]) -> bool:
+            return any(
+                any(map(reads, each.parts))
+                or (each.variable is not None and each.variable.value is not None and reads(each.variable.value))
+                or any(map(among, each.bodies))
+                for each in body
+            )
+
+        return any(among(each.body) for each in self.functions.values())

@@ -1,0 +1,218 @@
+"""The bundle of a lightmap model: textures of all tiles, the networks, and a table for each hour.
+
+Everything that only depends on the hour is in its table, so that the shader does not compute it in every texel: the
+positions on the time axis, the scale of each tile, and the bias of the first layer with the encoded time in it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from wlm.bundle import Bundle, Texture
+from wlm.errors import WlmError
+from wlm.formats.folder import rounded
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings import ENCODINGS, encoding_of
+from wlm.lightmap.encodings.maps import shader_networks
+from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.profile import encode_time
+from wlm.lightmap.shader import EXACT, HEAD, decode_glsl, record_fours
+from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.tiles import TILE, TileKind
+
+MOST_SIDE = 16384
+"""Largest side of a texture of all tiles, in texels."""
+
+MOST_LAYERS = 2048
+"""Largest number of layers of a texture array: stored times of tiles that are frames."""
+
+_ABOUT = {
+    "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
+    "images": "Each texture has images of all its tiles from left to right, across of them in a row. uv: image of a "
+    "tile. uvt: slice s of a tile is image * slices + s. planes: F_ut is 2 * image, F_vt 2 * image + 1, time along "
+    "the rows. frames is an array: layer i has the image of each tile at stored time i.",
+    "time": "Wrap t modulo the period (without one clamp it to the stored times) and find the stored times around it; "
+    "with a period the last and the first are neighbours. share is the position of t between the two, 0 to 1.",
+    "interpolation": "Light between two stored times. radiance: decode both and mix their linear radiance by share "
+    "(eq. 2). network: decode once, with tau and scale interpolated.",
+    "tau": "Position on the textures' time axis: tau[i] of stored time i. Between two, tau[i] + share * (step), the "
+    "step to the next one; for the rule 'frames' it is 1/T, and tau is taken modulo 1 if time_axis.repeats. For the "
+    "rule 'paper' with a period tau is t / period.",
+    "hours": "The buffer hours has a table for each stored time, hour_fours times four floats, which the shader reads. "
+    "Fours 0 and 1: for F_uvt, and for F_ut and F_vt, the slices or rows before and after tau, and the share of the "
+    "later one. Then record fours for each tile of the grid, in order: code (0 empty or constant, 1 static, 2 "
+    "dynamic, 3 frames), image, network_four, share of the later frame. Code 0: colour. 1 and 2: shift * scale, "
+    "spread * scale, then b1, which for code 2 includes the encoded time: b1 + its four rows of W1 times sin, "
+    "cos(turn * tau), sin, cos(2 turn * tau). 3: least and layer, greatest, of the earlier, then of the later frame. "
+    "Between two stored times, if interpolation is network, a table is computed in the same way.",
+    "colour": "(shift + spread * y) * scale, not below 0, is the colour in gamma space; y is the output of the network "
+    "(the shader). radiance = colour ** gamma, linear RGB. scale is interpolated linearly between stored times.",
+    "peak": "An upper bound of the tile's colour in gamma space: the value of 255 if colour is kept in 8 bits. "
+    "Between two stored times the larger one holds.",
+    "network": "h1 = gelu(x W1 + b1), h2 = gelu(h1 W2 + b2), y = h2 W3 + b3, a row of W for each input. x is uv[4], "
+    "uvt[4], ut[2], vt[2] as sampled, in [0, 1], then the encoded time[4]; of a static tile only uv[4]. The buffer "
+    "networks has float32 W1 b1 W2 b2 W3 b3 of each tile, the rows filled up with zeros to fours, and rows of zeros "
+    "added for those; a tile's begin at four network_four.",
+    "radiance": "Linear RGB of a constant tile at each stored time, interpolated linearly.",
+    "frames": "A tile of frames has an image for each stored time and no network: colour is least[i] + level * "
+    "(greatest[i] - least[i]). Between two stored times their radiance is mixed, whatever interpolation says.",
+}
+
+_VALUES = (
+    "The values of the colours 0 and 1: the texels are values, not light. In place of radiance read values[0] + "
+    "colour * (values[1] - values[0]); gamma is 1."
+)
+
+_SHEETS = "Each part is a sheet: up to three channels of a layer of an atlas, in the order of red, green and blue."
+
+
+def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
+    """Makes the bundle of a model. A model of several sheets is a collection with a part for each.
+
+    Args:
+        model: The model.
+        device: Device that decodes the reference.
+
+    Raises:
+        WlmError: There is no such device, a number of the model is not finite, or a texture is larger than GPUs take.
+    """
+    if len(model.sheets) == 1:
+        ((sheet, own),) = model.sheets.items()
+        return sheet_bundle(sheet, own, model.name, model.source, device)
+    parts, sheets = {}, []
+    for number, (sheet, own) in enumerate(model.sheets.items()):
+        part = f"sheet_{number:02d}"
+        # Engines name materials and shaders after the bundle.
+        name = f"{model.name} {sheet.label.replace('/', ' ')}"
+        parts[part] = sheet_bundle(sheet, own, name, model.source, device)
+        named = {"atlas": sheet.atlas, "layer": sheet.layer, "channels": list(sheet.channels)}
+        sheets.append({"part": part} | named | {"encoding": sheet.encoding, "width": own.width, "height": own.height})
+    document = {"about": _SHEETS, "times": model.times.tolist(), "period": model.period, "sheets": sheets}
+    return Bundle("lightmap", model.name, "", document | {"source": model.source}, parts=parts)
+
+
+def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device: str = "cpu") -> Bundle:
+    """Makes the bundle of a sheet.
+
+    The textures `uv` and `uvt` (BC7) and `planes` (R8G8_UNORM) are F_uv, F_uvt and F_ut beside F_vt of all tiles
+    (neural-dynamic-gi, table 1); `frames` (BC7) is an array with a layer for each stored time; `valid` is 255 inside
+    charts. The blocks are the model's own bytes. `networks`, float32 [n, 4], and `hours`, float32 [T, hour_fours, 4],
+    are the buffers. The reference `frame` is the map at the first stored time.
+
+    Args:
+        sheet: The sheet.
+        model: Its model.
+        name: Name of the bundle.
+        source: Hash of the input.
+        device: Device that decodes the reference.
+
+    Raises:
+        WlmError: As for `bundle`.
+    """
+    textures = {key: texture for encoding in ENCODINGS for key, texture in encoding.textures(model).items()}
+    for key, texture in textures.items():
+        if max(texture.width, texture.height) > MOST_SIDE or texture.layers > MOST_LAYERS:
+            raise WlmError(
+                f"{name}: cannot export: {key} of all tiles is {texture.width}x{texture.height}x{texture.layers}, more "
+                f"than {MOST_SIDE}x{MOST_SIDE}x{MOST_LAYERS} texels"
+            )
+    networks, hours = shader_networks(model), hour_tables(model, model.times.tolist())
+    if not (np.isfinite(networks).all() and np.isfinite(hours).all()):
+        raise WlmError(f"{name}: cannot export: a weight is NaN or infinite")
+    buffers = {"hours": hours} | ({"networks": networks} if len(networks) else {})
+    document = _document(model, textures, source) | {"hour_fours": hours.shape[1]}
+    if sheet.values is not None:
+        document |= {"values": list(sheet.values), "about": _ABOUT | {"values": _VALUES}}
+    mask = model.mask.astype(np.uint8) * 255
+    textures["valid"] = Texture(mask, "R8_UNORM", model.width, model.height)
+    frame = SheetDecoder(model, device).frame(float(model.times[0]))
+    if sheet.values is not None:
+        frame = np.float32(sheet.values[0]) + np.float32(sheet.span) * frame
+    shader = decode_glsl(model, sheet.values)
+    return Bundle("lightmap", name, shader, document, textures, buffers, {"frame": frame}, exact=EXACT)
+
+
+def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
+    """Computes the shader's tables of some hours.
+
+    A table has four floats for F_uvt: its slices before and after tau, the share of the second, and the columns of the
+    grid; the same for F_ut and F_vt, and 0. Then `record_fours` groups of four for each tile of the grid:
+
+        0    code, index among the images of its textures, start of its network, share of the second frame
+        1    code 0: its colour; 1 and 2: shift scale; 3: the least colour, and the layer of the first frame
+        2    code 1 and 2: spread scale; 3: the greatest colour
+        3    code 1 and 2: bias of the first layer, with the encoded time in it; 3: in two, the second frame
+
+    Args:
+        model: The sheet.
+        times: Stored times, or any times if the model's networks interpolate.
+
+    Returns:
+        float32 [times, 2 + tiles record_fours, 4].
+
+    Raises:
+        ValueError: A time is between two stored ones of a model whose radiance is mixed: it needs two tables.
+    """
+    axis, profile, size = model.axis, model.profile, record_fours(model)
+    tables = np.zeros((len(times), HEAD + model.kind.size * size, 4), np.float32)
+    for table, time in zip(tables, times, strict=True):
+        if axis.neighbours(time)[2] and axis.interpolation == "radiance":
+            raise ValueError(f"time: expected a stored one, got {time}")
+        tau = axis.place(time)
+        for i, count in enumerate((profile.uvt_slices, profile.plane_rows)):
+            table[i, :3] = _between(tau, count, axis.periodic)
+        table[0, 3] = model.grid.cols
+    records = tables[:, HEAD:].reshape(len(times), -1, size, 4)
+    for encoding in ENCODINGS:
+        for kind, code in zip(encoding.kinds, encoding.codes, strict=True):
+            records[:, model.kind == kind, 0, 0] = code
+        encoding.fill_records(model, times, records)
+    return tables
+
+
+def _document(model: SheetModel, textures: dict[str, Texture], source: str) -> dict[str, Any]:
+    """Describes textures, buffers and tiles."""
+    profile, axis = model.profile, model.axis
+    sides = {
+        "uvt": (profile.uvt_resolution, profile.uvt_resolution),
+        "planes": (profile.plane_columns, profile.plane_rows),
+    }
+    images = {}
+    for name, texture in textures.items():
+        width, height = sides.get(name, (TILE, TILE))
+        images[name] = {"size": [width, height], "across": texture.width // width}
+    tiles = []
+    for number in np.flatnonzero(model.kind).tolist():
+        row, column = divmod(number, model.grid.cols)
+        kind = TileKind(int(model.kind[number]))
+        tile = {"number": number, "kind": kind.name.lower(), "column": column, "row": row}
+        tiles.append(tile | encoding_of(kind).describe(model, number))
+    return {
+        "about": _ABOUT,
+        "source": source,
+        "width": model.width,
+        "height": model.height,
+        "tile_size": TILE,
+        "tile_columns": model.grid.cols,
+        "gamma": profile.gamma,
+        "hidden": profile.hidden,
+        "gelu": profile.gelu,
+        "times": model.times.tolist(),
+        "interpolation": profile.interpolation,
+        "period": model.period,
+        "time_axis": {"rule": axis.kind, "repeats": axis.periodic, "turn": axis.turn},
+        "tau": rounded(encode_time(axis)[0]),
+        "slices": profile.uvt_slices,
+        "record": record_fours(model),
+        "images": images,
+        "tiles": tiles,
+    }
+
+
+def _between(tau: float, count: int, repeats: bool) -> tuple[int, int, float]:
+    """Returns the texels of an axis that a linear filter reads at tau, and the share of the second."""
+    position = tau * count - 0.5
+    low = int(np.floor(position))
+    pair = [i % count if repeats else min(max(i, 0), count - 1) for i in (low, low + 1)]
+    return pair[0], pair[1], position - low

@@ -1,0 +1,17 @@
+"""The ways in which a tile is stored, one module for each; `encoding_of` finds the one of a kind of tile."""
+
+from wlm.lightmap.encodings.base import Encoding
+from wlm.lightmap.encodings.constant import Constant
+from wlm.lightmap.encodings.frames import Frames
+from wlm.lightmap.encodings.maps import Maps
+from wlm.lightmap.tiles import TileKind
+
+ENCODINGS: tuple[Encoding, ...] = (Maps(), Frames(), Constant())
+"""All encodings. Empty tiles have none."""
+
+_BY_KIND = {kind: encoding for encoding in ENCODINGS for kind in encoding.kinds}
+
+
+def encoding_of(kind: int) -> Encoding | None:
+    """Returns the encoding of tiles of a kind; None for empty tiles."""
+    return _BY_KIND.get(TileKind(int(kind)))

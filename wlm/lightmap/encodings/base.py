@@ -1,0 +1,169 @@
+"""The interface of the ways in which a tile is stored, and of its tiles on a device."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wlm.bundle import Texture
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.tiles import TILE, TileKind
+
+
+class DeviceTiles(ABC):
+    """The tiles of a sheet that have one encoding, on a device.
+
+    Attributes:
+        numbers: int [n], numbers of the tiles in the grid, rising.
+        device_bytes: Memory that they take on the device, bytes.
+    """
+
+    device_bytes = 0
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        """Takes the numbers of the tiles."""
+        self.numbers = numbers
+        self._row_of = {int(number): row for row, number in enumerate(numbers)}
+
+    def among(self, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Finds own tiles among `numbers`: their positions in `numbers` and in `self.numbers`, int32 [k] each."""
+        pairs = [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
+        places, rows = np.array(pairs, np.int32).reshape(-1, 2).T
+        return places, np.ascontiguousarray(rows)
+
+    @abstractmethod
+    def bounds(self, time: float) -> np.ndarray:
+        """Returns an upper bound of the colour of each tile in gamma space, float32 [n].
+
+        Between two stored times it is the larger of both bounds, since a texel may follow either time.
+        """
+
+    @abstractmethod
+    def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
+        """Decodes tiles to linear radiance.
+
+        Args:
+            rows: int32 [k], positions in `numbers`.
+            time: In the unit of the set's times, stored or between.
+
+        Returns:
+            float32 [k, 128, 128, 3]; gaps are not filled.
+        """
+
+    @abstractmethod
+    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
+        """Decodes tiles to 8 bits relative to their bounds: radiance = (byte / 255 * bound) ** gamma.
+
+        Args:
+            rows, time: As for `radiance`.
+
+        Returns:
+            uint8 [k, 128, 128, 4]; alpha is 255.
+        """
+
+
+class Encoding(ABC):
+    """One way to store tiles.
+
+    Attributes:
+        kinds: The kinds of tiles that are stored in this way.
+        codes: For each of them its code in the shader's table of an hour.
+    """
+
+    kinds: ClassVar[tuple[TileKind, ...]]
+    codes: ClassVar[tuple[int, ...]]
+
+    def packed_size(self, sheet: SheetModel, number: int) -> int:
+        """Returns the number of bytes of `pack`."""
+        return 0
+
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        """Returns the maps, the network or the frames of a tile, arranged for a general packer.
+
+        Raises:
+            WlmError: The arrays can not be stored.
+        """
+        return b""
+
+    def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
+        """Writes the bytes of `pack`, uint8, into the arrays of a sheet.
+
+        Raises:
+            WlmError, ValueError: The bytes are not those of such a tile.
+        """
+
+    @abstractmethod
+    def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
+        """Puts the tiles of this encoding on a device; the list is empty if the sheet has none.
+
+        Args:
+            sheet: The arrays.
+            device: As `wlm.interop.check_device` returns it.
+            gelu: Form of the GELU of networks, see `wlm_kernels.mlp`.
+        """
+
+    def textures(self, sheet: SheetModel) -> dict[str, Texture]:
+        """Returns the textures that the shader reads, by name, with the images of all tiles of this encoding."""
+        return {}
+
+    @abstractmethod
+    def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
+        """Returns the description of a tile in the document of a bundle, as JSON values."""
+
+    @abstractmethod
+    def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
+        """Writes the records of all tiles of this encoding into the shader's tables of some hours.
+
+        Args:
+            sheet: The arrays.
+            times: Stored times, or any times if networks interpolate.
+            records: float32 [times, tiles, fours, 4], written; the first number of each record is set already.
+        """
+
+    @abstractmethod
+    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
+        """Explains why a tile of this kind is stored in this way, in a sentence without a full stop."""
+
+
+def inverse_of(bounds: np.ndarray) -> np.ndarray:
+    """Returns 1 / each bound, float32; 0 for the bound 0 of a black tile."""
+    return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
+
+
+def columns(count: int, height: int, width: int) -> int:
+    """Returns how many of `count` images form a row of a texture that is about as wide as high."""
+    return max(int(np.ceil(np.sqrt(count * height / width))), 1)
+
+
+def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[str, Any]:
+    """Arranges images in rows of one texture.
+
+    Args:
+        images: [n, rows, columns, bytes] of texels or blocks.
+        fmt: Pixel format.
+        height, width: Size of an image in texels.
+
+    Returns:
+        The arguments of `Texture`.
+    """
+    across = columns(len(images), height, width)
+    missing = -len(images) % across
+    padded = np.concatenate([images, np.zeros((missing, *images.shape[1:]), images.dtype)])
+    grid = padded.reshape(-1, across, *images.shape[1:]).swapaxes(1, 2)
+    data = np.ascontiguousarray(grid).reshape(grid.shape[0] * grid.shape[1], -1, images.shape[-1])
+    return {"data": data, "fmt": fmt, "width": across * width, "height": -(-len(images) // across) * height}
+
+
+def layered(images: np.ndarray, fmt: str) -> Texture:
+    """Arranges tiles at all times, [n, T, rows, columns, bytes], in a texture array with a layer for each time."""
+    made = [side_by_side(images[:, i], fmt, TILE, TILE) for i in range(images.shape[1])]
+    return Texture(**made[0] | {"data": np.stack([layer["data"] for layer in made])}, layers=len(made))
+
+
+def rgba(words: Any) -> np.ndarray:
+    """Converts a `wp.array` of RGBA words, uint32 [...], to uint8 [..., 4] on the host."""
+    host = np.ascontiguousarray(words.numpy().astype("<u4"))
+    return host.view(np.uint8).reshape(*host.shape, 4)

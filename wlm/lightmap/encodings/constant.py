@@ -1,0 +1,62 @@
+"""Constant tiles: one colour at each time."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from wlm.formats.folder import rounded
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.tiles import TILE, TileKind
+
+
+class ConstantTiles(DeviceTiles):
+    """The constant tiles of a sheet. They need no memory on the device."""
+
+    def __init__(self, sheet: SheetModel) -> None:
+        """Takes the colours."""
+        super().__init__(sheet.numbers(TileKind.CONSTANT))
+        self._axis, self._colours = sheet.axis, sheet.constant.astype(np.float32)
+        self._exponent = 1.0 / sheet.profile.gamma
+
+    def colours(self, time: float) -> np.ndarray:
+        """Returns the linear radiance of all tiles, float32 [n, 3]."""
+        before, after, share = self._axis.neighbours(time)
+        return (1.0 - share) * self._colours[:, before] + share * self._colours[:, after]
+
+    def bounds(self, time: float) -> np.ndarray:
+        return (self.colours(time) ** self._exponent).max(1).astype(np.float32)
+
+    def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
+        return np.broadcast_to(self.colours(time)[rows, None, None], (len(rows), TILE, TILE, 3))
+
+    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
+        bounds = self.bounds(time)[rows]
+        share = self.colours(time)[rows] ** self._exponent / np.where(bounds > 0, bounds, 1.0)[:, None]
+        out = np.full((len(rows), TILE, TILE, 4), 255, np.uint8)
+        out[..., :3] = np.floor(share * 255.0 + 0.5).astype(np.uint8)[:, None, None]
+        return out
+
+
+class Constant(Encoding):
+    """Stores one colour at each time; nothing is packed."""
+
+    kinds = (TileKind.CONSTANT,)
+    codes = (0,)
+
+    def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
+        return [ConstantTiles(sheet)] if len(sheet.constant) else []
+
+    def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
+        return {"radiance": rounded(sheet.constant[sheet.row(number)])}
+
+    def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
+        colours, numbers = sheet.constant.astype(np.float64), sheet.numbers(TileKind.CONSTANT)
+        for table, time in zip(records, times, strict=True):
+            before, after, share = sheet.axis.neighbours(time)
+            light = (1.0 - share) * colours[:, before] + share * colours[:, after]
+            table[numbers, 1, :3] = light ** (1.0 / sheet.profile.gamma)
+
+    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
+        return "all valid texels have one colour at each time"

@@ -1,0 +1,267 @@
+"""Frames: the lightmap of each time as plain BC7, for tiles where a network would not be smaller.
+
+A frame holds levels between the least and the greatest colour of its tile, channel and time, in gamma space:
+
+    colour = least + level (greatest - least),     radiance = colour ** gamma
+
+as an engine's own BC7 does, so that a set of few times is never worse than that. Unlike a network's maps, the bytes
+grow in proportion to the number of times.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy.ndimage import binary_dilation
+
+from wlm.bundle import Texture
+from wlm.errors import WlmError
+from wlm.formats import bc7_modes
+from wlm.formats.bc7 import BLOCK_BYTES, blocks_image
+from wlm.formats.block_reuse import by_block, reuse_in_order
+from wlm.formats.folder import rounded
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, layered, rgba
+from wlm.lightmap.encodings.maps import tile_bytes
+from wlm.lightmap.model import BLOCKS, SheetModel
+from wlm.lightmap.profile import Profile
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.texels import REACH
+from wlm_kernels.lightmap import frames as frame_kernels
+
+EXTRA = "frames"
+"""The extra with the encoder."""
+
+_ENCODER = "ispc_texcomp"
+_RANGE_BYTES = 2 * 3 * 2  # two half floats for each channel of a frame
+
+# Rate-distortion optimisation: the root mean square error of a block's visible texels may grow by 0.2 levels of 255, in
+# squares. Blocks that repeat make the file smaller.
+_LOSS = (0.2 / 255.0) ** 2
+_RING_WEIGHT = 0.25  # only some bilinear reads reach the texels next to a chart
+_WINDOW = 1024  # blocks back that a block may repeat: the blocks of one tile
+
+_BLACK = np.zeros(BLOCK_BYTES, np.uint8)
+_BLACK[0] = 1 << 6  # a block of mode 6 whose other bits are 0
+
+
+def missing_encoder(count: int) -> str | None:
+    """Returns a warning about `count` tiles that would be stored as frames, or None if the encoder is installed."""
+    if importlib.util.find_spec(_ENCODER) is not None:
+        return None
+    tiles = "1 tile" if count == 1 else f"{count} tiles"
+    return (
+        f"{tiles} would be smaller and better as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
+        f"to them; needs the extra: pip install 'wlm[{EXTRA}]'"
+    )
+
+
+def choose_frames(
+    kinds: np.ndarray, numbers: Sequence[int] | np.ndarray, mask: np.ndarray, times: int, profile: Profile
+) -> np.ndarray:
+    """Chooses the tiles that are stored as frames, see `Profile.frames`.
+
+    Args:
+        kinds: int [N], from `wlm.lightmap.tiles.classify`.
+        numbers: Numbers of the N tiles in the grid.
+        mask: bool [H, W], the valid texels of the map.
+        times: T, the number of stored times.
+        profile: The settings.
+
+    Returns:
+        bool [N].
+    """
+    chosen = np.isin(kinds, (TileKind.STATIC, TileKind.DYNAMIC))
+    if profile.frames == "auto":
+        for i in np.flatnonzero(chosen):
+            share = needed_blocks(mask, int(numbers[i])).mean()
+            network = tile_bytes(profile, bool(kinds[i] == TileKind.DYNAMIC)) - (1.0 - share) * TILE * TILE
+            chosen[i] = times * (share * TILE * TILE + _RANGE_BYTES) <= network
+    return chosen & (profile.frames != "never")
+
+
+def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
+    """Finds the blocks of a tile that a filtered read may reach: those with a texel within `REACH` of a valid one.
+
+    Args:
+        mask: bool [H, W], the valid texels of the map.
+        number: Number of the tile in the grid.
+
+    Returns:
+        bool [32, 32].
+    """
+    y, x = TileGrid.of(*mask.shape).origin(number)
+    near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
+    part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
+    top, left = REACH - min(y, REACH), REACH - min(x, REACH)
+    near[top : top + part.shape[0], left : left + part.shape[1]] = part
+    for axis in () if part.all() or not part.any() else (0, 1):
+        shifted = [np.roll(near, step, axis) for step in range(-REACH, REACH + 1)]
+        near = np.logical_or.reduce(shifted)
+    near = near[REACH:-REACH, REACH:-REACH]
+    near[mask.shape[0] - y :] = False
+    near[:, mask.shape[1] - x :] = False
+    return near.reshape(BLOCKS, 4, BLOCKS, 4).any((1, 3))
+
+
+def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
+    """Replaces the blocks [T, 32, 32, 16] of a tile that are not needed, bool [32, 32], by black ones."""
+    return np.where(needed[..., None], blocks, _BLACK)
+
+
+def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Encodes the frames of a tile.
+
+    Args:
+        colour: float32 [T, 128, 128, 3], in gamma space, gaps filled.
+        valid: bool [128, 128].
+        needed: bool [32, 32], from `needed_blocks`.
+
+    Returns:
+        Blocks uint8 [T, 32, 32, 16], and least and greatest colours, half [T, 2, 3].
+
+    Raises:
+        WlmError: The encoder is missing.
+    """
+    texels = colour[:, valid]
+    ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)
+    least, greatest = ranges.astype(np.float32).swapaxes(0, 1)[:, :, None, None]
+    span = np.where(greatest > least, greatest - least, np.float32(1.0))
+    levels = np.clip((colour - least) / span, 0.0, 1.0).reshape(-1, TILE, 3)
+    blocks = bc7_modes.encode_image((levels * 255.0 + 0.5).astype(np.uint8), EXTRA)
+    ring = binary_dilation(valid, np.ones((3, 3), bool))
+    weight = np.where(valid, 1.0, np.where(ring, _RING_WEIGHT, 0.0)).astype(np.float32)
+    weight = np.tile(np.repeat(weight[..., None], 3, axis=2), (len(colour), 1, 1))
+    decoded = blocks_image(bc7_modes.decode_blocks(blocks))[..., :3] / np.float32(255.0)
+    kept = np.tile(needed, (len(colour), 1))
+    images = decoded, levels, weight, weight * np.float32(_LOSS)
+    values = (by_block(image)[kept.ravel()] for image in images)
+    blocks[kept] = reuse_in_order(blocks[kept], *values, _WINDOW)
+    return clear_unneeded(blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), needed), ranges
+
+
+def round_half(values: np.ndarray, toward: float) -> np.ndarray:
+    """Rounds to half floats in one direction, for bounds.
+
+    Args:
+        values: Any shape.
+        toward: Infinity for upper bounds, minus infinity for lower bounds.
+    """
+    nearest = values.astype(np.float16)
+    wrong = nearest > values if toward < 0 else nearest < values
+    return np.where(wrong, np.nextafter(nearest, np.float16(toward)), nearest)
+
+
+class FrameTiles(DeviceTiles):
+    """The frames of a sheet on a device."""
+
+    def __init__(self, sheet: SheetModel, device: str) -> None:
+        """Uploads the frames.
+
+        Raises:
+            WlmError: The sheet has none.
+        """
+        super().__init__(sheet.numbers(TileKind.FRAMES))
+        if not len(self.numbers):
+            raise WlmError(f"{sheet.name}: expected at least one tile of frames, found none")
+        self._axis, self._device = sheet.axis, device
+        self._greatest = sheet.ranges[:, :, 1].astype(np.float32).max(2)
+        ends = sheet.ranges.astype(np.float32).reshape(-1, 2, 3)
+        words = np.ascontiguousarray(sheet.frames).view("<u8").reshape(-1, BLOCKS, BLOCKS, 2)
+        stored = frame_kernels.StoredFrames()
+        stored.blocks = wp.array(words, dtype=wp.uint64, device=device)
+        stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
+        stored.times, stored.gamma = len(sheet.times), sheet.profile.gamma
+        tables = frame_kernels.Tables()
+        tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
+        tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
+        tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
+        tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
+        stored.tables = tables
+        self._stored = stored
+        self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
+
+    def bounds(self, time: float) -> np.ndarray:
+        before, after, share = self._axis.neighbours(time)
+        return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
+
+    def decode(self, time: float, rows: wp.array, out: wp.array, inverse_bounds: wp.array | None = None) -> None:
+        """Decodes tiles with one launch, which can be captured.
+
+        Args:
+            time: A stored time, or one between, where the radiance of both is mixed (eq. 2).
+            rows: int [k], positions in `numbers`.
+            out: [k, 128, 128], radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` uint32 of 8 bits.
+            inverse_bounds: float [n], 1 / the bound of each tile.
+        """
+        frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out, inverse_bounds)
+
+    def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
+        out = wp.empty((len(rows), TILE, TILE), dtype=wp.vec3, device=self._device)
+        self.decode(time, wp.array(rows, dtype=int, device=self._device), out)
+        return out.numpy()
+
+    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
+        out = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32, device=self._device)
+        inverse = wp.array(inverse_of(self.bounds(time)), dtype=float, device=self._device)
+        self.decode(time, wp.array(rows, dtype=int, device=self._device), out, inverse)
+        return rgba(out)
+
+
+class Frames(Encoding):
+    """Stores a tile as BC7 blocks at each time; blocks that no read reaches are left out of the file."""
+
+    kinds = (TileKind.FRAMES,)
+    codes = (3,)
+
+    def packed_size(self, sheet: SheetModel, number: int) -> int:
+        return len(sheet.times) * int(needed_blocks(sheet.mask, number).sum()) * BLOCK_BYTES
+
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        blocks, needed = sheet.frames[sheet.row(number)], needed_blocks(sheet.mask, number)
+        if not np.array_equal(blocks, clear_unneeded(blocks, needed)):
+            raise WlmError(f"frames: tile {number}: expected black blocks where no read reaches, found others")
+        kept = blocks[:, needed]
+        _check_modes(kept, number)
+        # The times of a block come one after another: they resemble each other more than neighbouring blocks do.
+        return kept.swapaxes(0, 1).tobytes()
+
+    def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
+        needed, blocks = needed_blocks(sheet.mask, number), sheet.frames[sheet.row(number)]
+        kept = data.reshape(-1, len(sheet.times), BLOCK_BYTES).swapaxes(0, 1)
+        _check_modes(kept, number)
+        blocks[...] = _BLACK
+        blocks[:, needed] = kept
+
+    def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
+        return [FrameTiles(sheet, device)] if len(sheet.frames) else []
+
+    def textures(self, sheet: SheetModel) -> dict[str, Texture]:
+        return {"frames": layered(sheet.frames, "BC7_UNORM")} if len(sheet.frames) else {}
+
+    def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
+        row = sheet.row(number)
+        least, greatest = sheet.ranges[row].swapaxes(0, 1)
+        ends = {"least": rounded(least), "greatest": rounded(greatest), "peak": rounded(greatest.max(1))}
+        return {"image": row} | ends
+
+    def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
+        numbers = sheet.numbers(TileKind.FRAMES)
+        for table, time in zip(records, times, strict=True):
+            before, after, share = sheet.axis.neighbours(time)
+            table[numbers, 0, 1], table[numbers, 0, 3] = np.arange(len(numbers)), share
+            for first, image in ((1, before), (3, after)):
+                table[numbers, first, :3], table[numbers, first + 1, :3] = sheet.ranges[:, image].swapaxes(0, 1)
+                table[numbers, first, 3] = image
+
+    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
+        if sheet.profile.frames == "auto":
+            return f"{len(sheet.times)} times as BC7 take no more bytes than maps and a network"
+        return f"the setting frames is {sheet.profile.frames}"
+
+
+def _check_modes(blocks: np.ndarray, number: int) -> None:
+    if (bc7_modes.block_modes(np.ascontiguousarray(blocks)) == bc7_modes.RESERVED).any():
+        raise WlmError(f"frames: tile {number}: expected BC7 blocks of modes 0 to 7, found a reserved mode")

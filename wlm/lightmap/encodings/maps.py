@@ -1,0 +1,527 @@
+"""Feature maps and a network: static tiles (F_uv alone) and dynamic tiles (F_uv, F_uvt, F_ut and F_vt).
+
+In the file each tile is one zstd frame (`wlm.lightmap.codec`). Before packing, the blocks of BC7 mode 6 are split into
+bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. Texels that no
+valid texel reads at a stored time are zero, which the fit sees to, so that they cost nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wlm.bundle import Texture
+from wlm.errors import WlmError
+from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
+from wlm.formats.folder import rounded
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
+from wlm.lightmap.exact import SQRT_12
+from wlm.lightmap.model import SheetModel, decode_scale
+from wlm.lightmap.profile import Profile, TimeAxis, encode_time
+from wlm.lightmap.tiles import TILE, TileKind
+from wlm_kernels import mlp
+from wlm_kernels.lightmap import decode as decode_kernels
+from wlm_kernels.lightmap.levels import LEVELS
+
+_SLACK = 1e-4  # of a texel: float32 may round a position to either side of a texel's middle
+_MODE_6 = np.uint64(1 << 6)
+_LOW_7 = np.uint64(127)
+_END_SHIFTS = (7 + 7 * np.arange(8)).astype(np.uint64)  # R0 R1 G0 G1 B0 B1 A0 A1 in the low half of a block
+_LAST_BIT = np.uint64(63)  # of the low half: the P bit of the first endpoint
+_MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynamic tiles; the encoded time follows
+
+
+# ---- sizes ----
+
+
+def tile_bytes(profile: Profile, temporal: bool) -> int:
+    """Returns the bytes of the maps and the network of one tile before packing: the arithmetic of table 3."""
+    size = TILE * TILE + _network_bytes(profile, temporal)
+    if temporal:
+        size += profile.uvt_slices * profile.uvt_resolution**2 + 2 * 2 * profile.plane_rows * profile.plane_columns
+    return size
+
+
+def _network_bytes(profile: Profile, temporal: bool) -> int:
+    inputs, hidden = profile.inputs(temporal), profile.hidden
+    if profile.net_bits == 16:
+        return 2 * mlp.parameter_count(inputs, hidden)
+    return (inputs + hidden + 3) * hidden + 2 * 2 * (2 * hidden + 3)
+
+
+# ---- texels that decoding reads ----
+
+
+@dataclass(frozen=True, eq=False)
+class Reads:
+    """The texels of the temporal maps that the valid texels of a dynamic tile read at the times that are evaluated.
+
+    Attributes:
+        slices: bool [S], slices of F_uvt.
+        texels: bool [R, R], texels of each of these slices.
+        rows: bool [rows] of F_ut and F_vt.
+        columns: bool [2, columns], columns of F_ut and of F_vt.
+    """
+
+    slices: np.ndarray
+    texels: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, used: np.ndarray, profile: Profile, axis: TimeAxis) -> Reads:
+        """Finds the reads of a tile.
+
+        Args:
+            used: bool [128, 128], the valid texels of the tile.
+            profile: The settings.
+            axis: The time axis. Only stored times are evaluated if light between them is mixed as radiance.
+        """
+        centres = (np.arange(TILE) + 0.5) / TILE
+        across = _cells(centres, profile.uvt_resolution).astype(np.int64)
+        along = _cells(centres, profile.plane_columns)
+        slices, rows = (
+            _cells(encode_time(axis)[0], count, axis.periodic).any(0)
+            if axis.interpolation == "radiance"
+            else np.ones(count, bool)
+            for count in (profile.uvt_slices, profile.plane_rows)
+        )
+        return cls(
+            slices,
+            across.T @ used @ across > 0,
+            rows,
+            np.stack([along[used.any(axis)].any(0) for axis in (0, 1)]),
+        )
+
+
+def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray:
+    """Returns the texels of an axis that linear filtering reads at places in [0, 1], bool [places, count]."""
+    x = np.asarray(places, np.float64) * count - 0.5
+    first, last = np.floor(x - _SLACK), np.floor(x + _SLACK) + 1
+    cells = np.zeros((len(x), count), bool)
+    for step in range(3):
+        cell = np.minimum(first + step, last).astype(np.int64)
+        cells[np.arange(len(x)), cell % count if periodic else cell.clip(0, count - 1)] = True
+    return cells
+
+
+def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads | None) -> dict[str, np.ndarray]:
+    """Sets texels that no valid texel reads to zero; the decoded light stays the same.
+
+    Args:
+        parts: `uv`, uint8 [32, 32, 16], and of a dynamic tile `uvt`, `ut` and `vt`.
+        used: bool [128, 128], the valid texels of the tile.
+        reads: The reads of a dynamic tile; None for a static one.
+
+    Returns:
+        The same parts.
+    """
+    result = dict(parts)
+    result["uv"] = _cleared(parts["uv"].reshape(-1, BLOCK_BYTES), _by_block(used)).reshape(parts["uv"].shape)
+    if reads is None:
+        return result
+    texels = (reads.slices[:, None, None] & _by_block(reads.texels)).reshape(-1, 16)
+    result["uvt"] = _cleared(parts["uvt"].reshape(-1, BLOCK_BYTES), texels).reshape(parts["uvt"].shape)
+    for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
+        result[name] = parts[name] * (reads.rows[:, None] & columns)[..., None]
+    return result
+
+
+def _by_block(texels: np.ndarray) -> np.ndarray:
+    """Rearranges texels [4 h, 4 w] block by block, [h w, 16]."""
+    h, w = texels.shape
+    return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
+
+
+def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Clears the unused texels, bool [n, 16], of blocks [n, 16]."""
+    ends, indices = _unpacked(blocks)
+    ends, indices = ends * used.any(1)[:, None, None], indices * used
+    # The first index of a block is below 8, which fixes the order of its endpoints; if it is unused, they are sorted.
+    swapped = ~used[:, 0] & (ends[:, 0].sum(1, dtype=int) > ends[:, 1].sum(1, dtype=int))
+    ends[swapped] = ends[swapped][:, ::-1]
+    indices[swapped] = (15 - indices[swapped]) * used[swapped]
+    return pack_mode6(ends, indices)
+
+
+# ---- bytes of a tile in the file ----
+
+
+def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
+    """Checks the maps and networks of tiles before they are used.
+
+    Args:
+        parts: `uv`, `net` and, of dynamic tiles, `uvt`, as a trainer returns them.
+        profile: The settings.
+        dynamic: Whether the tiles are dynamic instead of static.
+
+    Raises:
+        WlmError: A block is not of BC7 mode 6, or a network is not on the levels that the settings state.
+    """
+    for name in ("uv", "uvt") if dynamic else ("uv",):
+        _unpacked(parts[name].reshape(-1, BLOCK_BYTES))
+    if profile.net_bits == 8:
+        for net in parts["net"]:
+            pack_network(net, profile.inputs(dynamic), profile.hidden)
+
+
+def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Splits blocks [n, 16] into endpoints, uint8 [n, 2, 4], and indices [n, 16]."""
+    try:
+        return unpack_mode6(blocks)
+    except WlmError as error:
+        raise WlmError("maps: expected blocks of BC7 mode 6, found others") from error
+
+
+def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
+    """Splits blocks of mode 6, uint8 [..., 16], into bytes of endpoints and of indices, uint8 [n, 8] each.
+
+    The P bit of the first endpoint is the top bit of the first byte; that of the second is in the half with the
+    indices.
+    """
+    low, high = np.ascontiguousarray(blocks).reshape(-1, BLOCK_BYTES).view("<u8").T
+    if ((low & _LOW_7) != _MODE_6).any():
+        raise WlmError("maps: expected blocks of BC7 mode 6, found others")
+    ends = ((low[:, None] >> _END_SHIFTS) & _LOW_7).astype(np.uint8)
+    ends[:, 0] |= (low >> _LAST_BIT).astype(np.uint8) << 7
+    return [ends, np.ascontiguousarray(high).view(np.uint8).reshape(-1, 8)]
+
+
+def _join_blocks(data: np.ndarray) -> np.ndarray:
+    """Returns the blocks, uint8 [n, 16], of the bytes of `_split_blocks`, uint8 [16 n]."""
+    ends, indices = data.reshape(2, -1, 8)
+    if (ends[:, 1:] > 127).any():
+        raise ValueError("expected endpoints of 7 bits")
+    words = np.empty((len(ends), 2), "<u8")
+    wide = ends.astype(np.uint64)
+    words[:, 0] = _MODE_6 | (wide[:, 0] >> np.uint64(7)) << _LAST_BIT
+    for i, shift in enumerate(_END_SHIFTS):
+        words[:, 0] |= (wide[:, i] & _LOW_7) << shift
+    words[:, 1] = np.ascontiguousarray(indices).view("<u8")[:, 0]
+    return words.view(np.uint8)
+
+
+def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
+    """Returns a network with 8-bit weights as bytes: the integers of all weights, then the magnitudes and biases.
+
+    The weights into one unit share the largest magnitude m among them, a half float; a weight is q m / 127 with an
+    integer q from -127 to 127, rounded to a half float. Biases are half floats. The fit evaluates exactly these numbers
+    (`wlm_kernels.lightmap.levels`), so that the file loses nothing.
+
+    Args:
+        net: float16 [P], see `SheetModel.net`.
+        inputs, hidden: I and H.
+
+    Raises:
+        WlmError: A weight is not on its level.
+    """
+    whole, halves = [], []
+    for weights, bias in _layers(net, inputs, hidden):
+        most = np.abs(weights).max(0)
+        step = most.astype(np.float32) / np.float32(LEVELS)
+        q = np.rint(np.divide(weights, step, out=np.zeros(weights.shape, np.float32), where=step > 0))
+        if not np.array_equal((q * step).astype(np.float16), weights):
+            raise WlmError("net: expected weights on 8-bit levels, found others")
+        whole.append(q.astype(np.int8).ravel())
+        halves += [most, bias]
+    return np.concatenate([np.concatenate(whole).view(np.uint8), _apart(np.concatenate(halves))])
+
+
+def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
+    """Returns the network, float16 [P], of the bytes of `pack_network`."""
+    shapes = (inputs, hidden), (hidden, hidden), (hidden, 3)
+    count = sum(rows * units for rows, units in shapes)
+    whole, halves = data[:count].view(np.int8), _together(data[count:])
+    parts, at, place = [], 0, 0
+    for rows, units in shapes:
+        most, bias = halves[place : place + 2 * units].reshape(2, units)
+        step = most.astype(np.float32) / np.float32(LEVELS)
+        q = whole[at : at + rows * units].reshape(rows, units).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are refused later
+            parts += [(q * step).astype(np.float16).ravel(), bias]
+        at, place = at + rows * units, place + 2 * units
+    return np.concatenate(parts).astype(np.float16)
+
+
+def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Splits a network into the weights [inputs, units] and biases [units] of each layer."""
+    split = (inputs + hidden + 2) * hidden
+    rows, output = net[:split].reshape(-1, hidden), net[split:].reshape(-1, 3)
+    return [(rows[:inputs], rows[inputs]), (rows[inputs + 1 : -1], rows[-1]), (output[:-1], output[-1])]
+
+
+def _apart(halves: np.ndarray) -> np.ndarray:
+    """Returns half floats as their low bytes and then their high bytes, which resemble each other."""
+    return np.ascontiguousarray(halves, "<f2").view(np.uint8).reshape(-1, 2).T.ravel()
+
+
+def _together(data: np.ndarray) -> np.ndarray:
+    """Returns the half floats of the bytes of `_apart`."""
+    return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
+
+
+# ---- tiles on a device ----
+
+
+class MapTiles(DeviceTiles):
+    """The static or the dynamic tiles of a sheet on a device.
+
+    Attributes:
+        model: The sheet.
+        places: int [n], 0 to n - 1 on the device: positions of the tiles in the arrays of a `TimeState`.
+        arguments: First arguments of each decode kernel: `Stored`, hidden vecH [n, I + H + 2], output vec3 [n, H + 1].
+    """
+
+    def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
+        """Uploads the tiles of a kind, DYNAMIC or STATIC.
+
+        Raises:
+            WlmError: The sheet has none.
+        """
+        profile, dynamic = sheet.profile, kind == TileKind.DYNAMIC
+        rows = np.flatnonzero(sheet.kind[sheet.mapped] == kind)
+        if not len(rows):
+            raise WlmError(f"{sheet.name}: expected at least one {kind.name.lower()} tile, found none")
+        super().__init__(sheet.mapped[rows])
+        self.model, self._device = sheet, device
+        self._axis, self._scale = sheet.axis, sheet.scales[rows]
+        self._peak = decode_scale(sheet.peak[rows], profile.gamma)
+        affine = np.ascontiguousarray(sheet.affine[rows].astype(np.float32).swapaxes(0, 1))
+        self._shift, self._spread = (wp.array(values, dtype=wp.vec3, device=device) for values in affine)
+        self.places = wp.array(np.arange(len(rows), dtype=np.int32), dtype=int, device=device)
+        self._kernels = decode_kernels.exact_kernels(dynamic, profile.hidden, gelu)
+
+        def blocks(values: np.ndarray) -> wp.array:
+            words = np.ascontiguousarray(values).view("<u8")
+            return wp.array(words.reshape(-1, *words.shape[-3:]), dtype=wp.uint64, device=device)
+
+        stored = decode_kernels.Stored()
+        stored.slices, stored.periodic = profile.uvt_slices, int(self._axis.periodic)
+        maps = {"uv": blocks(sheet.uv[rows])}
+        if dynamic:
+            maps["uvt"] = blocks(sheet.uvt)
+            for name in ("ut", "vt"):
+                maps[name] = wp.array(np.ascontiguousarray(getattr(sheet, name)), dtype=wp.vec2ub, device=device)
+        for name, values in maps.items():
+            setattr(stored, name, values)
+        net = (sheet.net if dynamic else sheet.net_static).astype(np.float32)
+        split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
+        hidden = np.ascontiguousarray(net[:, :split]).reshape(len(net), -1, profile.hidden)
+        output = np.ascontiguousarray(net[:, split:]).reshape(len(net), -1, 3)
+        hidden = wp.array(hidden, dtype=wp.types.vector(profile.hidden, float), device=device)
+        output = wp.array(output, dtype=wp.vec3, device=device)
+        self.arguments = (stored, hidden, output)
+        self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
+
+    def bounds(self, time: float) -> np.ndarray:
+        before, after, share = self._axis.neighbours(time)
+        return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
+
+    def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
+        """Returns the numbers that kernels need for one time.
+
+        Args:
+            time: In the unit of the set's times.
+            state: From an earlier call, overwritten in place; None allocates a new one.
+        """
+        before, after, share = self._axis.neighbours(time)
+        if state is None:
+            state = decode_kernels.TimeState()
+            state.gamma, state.shift, state.spread = self.model.profile.gamma, self._shift, self._spread
+            state.scale = wp.empty_like(self._shift)
+            state.inverse_peak = wp.empty(len(self.numbers), dtype=float, device=self._device)
+        scale = (1.0 - share) * self._scale[:, before] + share * self._scale[:, after]
+        state.scale.assign(scale.astype(np.float32))
+        state.inverse_peak.assign(inverse_of(self.bounds(time)))
+        state.tau, state.encoding = self._axis.place(time), wp.vec4(*self._axis.encode(time))
+        return state
+
+    def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
+        """Decodes tiles in training's order of operations, one thread a texel.
+
+        Args:
+            state: From `state`.
+            rows: int [k], positions in `numbers`.
+            form: 0 for radiance (vec3), 1 for 8 bits, 2 for RGB9E5 (uint32).
+            out: [k, 128, 128], written.
+        """
+        inputs = [*self.arguments, state, self.places, rows]
+        wp.launch(self._kernels[form], out.shape, inputs=inputs, outputs=[out], device=self._device)
+
+    def _decoded(self, rows: np.ndarray, time: float, form: int) -> wp.array:
+        dtype = wp.uint32 if form else wp.vec3
+        out = wp.empty((len(rows), TILE, TILE), dtype=dtype, device=self._device)
+        self.launch(self.state(time), wp.array(rows, dtype=int, device=self._device), form, out)
+        return out
+
+    def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
+        reads = self._axis.reads(time)
+        if len(reads) == 1:
+            return self._decoded(rows, reads[0][0], 0).numpy()
+        return sum(np.float32(share) * self._decoded(rows, stamp, 0).numpy() for stamp, share in reads)
+
+    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
+        if len(self._axis.reads(time)) == 1:
+            return rgba(self._decoded(rows, time, 1))
+        factor = inverse_of(self.bounds(time)[rows])[:, None, None, None]
+        colour = self.radiance(rows, time) ** (1.0 / self.model.profile.gamma) * factor
+        out = np.full((len(rows), TILE, TILE, 4), 255, np.uint8)
+        out[..., :3] = np.clip(colour, 0.0, 1.0) * 255.0 + 0.5
+        return out
+
+
+# ---- textures, networks and tables of the shader ----
+
+
+def fours(profile: Profile) -> int:
+    """Returns how many groups of four numbers a layer of the networks has, the last one filled up with zeros."""
+    return -(-profile.hidden // 4)
+
+
+def shader_networks(sheet: SheetModel) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the networks of all tiles as the shader reads them: W1, b1, W2, b2, W3, b3, a row of W for each input.
+
+    Dynamic tiles come first, then static ones. Rows are filled up with zeros to groups of four, and rows of zeros are
+    added for the units that this adds. The centring of features from textures, (f - 1/2) sqrt(12), is in W1 and b1.
+
+    Returns:
+        float32 [n, 4]; `network_starts` says where each network begins.
+    """
+    hidden, wide = sheet.profile.hidden, 4 * fours(sheet.profile)
+    made = [np.zeros((0, 4), np.float32)]
+    for nets, centred in ((sheet.net, _TEMPORAL), (sheet.net_static, _MAPS)):
+        for net in nets:
+            count = len(net) - 3 * (hidden + 1)
+            layers, output = net[:count].astype(np.float64).reshape(-1, hidden), net[count:].reshape(-1, 3)
+            inputs = len(layers) - hidden - 2
+            # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
+            layers[:centred] *= SQRT_12
+            layers[inputs] -= 0.5 * layers[:centred].sum(0)
+            added = wide - hidden
+            layers = np.insert(layers, np.full(added, len(layers) - 1), 0.0, axis=0)
+            output = np.insert(output.astype(np.float64), np.full(added, hidden), 0.0, axis=0)
+            rows = np.pad(layers, ((0, 0), (0, added))).reshape(-1, 4), np.pad(output, ((0, 0), (0, 1)))
+            made += [part.astype(np.float32) for part in rows]
+    return np.concatenate(made)
+
+
+def network_starts(sheet: SheetModel) -> np.ndarray:
+    """Returns the index of the first row of each network in `shader_networks`, int [N_m]."""
+    wide = fours(sheet.profile)
+    sizes = [
+        np.full(len(nets), (sheet.profile.inputs(temporal) + 4 * wide + 2) * wide + 4 * wide + 1)
+        for nets, temporal in ((sheet.net, True), (sheet.net_static, False))
+    ]
+    return np.concatenate([[0], np.cumsum(np.concatenate(sizes))])[:-1].astype(int)
+
+
+def image_rows(sheet: SheetModel) -> np.ndarray:
+    """Returns the index of each tile with maps, in the order of `mapped`, among the images of the textures, int [N_m].
+
+    Dynamic tiles come first, then static ones.
+    """
+    static = sheet.kind[sheet.mapped] == TileKind.STATIC
+    rows = np.empty(len(static), int)
+    rows[np.argsort(static, kind="stable")] = np.arange(len(static))
+    return rows
+
+
+class Maps(Encoding):
+    """Stores feature maps and a network."""
+
+    kinds = (TileKind.STATIC, TileKind.DYNAMIC)
+    codes = (1, 2)
+
+    def packed_size(self, sheet: SheetModel, number: int) -> int:
+        return tile_bytes(sheet.profile, bool(sheet.kind[number] == TileKind.DYNAMIC))
+
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile
+        pieces = _split_blocks(sheet.uv[sheet.map_row(number)])
+        if dynamic:
+            pieces += [*_split_blocks(sheet.uvt[row]), sheet.ut[row], sheet.vt[row]]
+        net = sheet.net[row] if dynamic else sheet.net_static[row]
+        wide = profile.net_bits == 16
+        pieces.append(_apart(net) if wide else pack_network(net, profile.inputs(bool(dynamic)), profile.hidden))
+        return b"".join(piece.tobytes() for piece in pieces)
+
+    def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
+        dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile
+        at = 0
+
+        def fill(values: np.ndarray, blocks: bool) -> None:
+            nonlocal at
+            piece = data[at : at + values.size]
+            values[...] = (_join_blocks(piece) if blocks else piece).reshape(values.shape)
+            at += values.size
+
+        fill(sheet.uv[sheet.map_row(number)], True)
+        if dynamic:
+            fill(sheet.uvt[row], True)
+            fill(sheet.ut[row], False)
+            fill(sheet.vt[row], False)
+        net = sheet.net if dynamic else sheet.net_static
+        wide = profile.net_bits == 16
+        rest = data[at:]
+        net[row] = _together(rest) if wide else unpack_network(rest, profile.inputs(bool(dynamic)), profile.hidden)
+
+    def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
+        kinds = [kind for kind in (TileKind.DYNAMIC, TileKind.STATIC) if (sheet.kind == kind).any()]
+        return [MapTiles(sheet, kind, device, gelu) for kind in kinds]
+
+    def textures(self, sheet: SheetModel) -> dict[str, Texture]:
+        profile, made = sheet.profile, {}
+        if len(sheet.uv):
+            order = np.argsort(image_rows(sheet))
+            made["uv"] = Texture(**side_by_side(sheet.uv[order], "BC7_UNORM", TILE, TILE))
+        if len(sheet.uvt):
+            side, slices = profile.uvt_resolution, sheet.uvt.reshape(-1, *sheet.uvt.shape[2:])
+            made["uvt"] = Texture(**side_by_side(slices, "BC7_UNORM", side, side))
+            planes = np.stack([sheet.ut, sheet.vt], 1).reshape(-1, *sheet.ut.shape[1:])
+            size = profile.plane_rows, profile.plane_columns
+            made["planes"] = Texture(**side_by_side(planes, "R8G8_UNORM", *size))
+        return made
+
+    def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
+        at = sheet.map_row(number)
+        image = int(image_rows(sheet)[at])
+        shift, spread = sheet.affine[at]
+        return {
+            "image": image,
+            "shift": rounded(shift),
+            "spread": rounded(spread),
+            "scale": rounded(sheet.scales[at]),
+            "peak": rounded(decode_scale(sheet.peak[at], sheet.profile.gamma)),
+            "network_four": int(network_starts(sheet)[image]),
+        }
+
+    def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
+        axis, wide = sheet.axis, fours(sheet.profile)
+        weights, starts = shader_networks(sheet), network_starts(sheet)
+        scales, affine = sheet.scales.astype(np.float64), sheet.affine.astype(np.float64)
+        for place, (number, image) in enumerate(zip(sheet.mapped, image_rows(sheet), strict=True)):
+            start, (shift, spread) = int(starts[image]), affine[place]
+            temporal = sheet.kind[number] == TileKind.DYNAMIC
+            inputs, encoded = (_TEMPORAL, 4) if temporal else (_MAPS, 0)
+            layer = weights[start + inputs * wide : start + (inputs + encoded + 1) * wide].astype(np.float64)
+            layer = layer.reshape(-1, wide, 4)
+            for table, time in zip(records, times, strict=True):
+                before, after, share = axis.neighbours(time)
+                scale = (1.0 - share) * scales[place, before] + share * scales[place, after]
+                record = table[number]
+                record[0, 1:3] = image, start
+                record[1, :3], record[2, :3] = shift * scale, spread * scale
+                code = axis.encode(time).astype(np.float64)[:encoded]
+                record[3 : 3 + wide] = layer[-1] + np.tensordot(code, layer[:-1], 1)
+
+    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
+        if kind == TileKind.DYNAMIC:
+            less = ", and BC7 at each time would take more bytes" if sheet.profile.frames == "auto" else ""
+            return f"the light changes over time{less}"
+        if len(sheet.times) == 1:
+            return "there is one time"
+        return f"one pattern that only changes in brightness has {sheet.profile.static_budget_db:g} dB at all times"

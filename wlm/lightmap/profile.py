@@ -1,0 +1,191 @@
+"""Settings of a lightmap fit, and the time axis of the feature maps."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from wlm.errors import WlmError
+from wlm.lightmap.sheet import Sheet
+from wlm.system import Settings
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+
+_MOST_ALONG_TIME = 64
+_USUAL_TIMES = 26  # number of times of the paper's sets
+
+
+class Profile(Settings):
+    """Settings of a fit: the sizes of the feature maps (table 3 of the paper) and the training.
+
+    Each field is described by the string below it.
+    """
+
+    FILES: ClassVar[str] = "lightmap"
+
+    hidden: int = Field(16, ge=4, le=128)
+    """Width of both hidden layers of the network."""
+    uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
+    """Texels of F_uvt along u and along v."""
+    uvt_slices: int = Field(12, ge=1, le=_MOST_ALONG_TIME)
+    """Slices of F_uvt along time."""
+    plane_columns: int = Field(64, ge=1, le=128)
+    """Texels of F_ut along u and of F_vt along v."""
+    plane_rows: int = Field(24, ge=1, le=_MOST_ALONG_TIME)
+    """Texels of F_ut and F_vt along time."""
+    follow_times: bool = False
+    """Adapt the sizes along time to the number of stored times, see `Profile.for_times`."""
+    net_bits: Literal[8, 16] = 16
+    """Bits of a network weight in the file: 16 (half floats) or 8."""
+    gelu: Literal["exact", "tanh"] = "tanh"
+    """Form of the GELU; GPUs have an instruction for tanh."""
+    gamma: float = Field(2.2, ge=1.0, le=4.0)
+    """The maps approximate radiance ** (1 / gamma)."""
+    time_axis: Literal["paper", "frames"] = "frames"
+    """Time axis of the features. "paper": the hour divided by the period, clamped at its ends. "frames": every interval
+    between stored times has the same length, so that a lamp that is switched within minutes gets as many texels as an
+    hour of the afternoon; the axis wraps if the set is periodic."""
+    interpolation: Literal["radiance", "network"] = "radiance"
+    """Light between two stored times. "radiance": the mix of the radiance of both (eq. 2). "network": the network's
+    output for features that are interpolated in time, as in the paper."""
+    steps: int = Field(20000, ge=10)
+    """Steps of the fit."""
+    samples: int = Field(4096, ge=128, multiple_of=128)
+    """Random samples of each tile in one step."""
+    map_rate: float = Field(2e-2, gt=0.0, lt=1.0)
+    """Initial learning rate of the feature maps (Adam)."""
+    net_rate: float = Field(1e-2, gt=0.0, lt=1.0)
+    """Initial learning rate of the network (Adam)."""
+    final_rate: float = Field(1e-3, ge=0.0, le=1.0)
+    """Final learning rate as a fraction of the initial one; the schedule is half a cosine."""
+    adam_decay: float = Field(0.999, ge=0.5, lt=1.0)
+    """Adam's decay of squared gradients, beta 2. A texel is sampled only every few steps and its gradient shrinks by
+    orders of magnitude during a fit: 0.99 follows that and gains 0.1 to 0.8 dB over 0.999 in short fits, and nothing in
+    long ones."""
+    metric_weight: float = Field(0.5, ge=0.0, le=1.0)
+    """Loss. 0: squared error in normalised gamma space, as in the paper. 1: squared error of linear radiance relative
+    to the range of the tile at that time, which is what PSNR measures. Values between take the geometric mean."""
+    quantise_from: float = Field(0.5, ge=0.0, le=1.0)
+    """Fraction of the steps after which the maps are quantised to the exact levels of the file."""
+    freeze_from: float = Field(0.95, ge=0.0, le=1.0)
+    """Fraction of the steps after which the maps are frozen and only the network is trained."""
+    peak: float | None = Field(None, gt=0.0)
+    """Range that errors are relative to, for values that are not light; default: the range of the tile at each time, as
+    in the paper's protocol."""
+    static_budget_db: float = Field(60.0, gt=0.0)
+    """Lowest PSNR in dB with which a tile is stored as one pattern that only changes in brightness."""
+    frames: Literal["auto", "never", "always"] = "auto"
+    """Which tiles are stored as BC7 at each time instead of maps and a network. "auto": those that take no more bytes
+    of GPU memory that way."""
+
+    @model_validator(mode="after")
+    def _stages_in_order(self) -> "Profile":
+        if self.quantise_from > self.freeze_from:
+            raise ValueError("quantise_from must not be later than freeze_from")
+        return self
+
+    def for_times(self, times: int) -> "Profile":
+        """Returns the settings with sizes along time for a set of that many times.
+
+        With `follow_times` F_uvt, F_ut and F_vt have at most one slice or row for each stored time: more would only
+        hold mixtures. Beyond 26 times the sizes grow in proportion, up to 64.
+        """
+        if not self.follow_times:
+            return self
+        sizes = {
+            name: min(times, _MOST_ALONG_TIME, max(fixed, round(fixed * times / _USUAL_TIMES)))
+            for name, fixed in (("uvt_slices", self.uvt_slices), ("plane_rows", self.plane_rows))
+        }
+        return self.override(sizes | {"follow_times": False})
+
+    def for_sheet(self, sheet: Sheet) -> "Profile":
+        """Returns the settings of a sheet. A linear sheet has no gamma, and its errors are relative to [0, 1]."""
+        return self.override({"gamma": 1.0, "peak": 1.0}) if sheet.linear else self
+
+    def inputs(self, temporal: bool) -> int:
+        """Returns the number of inputs of the network of a tile with (`temporal`) or without temporal maps."""
+        return TEMPORAL_INPUTS if temporal else STATIC_INPUTS
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """Places a time on the time axis of the features; see `Profile.time_axis`.
+
+    Attributes:
+        times: float64 [T], increasing.
+        period: Length of the day in the unit of the times, or None.
+        kind: "paper" or "frames".
+        interpolation: "radiance" or "network", see `Profile.interpolation`.
+    """
+
+    times: np.ndarray
+    period: float | None
+    kind: str
+    interpolation: str = "radiance"
+
+    @property
+    def periodic(self) -> bool:
+        """Whether the time axis of the features wraps."""
+        return self.period is not None and self.kind == "frames" and len(self.times) > 1
+
+    @property
+    def turn(self) -> float:
+        """Factor of tau in gamma(t) of eq. 4, in radians: a full turn if the axis wraps."""
+        return (2.0 if self.periodic else 1.0) * math.pi
+
+    def wrap(self, t: float) -> float:
+        """Wraps a time by the period, or clamps it to the first and last stored time.
+
+        Raises:
+            WlmError: The time is not finite.
+        """
+        if not math.isfinite(t):
+            raise WlmError(f"time: expected a finite number, got {t}")
+        if self.period is not None:
+            return t % self.period
+        return float(np.clip(t, self.times[0], self.times[-1]))
+
+    def neighbours(self, t: float) -> tuple[int, int, float]:
+        """Returns the indices of the stored times around t and the weight of the second one in eq. 2."""
+        t = self.wrap(t)
+        n = len(self.times)
+        after = int(np.searchsorted(self.times, t, side="right"))
+        before = after - 1
+        if self.period is None:
+            before, after = max(before, 0), min(after, n - 1)
+            gap = self.times[after] - self.times[before]
+            return before, after, float((t - self.times[before]) / gap) if gap > 0 else 0.0
+        before, after = before % n, after % n
+        gap = (self.times[after] - self.times[before]) % self.period
+        gap = gap if gap > 0 else self.period  # with one stored time the whole day is one interval
+        return before, after, float(((t - self.times[before]) % self.period) / gap)
+
+    def place(self, t: float) -> float:
+        """Returns tau in [0, 1], the position at which the features are read at time t."""
+        if self.kind == "paper":
+            first = 0.0 if self.period is not None else self.times[0]
+            span = self.period if self.period is not None else max(self.times[-1] - self.times[0], 1e-12)
+            return float((self.wrap(t) - first) / span)
+        before, _, share = self.neighbours(t)
+        tau = (before + share + 0.5) / len(self.times)
+        return tau % 1.0 if self.periodic else tau
+
+    def reads(self, t: float) -> list[tuple[float, float]]:
+        """Returns the times at which the network is evaluated for time t, each with its share of the radiance."""
+        before, after, share = self.neighbours(t)
+        if self.interpolation == "network":
+            return [(t, 1.0)]
+        pair = [(float(self.times[before]), 1.0 - share), (float(self.times[after]), share)]
+        return [read for read in pair if read[1] > 0.0]
+
+    def encode(self, t: float) -> np.ndarray:
+        """Returns gamma(t) of eq. 4, float32 [4]."""
+        turn = self.turn * self.place(t)
+        return np.array([math.sin(turn), math.cos(turn), math.sin(2 * turn), math.cos(2 * turn)], np.float32)
+
+
+def encode_time(axis: TimeAxis) -> tuple[np.ndarray, np.ndarray]:
+    """Returns tau [T] and gamma(t) [T, 4] of every stored time, float32."""
+    tau = np.array([axis.place(t) for t in axis.times], np.float32)
+    return tau, np.stack([axis.encode(t) for t in axis.times])

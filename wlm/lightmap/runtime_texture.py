@@ -1,0 +1,166 @@
+"""A whole map at run time as one texture that a renderer samples: RGB9E5 with mips, on the device.
+
+Tiles of 8 bits have a bound each, so that a filter must not cross from one to the next. Here they lie in one texture of
+also 32 bits a texel, with gaps filled over the whole map and mips of the texels inside charts.
+"""
+
+import json
+import os
+
+import numpy as np
+import warp as wp
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.formats.dds import MOST_SIDE, write_dds
+from wlm.formats.shared_exponent import unpack_rgb9e5
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings.constant import ConstantTiles
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.runtime import runtime_decoders
+from wlm.lightmap.tiles import TILE, TileKind
+from wlm.texels import near_gaps
+from wlm_kernels.lightmap import texture
+
+
+class MapDecoder:
+    """All tiles of a sheet in one texture and its mips.
+
+    Attributes:
+        levels: `wp.array` uint32 [h, w] each, RGB9E5, written by `decode`: the map, then mips of half the size, rounded
+            down. A texel of a mip is the mean of the valid texels of stored tiles that it covers; gaps within
+            `wlm.texels.REACH` of those hold the nearest one of their own level.
+        decoders: The decoder of each kind of tile.
+    """
+
+    def __init__(self, model: SheetModel, device: str = "cpu", mips: int | None = None) -> None:
+        """Uploads a sheet and allocates all buffers; the time is the first stored one.
+
+        Args:
+            model: The sheet.
+            device: "cpu", "cuda" or "cuda:N".
+            mips: Number of levels below the map; None: down to one texel.
+
+        Raises:
+            WlmError: There is no such device, or the map does not have that many mips.
+        """
+        self.model, self.device = model, interop.check_device(device)
+        most = max(model.height, model.width).bit_length() - 1
+        if mips is not None and not 0 <= mips <= most:
+            raise WlmError(f"mips: expected 0 to {most} for a map of {model.width}x{model.height}, got {mips}")
+        self.decoders = runtime_decoders(model, self.device, shared=True)
+        self._corners = [self._places(decoder.numbers) for decoder in self.decoders]
+        self._constant = ConstantTiles(model)
+        self._constant_corners = self._places(self._constant.numbers)
+        self._colours = wp.empty(len(self._constant.numbers), dtype=wp.vec3, device=self.device)
+        self._allocate(most if mips is None else mips)
+        self.set_time(float(model.times[0]))
+
+    def _allocate(self, mips: int) -> None:
+        self.levels, self._weights, self._gaps = [], [], []
+        weight = self.model.mask.astype(np.float32)
+        # Valid texels of tiles that are not stored would darken mips.
+        for number in self.model.numbers(TileKind.EMPTY):
+            weight[self.model.grid.window(number)] = 0.0
+        for level in range(mips + 1):
+            if level:
+                weight = _halved(weight)
+            self.levels.append(wp.zeros(weight.shape, dtype=wp.uint32, device=self.device))
+            self._weights.append(wp.array(weight, dtype=float, device=self.device))
+            self._gaps.append([self._vectors(at) for at in near_gaps(weight > 0)])
+
+    def _vectors(self, at: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(at, np.int32), dtype=wp.vec2i, device=self.device)
+
+    def _places(self, numbers: np.ndarray) -> wp.array:
+        grid = self.model.grid
+        return self._vectors(np.array([grid.origin(int(number)) for number in numbers]).reshape(-1, 2))
+
+    def set_time(self, time: float) -> None:
+        """Sets the time of the following decodes; a graph captured before is out of date, as for `StripDecoder`.
+
+        Args:
+            time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
+
+        Raises:
+            WlmError: The time is not finite.
+        """
+        for decoder in self.decoders:
+            decoder.set_time(time)
+        self._colours.assign(self._constant.colours(time))
+
+    def decode(self) -> None:
+        """Decodes the map into `levels`. It only launches kernels, allocates nothing and can be captured."""
+        whole = self.levels[0]
+        for decoder, corners in zip(self.decoders, self._corners, strict=True):
+            decoder.decode()
+            texture.place(decoder.out, corners, whole)
+        if len(self._colours):
+            texture.paint(self._colours, self._constant_corners, TILE, whole)
+        for i, (level, (target, source)) in enumerate(zip(self.levels, self._gaps, strict=True)):
+            if i:
+                texture.halve(self.levels[i - 1], self._weights[i - 1], level)
+            if len(target):
+                texture.fill(target, source, level)
+
+    def numpy(self, level: int = 0) -> np.ndarray:
+        """Returns a level of the last decode on the host: linear radiance, float32 [h, w, 3]."""
+        return unpack_rgb9e5(self.levels[level].numpy())
+
+
+def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, device: str = "cpu") -> None:
+    """Writes the map at one time as a renderer samples it: a DDS of RGB9E5 texels with all mips.
+
+    Args:
+        path: The DDS.
+        model: The sheet.
+        time: In the unit of the set's times.
+        device: Device that decodes.
+
+    Raises:
+        WlmError: There is no such device, the time is not finite, the map is larger than a DDS may be, or the file can
+            not be written.
+    """
+    if max(model.height, model.width) > MOST_SIDE:
+        size = f"{model.width}x{model.height}"
+        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} texels along a side for a DDS, found {size}")
+    decoder = MapDecoder(model, device)
+    decoder.set_time(time)
+    decoder.decode()
+    texels = b"".join(level.numpy().astype("<u4").tobytes() for level in decoder.levels)
+    mips = len(decoder.levels) - 1
+    write_dds(path, texels, model.width, model.height, fmt="R9G9B9E5_SHAREDEXP", mips=mips)
+
+
+def write_8bit(
+    path: str | os.PathLike[str], decoder: SheetDecoder, time: float, values: tuple[float, float] | None = None
+) -> None:
+    """Writes a map as a texture cache holds it: a PNG of 8 bits, with gamma and the bound of each tile in its text
+    "wlm".
+
+    Args:
+        path: The PNG.
+        decoder: The decoder of the sheet.
+        time: In the unit of the set's times.
+        values: Values of the levels 0 and 1 of a linear sheet, which the text then has too; None: radiance.
+
+    Raises:
+        WlmError: The time is not finite, or the file can not be written.
+    """
+    pixels, bounds = decoder.frame_8bit(time)
+    text = PngInfo()
+    facts = {"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}
+    text.add_text("wlm", json.dumps(facts if values is None else facts | {"values": list(values)}))
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG", pnginfo=text)
+
+
+def _halved(weight: np.ndarray) -> np.ndarray:
+    """Returns sums of two by two texels [h, w]; the last texel of an odd side covers three."""
+    for axis in (0, 1):
+        starts = np.arange(max(weight.shape[axis] // 2, 1)) * 2
+        weight = np.add.reduceat(weight, starts, axis)
+    return weight

@@ -1,0 +1,156 @@
+"""`Sheet`: up to three channels of one layer of one atlas. Lightmap sets, models and reports are collections of sheets.
+
+An ordinary lightmap over time is one sheet: the channels R, G and B of the layer "light" of the atlas "0". A scene with
+several atlases has a sheet for each; a layer with more than three channels, such as SH coefficients, is split into
+sheets of three.
+
+Radiance is stored in gamma space. Directions, ratios of SH coefficients and masks are not light and have no gamma:
+their sheets hold levels in [0, 1] that are linear in the value, so that the kernels need no case for negative values
+and a mix of two hours mixes the values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.texels import MOST_TEXELS
+
+VALUE_RANGES = {"radiance": (0.0, 1.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
+"""The values that levels 0 and 1 stand for, by encoding. The levels of radiance are the values and have no upper
+end."""
+
+MOST_CHANNELS = 12
+"""Largest number of channels of an atlas, over all layers."""
+
+MOST_SHEETS = 1024
+"""Largest number of sheets of a set."""
+
+MOST_NAME = 128
+"""Largest number of characters in the name of a layer, an atlas or a channel."""
+
+WIDTH = 3
+"""Number of channels that the lightmap of a sheet holds."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Names the numbers that a lightmap of three channels holds.
+
+    A sheet of fewer than three channels repeats its last one. Block compression and networks store three equal channels
+    as well as one, and scores over the three are nearly the scores of the real channels.
+
+    Attributes:
+        atlas, layer: Names of the atlas and of the layer.
+        channels: One to three names of channels.
+        encoding: A key of `VALUE_RANGES`.
+    """
+
+    atlas: str = "0"
+    layer: str = "light"
+    channels: tuple[str, ...] = ("R", "G", "B")
+    encoding: str = "radiance"
+
+    @property
+    def label(self) -> str:
+        """Name of the sheet in messages: `Lightmap-0/dir RGB`."""
+        joint = "" if all(len(name) == 1 for name in self.channels) else ","
+        return f"{self.atlas}/{self.layer} {joint.join(self.channels)}"
+
+    @property
+    def linear(self) -> bool:
+        """Whether the sheet holds levels in [0, 1] instead of radiance."""
+        return self.encoding != "radiance"
+
+    @property
+    def values(self) -> tuple[float, float] | None:
+        """Values of the levels 0 and 1; None for radiance."""
+        return VALUE_RANGES[self.encoding] if self.linear else None
+
+    @property
+    def span(self) -> float:
+        """Difference between the values of the levels 1 and 0."""
+        least, greatest = VALUE_RANGES[self.encoding]
+        return greatest - least
+
+    def to_levels(self, values: np.ndarray) -> np.ndarray:
+        """Converts values [..., C] of the sheet's channels to levels, float32 [..., 3]."""
+        chosen = np.minimum(np.arange(WIDTH), len(self.channels) - 1)
+        levels = values[..., chosen].astype(np.float32)
+        if self.encoding == "signed":
+            levels = (levels + np.float32(1.0)) * np.float32(0.5)
+        return levels
+
+    def to_values(self, levels: np.ndarray) -> np.ndarray:
+        """Converts levels [..., 3] back to values, float32 [..., C]."""
+        values = levels[..., : len(self.channels)]
+        return values * np.float32(2.0) - np.float32(1.0) if self.encoding == "signed" else values
+
+
+LIGHT = Sheet()
+"""The sheet of an ordinary lightmap."""
+
+
+def sheets_of(atlas: str, layer: str, channels: tuple[str, ...], encoding: str) -> list[Sheet]:
+    """Returns the sheets of a layer of an atlas, three channels each, in the order of the channels."""
+    return [Sheet(atlas, layer, channels[first : first + WIDTH], encoding) for first in range(0, len(channels), WIDTH)]
+
+
+def first_light(sheets: Iterable[Sheet]) -> Sheet:
+    """Returns the first sheet of radiance, or the first sheet if there is none of radiance."""
+    sheets = list(sheets)
+    return next((sheet for sheet in sheets if not sheet.linear), sheets[0])
+
+
+def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: str | None) -> list[Sheet]:
+    """Returns the sheets of one layer of one atlas.
+
+    Args:
+        where: Name of the collection, for messages.
+        sheets: The sheets to choose from.
+        layer: Name of the layer; None takes the first layer of radiance, or the first layer.
+        atlas: Name of the atlas; None takes the first atlas that has the layer.
+
+    Raises:
+        WlmError: There is no such layer.
+    """
+    sheets = list(sheets)
+    named = [sheet for sheet in sheets if atlas in (None, sheet.atlas) and layer in (None, sheet.layer)]
+    if not named:
+        names = ", ".join(dict.fromkeys(f"{sheet.atlas}/{sheet.layer}" for sheet in sheets))
+        asked = f"{'any atlas' if atlas is None else atlas}/{'any layer' if layer is None else layer}"
+        raise WlmError(f"{where}: expected one of {names}, got {asked}")
+    first = first_light(named)
+    return [sheet for sheet in named if (sheet.atlas, sheet.layer) == (first.atlas, first.layer)]
+
+
+def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
+    """Checks the sheets that a set or a file claims to have, before memory is allocated for them.
+
+    Args:
+        where: The set or the file, for messages.
+        sizes: Height and width of each sheet.
+
+    Raises:
+        WlmError: There is no sheet; there are too many sheets, channels of an atlas or texels of all sheets; a channel
+            occurs twice; or an atlas has sheets of two sizes.
+    """
+    if not 1 <= len(sizes) <= MOST_SHEETS:
+        raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")
+    channels: dict[str, list[tuple[str, str]]] = {}
+    found: dict[str, tuple[int, int]] = {}
+    for sheet, size in sizes.items():
+        if found.setdefault(sheet.atlas, size) != size:
+            first, second = (f"{width}x{height}" for height, width in (found[sheet.atlas], size))
+            raise WlmError(f"{where}: {sheet.label} is {second}, but atlas {sheet.atlas} is {first}; expected one size")
+        channels.setdefault(sheet.atlas, []).extend((sheet.layer, name) for name in sheet.channels)
+    for atlas, names in channels.items():
+        if len(set(names)) < len(names):
+            raise WlmError(f"{where}: atlas {atlas}: expected each channel of a layer once")
+        if len(names) > MOST_CHANNELS:
+            raise WlmError(f"{where}: atlas {atlas}: expected at most {MOST_CHANNELS} channels, found {len(names)}")
+    if (texels := sum(height * width for height, width in sizes.values())) > MOST_TEXELS:
+        raise WlmError(f"{where}: expected at most {MOST_TEXELS} texels of all sheets, found {texels}")

@@ -1,0 +1,68 @@
+"""The bundle of a flip book: its textures in 8 bits, and the shader that shows it on a billboard."""
+
+import numpy as np
+
+from wlm.bundle import Bundle, Texture
+from wlm.errors import WlmError
+from wlm.smoke.camera import ALPHA
+from wlm.smoke.flipbook.book import Book
+from wlm.smoke.flipbook.shader import billboard_shader
+
+_MOST = 255  # largest level of 8 bits
+
+_ABOUT = {
+    "textures": "Frames of six-way lightmaps are in rows of cells from the top left, each of frame_size pixels with "
+    "padding around it. They are linear and premultiplied by the opacity; light is multiplied by gain. channels names "
+    "the direction from which the light of each channel comes, as seen from the camera.",
+    "motion": "Motion to the right and up until the next frame, in fractions of a frame: 127/255 + motion / (2 "
+    "motion_scale).",
+    "depth": "Distance of the smoke in front of the billboard, in heights of a frame: 127/255 + depth / (2 "
+    "depth_scale).",
+    "rate": "Frames per second.",
+    "extent": "Width and height of the region that a frame shows, in world units.",
+    "levels": "Number of mip levels; beyond them frames bleed into their neighbours.",
+    "clipped": "Number of values above the range of 8 bits, which are clipped.",
+}
+
+
+def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
+    """Makes the bundle of a flip book.
+
+    Args:
+        book: The flip book, with an opacity.
+        name: Name of the smoke, for an engine's assets.
+        device: Not used: a flip book is already on the CPU.
+
+    Raises:
+        WlmError: There is no opacity, or light is not finite.
+    """
+    if not any(ALPHA in names for names in book.channels.values()):
+        raise WlmError(f"{name}: has no opacity: expected an alpha channel, or a texture of it")
+    textures, clipped = {}, 0
+    for key, page in book.pages.items():
+        if not np.isfinite(page).all():
+            raise WlmError(f"{name}: {key}: cannot export: expected finite light, found NaN or infinity")
+        clipped += int((page > 1.0).sum())
+        pixels = np.ones((*page.shape[:2], 4), np.float32)
+        pixels[..., : page.shape[2]] = page
+        levels = np.round(np.clip(pixels, 0.0, 1.0) * _MOST).astype(np.uint8)
+        textures[key] = Texture.from_texels(levels, "R8G8B8A8_UNORM")
+    height, width = book.size
+    document = {
+        "about": _ABOUT,
+        "layout": book.layout,
+        "channels": {key: list(names) for key, names in book.channels.items()},
+        "rows": book.rows,
+        "columns": book.columns,
+        "frames": book.count,
+        "frame_size": [width, height],
+        "padding": book.padding,
+        "levels": book.levels,
+        "gain": book.gain,
+        "rate": book.rate,
+        "extent": [book.extent * width / height, book.extent],
+        "motion_scale": book.scale,
+        "depth_scale": book.reach,
+        "clipped": clipped,
+    }
+    return Bundle("smoke", name, billboard_shader(book), document, textures)
