@@ -34,9 +34,9 @@ VIEWS, RESOLUTION = 12, 256
 STEPS = 600
 DRAWN = [wlm.atlas.View.of((1.0, 0.7, 1.0)), wlm.atlas.View.of((0.4, 1.2, 1.0))]  # into the room
 
-# By profile: lower bounds of PSNR, CR of eq. 9, CR on disk without the mesh, and dB above downsampling at as many bits,
-# in views from around the room and from inside. Seed 0 gave 59.3 dB and 19.1 dB above, and 37.6 dB and 1.7 dB above: the
-# paper's texture is in half floats, 64 bits per texel on a GPU, the smaller lightmap in RGB9E5, 32.
+# By profile: lower bounds of PSNR, CR of eq. 9, CR on disk without the mesh and dB above downsampling at as many bits,
+# in views from around the room and from inside. Seed 0 gave 59.3 dB and 19.1 dB above, and 37.6 dB and 1.7 dB above: a
+# texel of the paper's texture takes 64 bits on a GPU (half floats), a texel of the smaller lightmap 32 (RGB9E5).
 LEAST = {
     "standard": (57.5, 0.83, 0.88, 17.5),
     "paper": (35.0, 0.915, 0.9, 0.5),

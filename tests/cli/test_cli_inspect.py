@@ -14,9 +14,9 @@ from builders.godot_bakes import Writer, bake, probes
 from builders.probe_models import random_model
 from PIL import Image
 from typer.testing import CliRunner
+from wlm.atlas.exporter import read_folder
 
 import wlm
-from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
 from wlm.export.engines.atlas import export_atlas
 from wlm.formats.exr import write_exr

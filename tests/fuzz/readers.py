@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
+from wlm.atlas.exporter import geometry, read_folder
 
 import wlm
 from benchmarks.rows import read_json
-from wlm.atlas.exporter import geometry, read_folder
 from wlm.atlas.listing import read_description
 from wlm.bake.geometry import read_geometry
 from wlm.bake.settings import LightmapSettings

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
+from wlm.atlas.display import screen_exposure
 
 from benchmarks.rivals.atlas import RIVALS, best_astc, block_codec, carving, downsampling, share_of, single_colour
 from wlm.atlas.data import from_arrays
-from wlm.atlas.display import screen_exposure
 from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import FILTERS, resize
 from wlm.atlas.views import scene_views, visible_uv

@@ -11,10 +11,10 @@ from builders.engine_scripts import Script, node_gives, pixels_of
 from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
 from test_folders import TEXTS, UNITY, as_glsl, compiled
-
 from wlm.atlas.scene.model import SHORT_ENTRY
-from wlm.export import ENGINES
 from wlm.export.engines.scene import export_scene
+
+from wlm.export import ENGINES
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.inspection import inspect
 

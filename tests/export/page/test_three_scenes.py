@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from builders.scene_folders import expected_picture, scene_folder
-
 from wlm.export.engines.scene import export_scene
 
 _SIZE = 96

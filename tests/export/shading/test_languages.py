@@ -18,15 +18,15 @@ from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, r
 from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
+from wlm.atlas.scene.exporter import factor_texels, sheet_texels
+from wlm.atlas.scene.shader import scene_glsl
 from wlm.lightmap.exporter import export as export_lightmap
 
 from wlm import probe
 from wlm.atlas.colour import quantise
-from wlm.atlas.exact import decode64
 from wlm.atlas.decode import Decoder as SceneDecoder
-from wlm.atlas.scene.exporter import factor_texels, sheet_texels
+from wlm.atlas.exact import decode64
 from wlm.atlas.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
-from wlm.atlas.scene.shader import scene_glsl
 from wlm.atlas.shader import atlas_glsl
 from wlm.errors import WlmError
 from wlm.export.shading import LANGUAGES, translate
