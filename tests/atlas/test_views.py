@@ -118,7 +118,8 @@ def test_inactive_triangles_hide_and_are_not_seen():
     visible, barycentric, at = _drawn(mesh, [0, 0, 1])
     assert set(np.unique(visible)) == {-1, 0}
     assert not barycentric[visible < 0].any() and not at[visible < 0].any()
-    flat = dataclasses.replace(mesh, active=np.array([True, True, True, True]))
+    whole = dataclasses.replace(mesh.sheets[0], active=np.array([True, True, True, True]))
+    flat = dataclasses.replace(mesh, sheets=(whole,))
     assert set(np.unique(_drawn(flat, [0, 0, 1])[0])) == {-1, 0, 1}
     assert set(np.unique(_drawn(mesh, [0, 0, -1])[0])) == {-1, 2, 3}
 

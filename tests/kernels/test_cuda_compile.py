@@ -36,7 +36,6 @@ MODULES = (
     "atlas.decode",
     "atlas.patch_graph",
     "atlas.patches",
-    "atlas.scene",
     "atlas.solve",
     pytest.param("bc6h", marks=pytest.mark.slow),  # several seconds
     "fluid.advection_places",

@@ -40,7 +40,7 @@ from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.formats.zstd import pack_parts, unpack_parts
 from wlm.system import Header, Name
-from wlm.texels import MOST_SIDE
+from wlm.texels import MOST_SIDE, check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # along an axis of a part
@@ -139,6 +139,8 @@ def decode(artifact: Artifact) -> AtlasModel:
         ValueError: The parts don't fit the settings; so with LookupError, TypeError and AttributeError.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
+    for size in header.sizes:
+        check_size(*size)
     parts = _checked_parts(header, artifact)
     texels, second = tuple(header.texels), tuple(header.block_texels or (0, 0))
     stored, blocks = parts["colour"], parts["blocks"]
@@ -152,6 +154,9 @@ def decode(artifact: Artifact) -> AtlasModel:
         pages = [colour.decode(page, *second, BLOCKS).astype(np.float16) for page in blocks]
         textures |= {"blocks": blocks, "block_texels": np.stack(pages)}
     places = _places(header, parts["sheets"])
+    held = sum(math.prod(each.shape[:3]) for name, each in textures.items() if name.endswith("texels"))
+    for place in places:
+        check_area(place.size, held, math.prod(parts["lut"].shape[:2]))
     stride = len(places) // (len(header.states) if header.separate else 1)
     count = len(header.sheets)
     objects = tuple(Placed(each.node, each.label, each.sheet, tuple(each.scale_offset)) for each in header.objects)
@@ -177,9 +182,6 @@ def decode(artifact: Artifact) -> AtlasModel:
         **textures,
     )
     _check_tiles(model)
-    for place in model.rows:
-        entries = math.prod(model.lut.shape[:2])
-        check_area(place.size, math.prod(model.texels.shape[:3]) + math.prod(model.block_texels.shape[:3]), entries)
     return model
 
 
