@@ -132,7 +132,7 @@ def probe(
     elif rivals_at is not None:
         if quick or not rivals or device != "cpu":
             raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
-        rows, options = run_rivals(rivals_at, **common), {"rivals_at": rivals_at}
+        rows, options = run_rivals(**common), {"rivals_at": rivals_at}
     else:
         rows = run(quick=quick, device=device, rivals=rivals, **common)
     _finish(rows, device, json_path, "probe", partial=volume_only, **options, probes=probes_path, key=keys)

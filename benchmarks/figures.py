@@ -44,6 +44,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
     "Size and error": {
         "bytes": Figure("size", "bytes", _WHOLE),
         "bpp": Figure("size", "bpp", ".3f"),  # bits for each texel and time, or for each probe
+        "gpu_bytes": Figure("on a GPU", "bytes", _WHOLE),
         "disk_bytes": Figure("on disk", "bytes", _WHOLE),
         "disk_bpp": Figure("on disk", "bpp", ".3f"),
         "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade
@@ -54,9 +55,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.display`
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
-        "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next two
+        "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next one
         "distance_psnr": Figure("by distance", "dB", ".2f"),
-        "kriging_psnr": Figure("kriging", "dB", ".2f"),
         "half_way_psnr": Figure("half-way", "dB", ".2f"),
         "coarse_psnr": Figure("coarse march", "dB", ".2f"),
         "network_psnr": Figure("network", "dB", ".2f"),

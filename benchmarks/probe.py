@@ -1,30 +1,28 @@
 """The probe system against itself, plain torch, the PCA family and an engine's packing: size, speed and error.
 
-For each set these kinds of rows, but where another is named:
+Rows of each set, by method:
 
-- method "ours", one row for each profile, and for the first profile at each ratio of gaussian-probe-compression,
-  tables 2 and 3: the file, the fit with the writing, the errors of the decode against the input, and the decode time of
-  all live probes.
-- method "decode", the first profile, one row for each way to find and to bound the Gaussians: its time and its error.
-  "sphere" is the paper's way (eq. 6), another fit, in which Gaussians reach a sphere; "sphere lists" only finds the
-  ellipsoids of the first fit by their spheres. The cuts below the profile's are those of the decode alone.
-- method "fit", the first profile on the first set alone: the speed of the fit, and method "dense torch": as many steps
-  in plain torch, all of them on CUDA, else a few.
-- method "transform", one row for each size, a share of the probes as float32: as "ours". A size in which there is no
-  room for the file is left out.
-- the rivals of `benchmarks.rivals.probe` at the bytes of each of these files, and Unreal's packing, which has one size.
-  The list of dead probes is counted for them too; positions are for nobody.
-- method "held out", the first profile and the transform of 5%: the light at every fifth probe, of a file of the others,
-  beside that of the uncompressed others by plain rules, and the light half-way between probes.
-- methods "volume" and "views" of `benchmarks.probe_volume`, the first profile and the transform of 5%: the light
-  through the cascaded volume along a walk, and pictures under it. `run_volume` has the walks alone.
+- "ours": one row for each profile, and for the first profile at each ratio of gaussian-probe-compression, tables 2 and
+  3. Size on disk and on a GPU, time of the fit with the writing, errors against the input, decode time of all live
+  probes. "pca" is the same for the profile of principal components.
+- "decode": the first profile, one row for each way to build the lists of Gaussians and to bound their support. "sphere"
+  is the paper's way (eq. 6), another fit with spherical supports; "sphere lists" only builds the lists of the first
+  fit's ellipsoids from spheres. Cuts below 3 apply to the decode only.
+- "fit": the first profile on the first set: speed of the fit; "dense torch": as many steps in plain torch, all of them
+  on CUDA, otherwise a few.
+- The rivals of `benchmarks.rivals.probe` at shares of the probes' size as float32, and Unreal's packing, which has one
+  size. The list of dead probes counts for them too; nobody stores positions.
+- "held out": the first profile: light at every fifth probe from a fit to the others, and the light half-way between
+  probes; with that of the uncompressed others by two simple rules.
+- "volume" and "views" of `benchmarks.probe_volume`, the first profile: light through the cascaded volume along a walk,
+  and pictures under it. `run_volume` measures the walks only.
 
-A largest error is that against the float64 decode of the same model, at its own cut, in the probes' unit. A decode on
-CUDA is timed as the replay of a graph, so that gaps between launches do not count; the rivals decode on the CPU alone.
+A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
+graph, so that gaps between launches do not count; the rivals decode on the CPU.
 """
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -35,24 +33,26 @@ from benchmarks.probe_volume import view_rows, volume_rows
 from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rivals.rival import Rival
-from benchmarks.rows import Row, read_json
+from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors
 from wlm.errors import WlmError
+from wlm.formats import zstd
 from wlm.probe.between import between_psnr, held_out
 from wlm.probe.data import ProbeSet, load
-from wlm.probe.decode import Decoder, Points
 from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
-from wlm.probe.fields import pack_dead
 from wlm.probe.fit import compress
+from wlm.probe.gaussian.decode import GaussianDecoder, Points
+from wlm.probe.gaussian.model import CUT
+from wlm.probe.gaussian.trainer import CODE_BITS, FINAL_RATE
 from wlm.probe.model import Profile
-from wlm.probe.seen import VIEWS
+from wlm.probe.views import VIEWS
 
 PROFILES = ("standard", "compact", "paper")
-"""Profiles of a run; the first is the one that the other rows are about."""
+"""Profiles of a run; rows of other methods are about the first."""
 
 SHARES = (1, 2, 3, 5, 7, 10)
-"""Sizes of transforms, per cent of float32, in a full run."""
+"""Sizes of the rivals in a full run, in per cent of float32."""
 
 RATIOS = (0.02, 0.05, 0.10, 0.15, 0.20)
 """Gaussians as a share of the live probes, in a full run: the paper's tables 2 and 3."""
@@ -73,10 +73,9 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     "CPCA by signal": ("clustered_pca_signal", WEIGHT_BITS),
     "moving basis": ("moving_basis", WEIGHT_BITS),
 }
-_TRANSFORM = "transform"
-_BESIDE = 5  # per cent, of the transform that is scored between probes and through the volume too
+_QUICK_SHARES = (5,)
 
-PANELS = (Panel("bpp", "psnr", ("transform", "ours", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
+PANELS = (Panel("bpp", "psnr", ("ours", "pca", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
 """What a plot of the rows shows: quality against size, and a decode's error against its time."""
 
 
@@ -92,8 +91,8 @@ def run(
     """Measures the probe system on one file.
 
     Args:
-        quick: Short fits, no other ratios than the profiles', transform and rivals of one size, a short walk, and of
-            the demo noon alone: under two minutes on two CPU cores. Its errors are those of unfinished fits.
+        quick: Short fits, the profiles' ratios only, rivals of one size, a short walk, and of the demo noon only: less
+            than two minutes on two CPU cores. The errors are those of unfinished fits.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
         probes_path: A file as `wlm.probe.load` reads it; None: the checkout's
             `demos/data/probes/street.npz`.
@@ -118,7 +117,7 @@ def run(
         profiles,
         device=device,
         ratios=() if quick else RATIOS,
-        shares=(_BESIDE,) if quick else SHARES,
+        shares=_QUICK_SHARES if quick else SHARES,
         rivals=rivals,
         frames=_QUICK_FRAMES if quick else None,
         progress=progress,
@@ -126,34 +125,15 @@ def run(
 
 
 def run_rivals(
-    results: str | os.PathLike[str],
     *,
     probes_path: str | os.PathLike[str] | None = None,
     keys: Sequence[str] = (),
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the rivals alone, at the bytes that our transforms took in a former run.
-
-    Args:
-        results: What a former run wrote, maybe without rivals.
-        probes_path: As for `run`.
-        keys: As for `run`.
-        progress: As for `run`.
-
-    Returns:
-        The rows of the rivals, computed on the CPU.
-
-    Raises:
-        WlmError: As `run`, or `results` lacks the transforms of a set.
-    """
-    rows = read_json(results)[0]
+    """Measures the rivals only, on the CPU; arguments and errors as for `run`."""
     sets = _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ()))
     benches = [_ProbeBench(probes, "cpu", progress) for probes in sets]
-    sizes = {bench.scene: _sizes(row for row in rows if row.scene == bench.scene) for bench in benches}
-    missing = [scene for scene, ours in sizes.items() if not ours]
-    if missing:
-        raise WlmError(f"{results}: expected rows of transforms of {missing[0]}")
-    return [row for bench in benches for row in bench.rival_rows(sizes[bench.scene])]
+    return [row for bench in benches for row in bench.rival_rows(SHARES)]
 
 
 def run_volume(
@@ -164,7 +144,7 @@ def run_volume(
     frames: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the volume alone, over the probes as they were and as the transform of 5% has them.
+    """Measures the volume only, filled from the original probes and from principal components.
 
     Args:
         device: As for `run`.
@@ -182,14 +162,8 @@ def run_volume(
     rows = []
     for probes in _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ())):
         bench = _ProbeBench(probes, device, progress)
-        models = {fit.option: fit.model for fit in bench.transforms((_BESIDE,)).values()}
-        rows += volume_rows(bench, probes, models, frames)
+        rows += volume_rows(bench, probes, {"pca": compress(probes, "pca")}, frames)
     return rows
-
-
-def _sizes(rows: Iterable[Row]) -> dict[str, int]:
-    """Bytes of the transforms' files, by their option."""
-    return {row.option: int(row["bytes"]) for row in rows if row.method == _TRANSFORM and row.get("bytes")}
 
 
 def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
@@ -216,9 +190,9 @@ def run_rows(
         sets: At least one.
         profiles: At least one; all but the rows "ours" are about the first.
         ratios: Further ratios of the first profile; the profile's ratio is left out.
-        shares: Sizes of transforms, per cent of float32.
+        shares: Sizes of the rivals, in per cent of float32.
         frames: Frames of the walk, at least one; None: as many as a tenth of a block each takes.
-        rivals: With the rivals, at the transforms' bytes.
+        rivals: Whether to measure the rivals.
         repeats: As for `Bench`.
     """
     if not sets or not profiles:
@@ -231,17 +205,14 @@ def run_rows(
             if ratio != profiles[0].ratio:
                 changed = profiles[0].model_copy(update={"ratio": ratio})
                 others.append(bench.fit_profile(changed, f"ratio {ratio:.2f}"))
-        transforms = bench.transforms(shares)
-        peers = [bench.profile_row(fit) for fit in (first, *others)]
-        peers += [bench.transform_row(fit) for fit in transforms.values()]
+        peers = [bench.profile_row(fit) for fit in (first, *others)] + [bench.component_row()]
         rows += bench.time_rows(peers + bench.decode_rows(first))
         if probes is sets[0]:
             rows += bench.fit_rows(first)
         if rivals:
-            rows += bench.rival_rows({fit.option: fit.bytes for fit in transforms.values()})
-        both = [fit for fit in (first, transforms.get(_BESIDE)) if fit is not None]
-        rows += [bench.held_out_row(fit) for fit in both]
-        rows += volume_rows(bench, probes, {"ours" if fit is first else fit.option: fit.model for fit in both}, frames)
+            rows += bench.rival_rows(shares)
+        rows.append(bench.held_out_row(first))
+        rows += volume_rows(bench, probes, {"ours": first.model}, frames)
         rows += view_rows(bench, probes, first.model, VIEWS if frames is None else min(frames, VIEWS))
     return rows
 
@@ -258,12 +229,13 @@ class _ProbeBench(Bench):
     def fit_profile(self, profile: Profile, option: str) -> Fit:
         """Fits and writes a profile; compiling its kernels is no part of either time."""
         self.note(f"{option}: fitting {len(self.position):,} probes, {profile.steps:,} steps")
+        profile = profile.model_copy(update={"method": "gaussians"})
         compress(self.probes, profile.model_copy(update={"steps": 10}), device=self.device)
         return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """What a fit costs and yields; and its decode, to be timed."""
-        model, decoder = fit.model, Decoder(fit.model, self.device)
+        model, decoder = fit.model, GaussianDecoder(fit.model, self.device)
         points = decoder.points(self.position)
         report, errors = self._decode(decoder, points, decode64(model, self.position), fit.bytes)
         row = self.row(
@@ -273,49 +245,40 @@ class _ProbeBench(Bench):
             encode_seconds=fit.seconds,
             steps=model.profile.steps,
             probes=report.live,
-            gaussians=model.count,
-            dropped=model.dropped,
+            gaussians=model.content.count,
+            dropped=model.content.dropped,
+            gpu_bytes=model.content.nbytes,
             irradiance_psnr=report.irradiance_psnr,
             **_size_and_psnr(report),
             **errors,
         )
         return row, self.replay(lambda: decoder.run(points))
 
-    def transforms(self, shares: Sequence[int]) -> dict[int, Fit]:
-        """Transforms by their share of float32, those that there is room for."""
-        fits = {}
-        for share in shares:
-            self.note(f"transform, {share}%")
-            limit = share * self.probes.float_bytes // 100
-            try:
-                fits[share] = self.fit(f"{share}%", lambda limit=limit: compress(self.probes, max_bytes=limit))
-            except WlmError as error:
-                self.note(str(error))
-        return fits
-
-    def transform_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """What a transform costs and yields; and its decode once it is unpacked, to be timed."""
-        decoder = fit.model.decoder(self.device, position=self.probes.position)
+    def component_row(self) -> tuple[Row, Callable[[], object]]:
+        """Size and errors of principal components, and their decode, to be timed."""
+        self.note("principal components")
+        fit = self.fit("pca", lambda: compress(self.probes, "pca"))
+        decoder = fit.model.decoder(self.device)
         report = score(decoder.decode_probes(), self.probes, fit.bytes)
-        points = decoder.points(self.position)
+        reader = decoder.light(self.probes.position).reader(len(self.position))
+        reader.numbers.assign(np.flatnonzero(self.probes.live).astype(np.int32))
         row = self.row(
-            _TRANSFORM,
-            fit.option,
-            f"time of all live probes once they are unpacked, {self.mode}; made on the CPU",
+            "pca",
+            f"{fit.model.content.count} components",
+            f"time of all live probes, {self.mode}; made on the CPU",
             encode_seconds=fit.seconds,
             probes=report.live,
             irradiance_psnr=report.irradiance_psnr,
-            memory=decoder.device_bytes / 2**20,
+            gpu_bytes=fit.model.content.nbytes,
             **_size_and_psnr(report),
         )
-        return row, self.replay(lambda: decoder.run(points))
+        return row, self.replay(reader.run)
 
     def held_out_row(self, fit: Fit) -> Row:
         """The light where no probe was compressed."""
         self.note(f"{fit.option}: fitting four fifths of the probes")
         held = held_out(fit.model, self.probes, device=self.device)
-        decoder = fit.model.decoder(self.device)
-        decoder.decode_probes(self.probes.position)
+        decoder = fit.model.decoder(self.device, position=self.probes.position)
         return self.row(
             "held out",
             fit.option,
@@ -325,7 +288,6 @@ class _ProbeBench(Bench):
             psnr=held.psnr,
             nearest_psnr=held.nearest,
             distance_psnr=held.distance,
-            kriging_psnr=held.kriging,
             half_way_psnr=between_psnr(decoder, self.probes),
         )
 
@@ -335,19 +297,21 @@ class _ProbeBench(Bench):
         spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
         exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
         ways = {
-            "none": (Decoder(model, self.device, culling="none"), exact),
-            "sphere": (Decoder(spheres, self.device), sphere_exact),
-            "sphere lists": (Decoder(model, self.device, culling="sphere"), exact),
-            "box": (Decoder(model, self.device, culling="box"), exact),
-            "exact": (Decoder(model, self.device, culling="exact"), exact),
-            "exact, given order": (Decoder(model, self.device, culling="exact"), exact),
+            "none": (GaussianDecoder(model, self.device, culling="none"), exact),
+            "sphere": (GaussianDecoder(spheres, self.device), sphere_exact),
+            "sphere lists": (GaussianDecoder(model, self.device, culling="sphere"), exact),
+            "box": (GaussianDecoder(model, self.device, culling="box"), exact),
+            "exact": (GaussianDecoder(model, self.device, culling="exact"), exact),
+            "exact, given order": (GaussianDecoder(model, self.device, culling="exact"), exact),
         }
         for cut in _CUTS:
-            if cut < model.profile.cut:
-                ways[f"cut {cut:g}"] = (Decoder(model, self.device, cut=cut), exact)
+            if cut < CUT:
+                ways[f"cut {cut:g}"] = (GaussianDecoder(model, self.device, cut=cut), exact)
         return [self._way(fit, option, *way) for option, way in ways.items()]
 
-    def _way(self, fit: Fit, option: str, decoder: Decoder, exact: np.ndarray) -> tuple[Row, Callable[[], object]]:
+    def _way(
+        self, fit: Fit, option: str, decoder: GaussianDecoder, exact: np.ndarray
+    ) -> tuple[Row, Callable[[], object]]:
         points = decoder.points(self.position)
         if option == "exact, given order":
             _in_given_order(points)
@@ -358,7 +322,7 @@ class _ProbeBench(Bench):
             option,
             f"profile {fit.option}{spheres}; time of all live probes, {self.mode}",
             psnr=report.psnr,
-            gaussians=decoder.model.count,
+            gaussians=decoder.model.content.count,
             list_entries=decoder.pairs,
             **errors,
         )
@@ -369,7 +333,11 @@ class _ProbeBench(Bench):
         p, model = fit.model.profile, fit.model
         step_ms = 1e3 * fit.fit_seconds / p.steps
         option = f"{fit.option} {p.steps:,} steps"
-        counts = {"steps": p.steps, "probes": len(self.position), "gaussians": model.count + model.dropped}
+        counts = {
+            "steps": p.steps,
+            "probes": len(self.position),
+            "gaussians": model.content.count + model.content.dropped,
+        }
         ours = self.row(
             "fit", option, "with the first places", encode_seconds=fit.fit_seconds, step_ms=step_ms, **counts
         )
@@ -382,8 +350,8 @@ class _ProbeBench(Bench):
             hidden=p.hidden,
             steps=p.steps,
             rates=(p.centre_rate, p.scale_rate, p.rotation_rate, p.latent_rate, p.net_rate),
-            final=p.final_rate,
-            bits=p.bits,
+            final=FINAL_RATE,
+            bits=CODE_BITS,
             seed=0,
             device=self.device,
         )
@@ -405,10 +373,11 @@ class _ProbeBench(Bench):
         )
         return [ours, dense]
 
-    def rival_rows(self, sizes: Mapping[str, int]) -> list[Row]:
-        """The rivals at the bytes of some files, by their option, and Unreal's packing at its own."""
+    def rival_rows(self, shares: Sequence[int]) -> list[Row]:
+        """Measures the rivals at shares of float32, in per cent, and Unreal's packing at its own size."""
         rows = []
-        for option, size in sizes.items():
+        for share in shares:
+            option, size = f"{share}%", share * self.probes.float_bytes // 100
             for name, (baseline, bits) in _RIVALS.items():
                 self.note(f"{name}, {option}")
                 encode = partial(at_bytes, baseline, budget_bytes=size - self._dead_bytes(), bits=bits)
@@ -431,7 +400,7 @@ class _ProbeBench(Bench):
         )
 
     def _decode(
-        self, decoder: Decoder, points: Points, exact: np.ndarray, size: int
+        self, decoder: GaussianDecoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
         """The score, and the errors against float64."""
         decoder.run(points)
@@ -445,8 +414,8 @@ class _ProbeBench(Bench):
         return values
 
     def _dead_bytes(self) -> int:
-        """What the list of dead probes takes, as in our file."""
-        return len(pack_dead(~self.probes.live))
+        """Bytes of the packed list of dead probes, as in our file."""
+        return 0 if self.probes.live.all() else len(zstd.compress(np.packbits(~self.probes.live).tobytes()))
 
 
 def _size_and_psnr(report: Report) -> dict[str, float]:

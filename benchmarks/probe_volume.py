@@ -1,12 +1,11 @@
 """The cascaded volume of probes: error and cost of a walk with it, and pictures under its light.
 
-- method "volume": a walk with the volume, over the probes as they were ("lossless") and as each model has them, whose
-  figures are means and 95th percentiles of a frame. A frame is timed until the device has done all of it. Its PSNR is
-  that of what is read at probes near the viewer against the input, beside it that of the same probes as they were
-  decoded, and of what is read farther away. The walk starts with an empty volume: what its first frame takes, and the
-  frames until nothing waits. The light's RMS is that of the probes that the volume was made from, its RMSE is against
-  these.
-- method "views": pictures of balls at the probes, compared as they are shown, see `wlm.probe.seen`.
+- Method "volume": a walk with the volume, filled from the original probes ("lossless") and from each model. Figures are
+  means and 95th percentiles over frames, each timed until the device has finished it. The PSNR is that of readings at
+  probes near the viewer against the input; beside it are those of the decoded probes at the same samples, and of
+  readings farther away. The walk starts with an empty volume: the time of its first frame, and the frames until no
+  block waits. RMS and RMSE of the light refer to the probes that filled the volume.
+- Method "views": pictures of balls at the probes, compared as displayed, see `wlm.probe.views`.
 """
 
 from collections.abc import Mapping
@@ -16,28 +15,25 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench
 from wlm.errors import WlmError
 from wlm.probe.data import ProbeSet
-from wlm.probe.light import Light, StoredLight, light_of
 from wlm.probe.model import ProbeModel
-from wlm.probe.seen import score_views
-from wlm.probe.transform import TransformModel
-from wlm.probe.walk import score_volume
+from wlm.probe.views import score_views
+from wlm.probe.volume.light import Light, StoredLight
+from wlm.probe.volume.walk import score_volume
 
 
-def volume_rows(
-    bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel | TransformModel], frames: int | None
-) -> list[Row]:
-    """A walk with the probes as they were and one with each model's, each from an empty volume.
+def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
+    """Walks with the original probes and with each model, each from an empty volume.
 
     Args:
-        bench: Of the set, on the device of the volume.
-        probes: As they were.
-        models: By the names of their rows.
-        frames: Of the walk, at least one; None: as many as a tenth of a block each takes.
+        bench: Benchmark of the set, on the device of the volume.
+        probes: The original probes.
+        models: Models by the names of their rows.
+        frames: Frames of the walk, at least one; None: each frame moves the viewer by a tenth of a block.
     """
     rows = []
     lights: dict[str, Light] = {"lossless": StoredLight(probes.values, bench.device)}
     for name, model in models.items():
-        lights[name] = light_of(model.decoder(bench.device), probes.position)
+        lights[name] = model.decoder(bench.device).light(probes.position)
     for name, light in lights.items():
         bench.note(f"the volume, {name}")
         walked = score_volume(probes, light, frames=frames)
@@ -63,13 +59,13 @@ def volume_rows(
 
 
 def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> list[Row]:
-    """Pictures of balls under the light, for each way to read it.
+    """Scores pictures of balls under each kind of light.
 
     Args:
-        bench: Of the set, on the device of the decode.
-        probes: As they were.
-        model: Of them.
-        views: Pictures, at least one.
+        bench: Benchmark of the set, on the device of the decode.
+        probes: The original probes.
+        model: A model of them.
+        views: Number of pictures, at least one.
     """
     bench.note(f"{views} views of balls")
     decoded = model.decoder(bench.device).decode_probes(probes.position)
@@ -81,7 +77,7 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
         bench.row(
             "views",
             f"{score.drawn}, {score.light}",
-            f"{score.views} views under the probes as they were and under these",
+            f"{score.views} views under the original probes and under these",
             psnr=score.psnr,
             ssim=score.ssim,
             flip=score.flip,
@@ -91,6 +87,6 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
 
 
 def _light(figures: dict[str, Any]) -> dict[str, float | None]:
-    """What the samples of a walk say of the light; none where no probe is near the viewer."""
+    """Returns figures of the light at a walk's samples; None where no probe is near the viewer."""
     names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
     return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}

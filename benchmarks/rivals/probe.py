@@ -22,8 +22,8 @@ from benchmarks.rivals import probe_mbd, probe_pca
 from benchmarks.rivals.rival import Rival, measure
 from wlm.errors import WlmError
 from wlm.probe.data import ProbeSet
+from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
 from wlm.probe.evaluation import Report, score
-from wlm.probe.unreal import pack_unreal, unpack_unreal
 from wlm.system import Meter, OnProgress
 
 # Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.

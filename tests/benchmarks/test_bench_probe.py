@@ -12,7 +12,7 @@ from benchmarks.probe import PANELS, run, run_rivals, run_rows, run_volume
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
-from wlm.probe.seen import KINDS
+from wlm.probe.views import KINDS
 
 STEPS = 60
 PROBES = {"room": 300, "hall": 100}

@@ -76,7 +76,7 @@ def _layers() -> Subject:
 
 
 def _probe() -> Subject:
-    profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=60, hidden=16, latent=3)
+    profile = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=60, hidden=16, latent=3)
 
     def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.probe.fit import open_checkpoint
@@ -91,39 +91,21 @@ def _probe() -> Subject:
         lambda: probe_sets.synthetic(300, dead=5),
         lambda data, **options: wlm.probe.compress(data, profile, **options),
         lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.probe.export(model, folder),
+        lambda model, data, folder: wlm.export.export(model, folder),
         checkpoint,
     )
 
 
-def _probe_compact() -> Subject:
+def _probe_pca() -> Subject:
     return Subject(
         "probe",
-        FILES / "probe-compact.wlm",
+        FILES / "probe-pca.wlm",
         lambda model: {"values": model.decoder().decode_probes()},
-        FILES / "probe-compact.npz",
-    )
-
-
-def _probe_packed() -> Subject:
-    return Subject(
-        "probe",
-        FILES / "probe-packed.wlm",
-        lambda model: {"values": model.decoder().decode_probes()},
-        FILES / "probe-packed.npz",
-    )
-
-
-def _probe_transform() -> Subject:
-    return Subject(
-        "probe",
-        FILES / "probe-transform.wlm",
-        lambda model: {"values": model.decoder().decode_probes()},
-        FILES / "probe-transform.npz",
+        FILES / "probe-pca.npz",
         lambda: probe_sets.synthetic(300, dead=5),
-        lambda data, **options: wlm.probe.compress(data, positions=True, target_psnr=40.0, **options),
+        lambda data, **options: wlm.probe.compress(data, "pca", positions=True, **options),
         lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.probe.export(model, folder),
+        lambda model, data, folder: wlm.export.export(model, folder),
     )
 
 
@@ -168,9 +150,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
     "lightmap": _lightmap,
     "lightmap-layers": _layers,
     "probe": _probe,
-    "probe-compact": _probe_compact,
-    "probe-packed": _probe_packed,
-    "probe-transform": _probe_transform,
+    "probe-pca": _probe_pca,
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
     "smoke": _smoke,
 }

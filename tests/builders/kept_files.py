@@ -63,15 +63,6 @@ def _layers() -> Kept:
     return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
 
 
-def _probe() -> Kept:
-    from builders.probe_models import random_model
-
-    ranges = {"bounds": ((0, 4), 41.0), "frame": (3, 0.0)}
-    return Kept(
-        _written(random_model(positions=True).save), wlm.load, {"dead": "missing", "positions": "missing"}, ranges
-    )
-
-
 def _atlas(kind: str, colour: str) -> Kept:
     from builders.atlas_meshes import sheet
     from builders.atlas_models import random_model, save_plainly
@@ -141,13 +132,14 @@ def _probe_running() -> Kept:
     from builders.probe_sets import synthetic
 
     from wlm.probe import Profile
-    from wlm.probe.fit import _frame
-    from wlm.probe.trainer import Trainer
+    from wlm.probe.gaussian.trainer import Trainer
+    from wlm.probe.model import box_of
 
     probes = synthetic(60)
-    origin, extent, _ = _frame(probes.position)
+    box = box_of(probes.position)
     profile = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
-    trainer = Trainer(((probes.position - origin) / extent).astype(np.float32), probes.values, profile, 0, "cpu")
+    x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
+    trainer = Trainer(x, probes.values, profile, 0, "cpu")
     trainer.run(52)
     content = _written(lambda path: Checkpoint(path, "probe", {}, "0f").save_running(0, trainer.state()))
     ranges = {"control": (0, -1), "entered": ((), 2), "bounds": ((0, 0), 9.0)}
@@ -205,7 +197,6 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
         "lightmap-layers": _layers,
-        "probe": _probe,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),
         "atlas-bc6h": lambda: _atlas("plain with uv", "bc6h"),

@@ -25,7 +25,8 @@ def room(tmp_path_factory):
 @pytest.fixture(scope="session")
 def profile(tmp_path_factory):
     path = tmp_path_factory.mktemp("profile") / "tiny.yaml"
-    path.write_text(yaml.safe_dump({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 30}))
+    settings = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 30}
+    path.write_text(yaml.safe_dump(settings))
     return path
 
 
@@ -51,8 +52,8 @@ def test_compress_prints_one_table(room, profile, tmp_path):
     size, model = out.stat().st_size, wlm.load(out)
     for word in (f"{size:,}", f"{size * 8 / PROBES:.2f}", f"{size / (PROBES * 27 * 4):.2%}"):
         assert word in text
-    assert re.search(rf"│ +{model.count} │ +{model.dropped} │", text)
-    assert model.count + model.dropped == round(0.1 * (PROBES - DEAD))
+    assert re.search(rf"│ +{model.content.count} │ +{model.content.dropped} │", text)
+    assert model.content.count + model.content.dropped == round(0.1 * (PROBES - DEAD))
     assert re.search(r"fit: 30 of 30, PSNR \d+\.\d+ dB", call.stderr)
     assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
@@ -60,12 +61,12 @@ def test_compress_prints_one_table(room, profile, tmp_path):
 
 def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     out, other = tmp_path / "a.wlm", tmp_path / "b.wlm"
-    options = ["--profile", profile, "--ratio", 0.2, "--bits", 8, "--latent", 3, "--steps", 12, "--positions"]
+    options = ["--profile", profile, "--ratio", 0.2, "--latent", 3, "--steps", 12, "--positions"]
     call("probe", "compress", room, "-o", out, *options, "--key", "sh", "--convention", "threejs")
     model = wlm.load(out)
     settings = model.profile
-    assert (settings.ratio, settings.bits, settings.latent, settings.steps) == (0.2, 8, 3, 12)
-    assert model.source == data.load(room).source[:4]
+    assert (settings.ratio, settings.latent, settings.steps) == (0.2, 3, 12)
+    assert model.source == data.load(room).source[:8]
     slack = model.extent * model.size.max() / 65535
     np.testing.assert_allclose(model.stored_positions(), data.load(room).position, rtol=0, atol=slack)
     # The seed of the command is the seed of the fit.
@@ -74,7 +75,7 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
         assert (other.read_bytes() == out.read_bytes()) is same
     # Another convention is other light.
     call("probe", "compress", room, "-o", other, *options, "--convention", "godot")
-    assert wlm.load(other).source == data.load(room, convention="godot").source[:4] != model.source
+    assert wlm.load(other).source == data.load(room, convention="godot").source[:8] != model.source
 
 
 def test_warnings_of_the_set_are_shown(profile, tmp_path):
@@ -151,7 +152,7 @@ def test_evaluate_against_another_set(fitted, tmp_path):
     assert f"warning: {tmp_path / 'a.npz'}: not what {fitted} was made of" in call.stderr
     save_probes(tmp_path / "b.npz", probes.position[1:], probes.values[1:])
     line = fails("probe", "evaluate", fitted, tmp_path / "b.npz")
-    assert f"expected the positions of {PROBES} probes, got {PROBES - 1}" in line
+    assert f"has {PROBES - 1} probes, but {PROBES} were compressed" in line
 
 
 def test_info_says_what_is_in_the_file(fitted, carrying):
@@ -159,7 +160,7 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
     model = wlm.load(fitted)
     assert facts["bytes"] == fitted.stat().st_size == sum(facts["parts"].values())
     assert (facts["probes"], facts["dead"], facts["outputs"], facts["positions"]) == (PROBES, DEAD, 27, False)
-    assert facts["gaussians"] == model.count and facts["packed"] and facts["gaussian_bits"] is None
+    assert facts["gaussians"] == model.content.count and facts["gpu_bytes"] == model.content.nbytes
     assert facts["bits_per_probe"] == facts["bytes"] * 8 / PROBES
     np.testing.assert_allclose(facts["size"], np.ptp(synthetic(PROBES).position, axis=0))
     assert facts["profile"]["name"] == "tiny"
@@ -210,7 +211,7 @@ def test_walk_with_another_axis_up(carrying, monkeypatch):
         asked.append((len(position), frames, eye_height, up))
         return position[:2]
 
-    monkeypatch.setattr("wlm.probe.walk.camera_path", path)
+    monkeypatch.setattr("wlm.probe.volume.walk.camera_path", path)
     call("probe", "walk", carrying, "--up", "z", "--eye", 0.8, "--frames", 7)
     call("probe", "walk", carrying, "--block", 0.7)
     # Live probes alone, and as many frames as it takes to go round.
@@ -233,14 +234,13 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "0"], "--ratio: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "nan"], "--ratio: expected"),
-        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--bits", "17"], "--bits: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--latent", "0"], "--latent: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--key", "noon"], "expected values named noon"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--convention", "quake"], "convention"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--device", "cuda:9"], "device 'cuda:9'"),
-        (["decode", "{fit}", "-o", "{tmp}/f.npz"], "holds no positions"),
+        (["decode", "{fit}", "-o", "{tmp}/f.npz"], "stores no positions"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{bad}"], "position[0]: expected finite"),
         (["decode", "{fit}", "-o", "{tmp}/f.exr", "--positions", "{set}"], "ends in .npz or .json"),
         (
@@ -254,7 +254,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["evaluate", "{fit}", "absent.npz"], "absent.npz: cannot read the arrays: No such file"),
         (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
         (["info", "{tmp}"], "expected a file, found a folder"),
-        (["walk", "{fit}"], "holds no positions"),
+        (["walk", "{fit}"], "stores no positions"),
         (["walk", "{fit}", "{other}"], "expected the 160 probes that"),
         (["walk", "{fit}", "{set}", "--up", "w"], "--up: expected x, y or z"),
         (["walk", "{fit}", "{set}", "--frames", "0"], "camera path: expected at least 1 frame"),
@@ -293,10 +293,10 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", "1,2.5,-3")
     files = list((tmp_path / "out").iterdir())
     assert len(files) == 7 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
-    document = json.loads((tmp_path / "out" / "volume.json").read_text())
+    document = json.loads((tmp_path / "out" / "bundle.json").read_text())
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
     call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
-    assert json.loads((tmp_path / "out" / "volume.json").read_text())["levels"][0]["block"] == 0.5
+    assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
     assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
 
 

@@ -108,7 +108,8 @@ def command(request, tmp_path_factory):
         case "probe compress":
             probes = probe_sets.synthetic(300, dead=5)
             save_probes(place / "room.npz", probes.position, probes.values)
-            profile = settings({"name": "tiny", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 800})
+            tiny = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 800}
+            profile = settings(tiny)
             words += (place / "room.npz", "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("probe.wlm"), file_bytes, kept_or_whole, beside)
         case "atlas compress" | "atlas compress cascade":
@@ -146,13 +147,13 @@ def command(request, tmp_path_factory):
         case "lightmap export":
             lightmaps = small_sets.moving_light(40, 24)
             wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(place / "a.wlm")
-            check = earlier_or_unfinished("weights.json")
+            check = earlier_or_unfinished("bundle.json")
             earlier = exported("lightmap", "lightmap.wlm")
             return Command((*words, place / "a.wlm"), "out", earlier, file_bytes, check, None)
         case "probe export":
-            profile = wlm.probe.Profile(name="tiny", ratio=0.1, steps=30, hidden=16, latent=3)
+            profile = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=30, hidden=16, latent=3)
             wlm.probe.compress(probe_sets.synthetic(300), profile).save(place / "a.wlm")
-            check = earlier_or_unfinished("probe.json")
+            check = earlier_or_unfinished("bundle.json")
             return Command((*words, place / "a.wlm"), "out", exported("probe", "probe.wlm"), file_bytes, check, None)
     raise WlmError(request.param)
 

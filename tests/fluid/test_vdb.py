@@ -142,7 +142,7 @@ def test_damage(tmp_path: Path):
     with pytest.raises(WlmError, match="expected version 222 to 224 of OpenVDB's files, found 221"):
         load_volume(path)
     path.write_bytes(whole.replace(b"ScaleMap", b"OtherMap"))
-    with pytest.raises(WlmError, match="a.vdb: density: expected voxels along straight axes, found a OtherMap"):
+    with pytest.raises(WlmError, match="a.vdb: density: expected a linear transform, found a OtherMap"):
         load_volume(path)
     path.write_bytes(whole.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3"))
     with pytest.raises(WlmError, match=r"a.vdb: expected a grid of floats, found density \(Tree_vec3s_5_4_3\)"):

@@ -32,8 +32,8 @@ def test_against_a_slow_packing(count, widths):
 
 
 def test_bits_that_do_not_fit():
-    with pytest.raises(ValueError, match="fit the width"):
+    with pytest.raises(ValueError, match="exceeds the bit width"):
         pack_bits(np.array([[3, 8]], np.uint16), np.array([2, 3]))
     for length in (1, 3):
-        with pytest.raises(ValueError, match=f"{length} bytes for 2 rows of 5 bits"):
+        with pytest.raises(ValueError, match=f"expected the bytes of 2 rows of 5 bits, found {length} bytes"):
             unpack_bits(np.zeros(length, np.uint8), np.array([2, 3]), 2)

@@ -255,7 +255,7 @@ WRONG = [
     (["accessors", 0, "componentType", 5124], "accessors[0]: expected a componentType"),
     (["accessors", 0, "bufferView", 5], "bufferViews[5]: expected one of 3"),
     (["accessors", 1, "count", 4], "TEXCOORD_0: expected 5 vertices as POSITION, found 4"),
-    (["accessors", 2, "count", 5], "expected three corners a triangle, found 5"),
+    (["accessors", 2, "count", 5], "expected three corners per triangle, found 5"),
     (["accessors", 2, "componentType", 5122], "indices: expected unsigned integers"),
     (["accessors", 0, "sparse", {"count": 1}], "malformed glTF: the field 'indices' is missing"),
     (["bufferViews", 0, "byteLength", 10**9], "bufferViews[0]: needs 1000000000 bytes of buffers[0]"),
@@ -295,12 +295,12 @@ def test_an_index_beyond_the_vertices(tmp_path):
     ("uri", "words"),
     [
         ("gone.bin", "gone.bin: cannot read buffers[0] of "),
-        ("http://a.example/b.bin", "buffers[0].uri: expected a file relative to it, found http"),
-        ("/b.bin", "buffers[0].uri: expected a file relative to it, found /b.bin"),
+        ("http://a.example/b.bin", "buffers[0].uri: expected a path relative to the document, found http"),
+        ("/b.bin", "buffers[0].uri: expected a path relative to the document, found /b.bin"),
         ("data:;base64,?", "buffers[0].uri: expected base64"),
-        ("data:;base64", "buffers[0].uri: expected data: with a comma"),
+        ("data:;base64", "buffers[0].uri: expected a data: URI with a comma"),
         ("data:;base64,AAAA", "buffers[0]: expected 500 bytes, found 3"),
-        (None, "buffers[0]: has no uri, and the file no binary chunk"),
+        (None, "buffers[0]: has no uri, and the file has no binary chunk"),
     ],
 )
 def test_a_buffer_that_cannot_be_read(tmp_path, uri, words):

@@ -290,7 +290,7 @@ def test_what_does_not_fit_is_a_value_error(tmp_path, change, words):
 def test_a_set_that_is_there_and_a_primitive_twice_are_value_errors(tmp_path):
     document = _document(tmp_path)
     replacements = _replacements(tmp_path)
-    with pytest.raises(ValueError, match="expected a number that node 0, mesh 0, primitive 1 has not yet, got 0"):
+    with pytest.raises(ValueError, match="expected a UV set that node 0, mesh 0, primitive 1 does not have, got 0"):
         write_glb(tmp_path / "out.glb", document, replacements, 0)
     with pytest.raises(ValueError, match="at most one for each primitive"):
         write_glb(tmp_path / "out.glb", document, [*replacements, replacements[0]], 1)

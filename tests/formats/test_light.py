@@ -181,7 +181,7 @@ def test_kinds_are_told_by_content(tmp_path):
     np.testing.assert_array_equal(read_light(tmp_path / "a.exr")[0], light)
     for content, found in (
         (b"", "other content"),
-        (b"\x89PNG\r\n\x1a\n", "a PNG: its 8 or 16 bits don't say what light they stand for"),
+        (b"\x89PNG\r\n\x1a\n", "a PNG, whose encoding of light is unknown"),
         (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
     ):
         (tmp_path / "a.exr").write_bytes(content)

@@ -69,9 +69,9 @@ def cut(item, size):
     [
         ([("Texture2D", None, b"", "<")], "found neither"),
         ([probes(PLACES, SH[:1])], "light for each of 2 probes, found that of 1"),
-        ([cut(probes(PLACES, SH), -1)], "damaged, or of a version .*: expected 216 bytes"),
+        ([cut(probes(PLACES, SH), -1)], "damaged, or UnityPy cannot read its version.*: expected 216 bytes"),
         ([("LightProbes", node("LightProbes", "Base"), b"", "<")], "m_BakedCoefficients is missing"),
-        ([("LightProbes", None, b"", "<")], "layout of its objects isn't in the file"),
+        ([("LightProbes", None, b"", "<")], "does not contain the layout of its objects"),
         ([("LightingDataAsset", unity_assets.LIGHTING, struct.pack("<2i", 0, -1), "<")], "array of -1 values"),
     ],
 )
@@ -88,7 +88,7 @@ def test_no_room_is_made_for_what_a_file_claims(unity):
     for damaged in (many + content[4:], content[:12] + many + bytes(1 << 23)):
         path = unity((kind, tree, damaged, order))
         tracemalloc.start()
-        with pytest.raises(WlmError, match="damaged, or of a version"):
+        with pytest.raises(WlmError, match="damaged, or UnityPy cannot read its version"):
             read_lighting_data(path)
         assert tracemalloc.get_traced_memory()[1] < 5e7
         tracemalloc.stop()

@@ -15,7 +15,10 @@ from random import Random
 from typing import Any
 
 import numpy as np
+import zstandard
 from numpy.lib import format as npy
+
+from wlm.formats import zstd
 
 from .mutate import corrupt, vary_array, vary_json, vary_numbers
 
@@ -112,23 +115,24 @@ def _pack_artifact(words: str, settings: Any, parts: dict[str, np.ndarray]) -> b
 
 
 def vary_compact(draw: Random, data: bytes) -> bytes:
-    """Changes bytes behind the digest, those of a head more often than not, and signs the whole again."""
-    size = 4 if data[3] & 15 == 2 else 8
-    body = data[4 + size :]
-    if size == 8 and draw.random() < 0.5:
-        # The head alone, so that the data is where it was.
-        end = 4 + int.from_bytes(body[:4], "little")
-        body = body[:4] + corrupt(draw, body[4:end])[: end - 4].ljust(end - 4, b"\0") + body[end:]
-    else:
+    """Changes a probe file's bytes, header or unpacked parts, and packs and signs them again."""
+    body, draws = data[8:], draw.random()
+    end = 2 + int.from_bytes(body[:2], "little")
+    header, frame = body[2:end], body[end:]
+    if draws < 0.2:
         body = corrupt(draw, body)
+    else:
+        if draws < 0.6:
+            header = corrupt(draw, header)[:65535]
+        else:
+            frame = zstd.compress(corrupt(draw, zstandard.ZstdDecompressor().decompress(frame)))
+        body = len(header).to_bytes(2, "little") + header + frame
     return data[:4] + compact_digest(data[:4], body) + body
 
 
 def compact_digest(begin: bytes, body: bytes) -> bytes:
-    """The digest of a compact artifact: of all of it, or of all up to the end of its head."""
-    if begin[3] & 15 == 2:
-        return hashlib.blake2b(begin + body, digest_size=4).digest()
-    return hashlib.blake2b(begin + body[: 4 + int.from_bytes(body[:4], "little")], digest_size=8).digest()
+    """The digest of a compact artifact."""
+    return hashlib.blake2b(begin + body, digest_size=4).digest()
 
 
 # NumPy archives.

@@ -17,11 +17,11 @@ from PIL import Image
 
 from benchmarks import Row, write_json
 from wlm.atlas.stored import store
+from wlm.export import export
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.probe.data import save_probes
-from wlm.probe.three_grid import export_grid
-from wlm.probe.unreal import AMBIENT_FILE, SH_FILES, export_unreal
+from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.flipbook.shots import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
@@ -166,10 +166,10 @@ def _probe_files(folder: Path) -> None:
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
     with tempfile.TemporaryDirectory() as grid:
-        export_grid(probe_models.random_model(count=3), Path(grid) / "out", cells=2)
+        export(probe_models.random_model(count=3), Path(grid) / "out", "three", cells=2)
         for name in ("grid.json", "grid.ktx2"):
             (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
-        export_unreal(probe_models.random_model(count=3), Path(grid) / "unreal", cells=2)
+        export(probe_models.random_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
         for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
             (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)

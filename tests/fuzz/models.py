@@ -16,9 +16,6 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
-from wlm.probe.day import DayModel
-from wlm.probe.regions import RegionModel
-from wlm.probe.transform import Transform
 from wlm.smoke.march.motion import read_velocity, write_velocity
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
@@ -50,20 +47,11 @@ def _layers(path: Path) -> None:
 def _probe(path: Path) -> None:
     model = wlm.load(path, "probe")
     check_digest(path)
-    if isinstance(model, RegionModel):
-        # Its pieces are looked at when they are asked for, and errors have the name alone.
-        with suppress(WlmError):
-            check_finite(values=model.decoder().decode_probes())
+    check_finite(origin=model.origin, extent=model.extent, size=model.size)
+    if model.method == "pca":
+        check_finite(values=model.decoder().decode_probes())
         return
-    if isinstance(model, Transform):
-        if model.has_positions:
-            values = model.decoder().decode_probes()
-            check_finite(values=values, position=model.stored_positions())
-            assert values.shape == (model.probes, model.outputs), "decodes to another size"
-            if isinstance(model, DayModel):
-                check_finite(**{f"hour{time}": model.at(time + 0.5).stored_values for time in model.times})
-        return
-    check_finite(bounds=model.bounds, net=model.net, origin=model.origin, extent=model.extent, gain=model.gain)
+    check_finite(bounds=model.content.bounds, net=model.content.net, gain=model.content.gain)
     places = np.linspace(0.0, 1.0, 8)[:, None]
     with np.errstate(over="ignore"):
         position = model.origin + model.extent * model.size * places
@@ -186,7 +174,7 @@ def _lightmap_checkpoint(path: Path) -> None:
 def _probe_fit() -> tuple[Any, Any]:
     from builders.probe_sets import synthetic
 
-    return synthetic(60), wlm.probe.Profile(name="tiny", ratio=0.1, steps=10, hidden=16, latent=3)
+    return synthetic(60), wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=10, hidden=16, latent=3)
 
 
 @functools.cache
@@ -308,11 +296,10 @@ READERS = (
         _lightmap,
     ),
     Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
-    Reader("probe", "a.wlm", stored("probe.wlm", "probe-transform.wlm"), vary_artifact, _probe),
     Reader(
-        "probe-compact",
+        "probe",
         "a.wlm",
-        stored("probe-compact.wlm", "probe-regions.wlm", "probe-day.wlm", "probe-packed.wlm"),
+        stored("probe.wlm", "probe-pca.wlm"),
         vary_compact,
         _probe,
     ),

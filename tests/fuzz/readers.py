@@ -32,7 +32,7 @@ from wlm.formats.mask import read_mask
 from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
 from wlm.probe.data import load_positions
-from wlm.probe.unreal import AMBIENT_FILE, SH_FILES
+from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
 from wlm.smoke.flipbook.textures import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings

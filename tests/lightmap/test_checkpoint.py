@@ -205,5 +205,5 @@ def test_unknown_parts_are_refused(tmp_path, part):
     with pytest.raises(WlmError, match="expected one of a finished or a running batch"):
         open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     write_artifact(checkpoint.path, checkpoint.system, {}, {}, lightmaps.source)
-    with pytest.raises(WlmError, match="does not say which fit"):
+    with pytest.raises(WlmError, match="does not state its fit"):
         open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)

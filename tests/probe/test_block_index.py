@@ -5,7 +5,7 @@ import pytest
 from reference import volume_blocks as reference
 
 from wlm.errors import WlmError
-from wlm.probe.index import BlockIndex, finest_side
+from wlm.probe.volume.index import BlockIndex, finest_side
 
 
 def _cells(key: np.ndarray) -> np.ndarray:

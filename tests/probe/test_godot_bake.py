@@ -9,8 +9,8 @@ from builders.probe_models import random_model
 
 import wlm
 from wlm.errors import WlmError
+from wlm.export import export
 from wlm.formats.godot import read_lmbake, relit
-from wlm.probe import export_godot
 from wlm.probe.data import from_arrays
 
 
@@ -42,7 +42,7 @@ def tap(data: bytes, place: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("cells", [1, 5])
 def test_godot_finds_the_light_at_any_place(cells, tmp_path):
     model = random_model()
-    export_godot(model, tmp_path / "out", cells=cells)
+    export(model, tmp_path / "out", "godot", cells=cells)
     path = tmp_path / "out" / "light.lmbake"
     data, (points, light) = path.read_bytes(), read_lmbake(path)
     np.testing.assert_allclose(light.reshape(-1, 27) * np.pi, model.decoder().decode(points), rtol=1e-4, atol=1e-5)
@@ -76,7 +76,7 @@ def test_a_bake_keeps_all_but_its_light(order, double, tmp_path):
     path.write_bytes(writer.file(bake(writer, points, light)))
     probes = wlm.probe.load(path)
     model = wlm.probe.compress(probes)
-    export_godot(model, tmp_path / "out", bake=path)
+    export(model, tmp_path / "out", "godot", original=path)
     made = tmp_path / "out" / "light.lmbake"
     old, new = path.read_bytes(), made.read_bytes()
     differ = np.flatnonzero(np.frombuffer(old, "u1") != np.frombuffer(new, "u1"))
@@ -93,15 +93,15 @@ def test_what_is_refused(tmp_path):
     writer, random = Writer(), np.random.default_rng(0)
     points, path = random.random((9, 3)), tmp_path / "a.lmbake"
     path.write_bytes(writer.file(bake(writer, points, np.ones((9, 9, 3)))))
-    model = wlm.probe.compress(from_arrays(points[::-1], np.ones((9, 27))))
+    model = wlm.probe.compress(from_arrays(points[::-1] + 1.0, np.ones((9, 27))))
     for refused, settings, message in [
         (random_model(outputs=12), {}, "expected L2 in RGB"),
-        (random_model(outputs=12), {"bake": path}, "expected L2 in RGB"),
+        (random_model(outputs=12), {"original": path}, "expected L2 in RGB"),
         (random_model(), {"cells": 65}, "cells: expected 1 to 64"),
-        (random_model(), {"cells": 4, "bake": path}, "cells: expected none"),
-        (model, {"bake": path}, "a.lmbake: expected the 9 probes"),
-        (model, {}, "holds no positions"),
+        (random_model(), {"cells": 4, "original": path}, "cells: expected none"),
+        (model, {"original": path}, "a.lmbake: expected the 9 probes"),
+        (model, {}, "stores no positions"),
     ]:
         with pytest.raises(WlmError, match=message):
-            export_godot(refused, tmp_path / "out", **settings)
+            export(refused, tmp_path / "out", "godot", **settings)
     assert not (tmp_path / "out").exists()

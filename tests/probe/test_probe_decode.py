@@ -5,9 +5,9 @@ import pytest
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
-from wlm.probe.decode import CULLINGS, Decoder
 from wlm.probe.exact import decode64
-from wlm.probe.model import check_outputs
+from wlm.probe.gaussian.decode import CULLINGS, GaussianDecoder
+from wlm.probe.gaussian.model import check_outputs
 from wlm_kernels.probe.network import most_outputs, probes_at_once
 
 RANDOM = np.random.default_rng(11)
@@ -32,7 +32,6 @@ def close(decoded, model, position):
         {"outputs": 3, "latent": 1},
         {"outputs": 75, "hidden": 64, "latent": 12},
         {"support": "sphere"},
-        {"cut": 2.0},
         {"turn": 0.0},
         {"count": 1},
     ],
@@ -41,19 +40,21 @@ def close(decoded, model, position):
 def test_against_float64(settings, device):
     model = random_model(**settings)
     position = points(130, model)
-    close(Decoder(model, device).decode(position), model, position)
+    close(GaussianDecoder(model, device).decode(position), model, position)
 
 
 def test_far_from_the_origin(device):
     model = random_model(origin=np.array([1e6, -2e6, 5e5]))
     position = points(100, model)
-    close(Decoder(model, device).decode(position), model, position)
+    close(GaussianDecoder(model, device).decode(position), model, position)
 
 
 def test_all_lists_give_the_same(device):
     model = random_model(count=60)
     position = points(200, model)
-    decoders = [Decoder(model, device, culling=culling, cube=cube) for culling in CULLINGS for cube in (None, 0.07)]
+    decoders = [
+        GaussianDecoder(model, device, culling=culling, cube=cube) for culling in CULLINGS for cube in (None, 0.07)
+    ]
     decoded = [decoder.decode(position) for decoder in decoders]
     for other in decoded[1:]:
         np.testing.assert_allclose(other, decoded[0], rtol=0, atol=3e-6 * np.abs(decoded[0]).max())
@@ -64,8 +65,10 @@ def test_all_lists_give_the_same(device):
 def test_a_tighter_cut_costs_what_is_cut(device):
     model = random_model(count=60)
     position = points(200, model)
-    whole = Decoder(model, device).decode(position)
-    errors = [np.abs(Decoder(model, device, cut=cut).decode(position) - whole).mean() for cut in (2.5, 2.0, 1.5)]
+    whole = GaussianDecoder(model, device).decode(position)
+    errors = [
+        np.abs(GaussianDecoder(model, device, cut=cut).decode(position) - whole).mean() for cut in (2.5, 2.0, 1.5)
+    ]
     assert 0 < errors[0] < errors[1] < errors[2]
 
 
@@ -76,26 +79,26 @@ def test_outside_is_the_nearest_point_of_the_box(device):
     outside, nearest = inside.copy(), inside.copy()
     outside[:, 0], nearest[:, 0] = high[0] + 1e9, high[0]
     outside[:10, 2], nearest[:10, 2] = ORIGIN[2] - 0.5, ORIGIN[2]
-    decoder = Decoder(model, device)
+    decoder = GaussianDecoder(model, device)
     np.testing.assert_array_equal(decoder.decode(outside), decoder.decode(nearest))
 
 
 def test_the_models_own_probes(device):
     model = random_model(positions=True, dead=5)
-    decoder = Decoder(model, device)
+    decoder = GaussianDecoder(model, device)
     decoded = decoder.decode_probes()
     assert decoded.shape == (200, 27) and (decoded[model.dead] == 0).all() and (decoded[~model.dead] != 0).any(1).all()
     np.testing.assert_array_equal(decoder.decode_probes(model.stored_positions()), decoded)
-    # The order in which points lie on the device is none of the caller's business.
+    # The order of the points on the device does not show in the result.
     turned = decoder.decode(model.stored_positions()[::-1])[::-1]
     np.testing.assert_array_equal(turned[~model.dead], decoded[~model.dead])
 
 
 def test_wrong_positions():
-    decoder = Decoder(random_model())
-    with pytest.raises(WlmError, match="random: holds no positions"):
+    decoder = GaussianDecoder(random_model())
+    with pytest.raises(WlmError, match="random: the file stores no positions"):
         decoder.decode_probes()
-    with pytest.raises(WlmError, match="expected the positions of 200 probes, got 7"):
+    with pytest.raises(WlmError, match="expected the positions of its own 200 probes"):
         decoder.decode_probes(np.zeros((7, 3)))
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
@@ -104,23 +107,23 @@ def test_wrong_positions():
     with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
         decoder.decode(np.zeros(3))
     with pytest.raises(WlmError, match="device 'cuda:9'"):
-        Decoder(random_model(), "cuda:9")
+        GaussianDecoder(random_model(), "cuda:9")
     assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
 
 
 def test_it_says_what_memory_it_takes():
     model = random_model()
-    assert Decoder(model).device_bytes > 4 * (40 * 19 + len(model.net))
+    assert GaussianDecoder(model).device_bytes > 4 * (40 * 19 + len(model.content.net))
 
 
 def test_more_numbers_than_a_block_of_cuda_threads_can_hold():
     model = random_model(outputs=1501, count=3)
     position = points(20, model)
     close(model.decoder("cpu").decode(position), model, position)
-    most = most_outputs(model.profile.latent, model.profile.hidden)
-    check_outputs("x", model.profile, most, "cuda:0")
+    most = most_outputs(9, 16)
+    check_outputs("x", 9, 16, most, "cuda:0")
     with pytest.raises(WlmError, match=f"expected at most {most} numbers a probe on CUDA with latent .* found 1501"):
-        check_outputs("x", model.profile, 1501, "cuda:0")
+        check_outputs("x", 9, 16, 1501, "cuda:0")
 
 
 @pytest.mark.parametrize(("latent", "hidden"), [(1, 8), (9, 64), (32, 128)])

@@ -1,23 +1,21 @@
 """What an engine gets: numbers that decode to the same light with NumPy alone, and a shader that does the same."""
 
-import json
 import shutil
 import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
+from builders.exported import read_export
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
 
 from wlm.errors import WlmError
-from wlm.probe.data import load
-from wlm.probe.decode import Decoder
-from wlm.probe.exporter import export
-from wlm.probe.shader import probe_glsl
+from wlm.export import export
+from wlm.probe.gaussian.shader import probe_glsl
 
 SHAPES = [
     {},
-    {"support": "sphere", "cut": 2.0},
+    {"support": "sphere"},
     {"latent": 1, "hidden": 8, "bits": 4, "outputs": 3},
     {"latent": 4, "outputs": 5, "count": 1},
     {"turn": 0.0},
@@ -30,12 +28,12 @@ def sigmoid(x):
 
 
 class Files:
-    """An exported folder, read as "about" and the head of probe.glsl say, in float64."""
+    """A raw folder, read as "about" and the head of probe.glsl say, in float64."""
 
     def __init__(self, folder):
-        self.info = info = json.loads((folder / "probe.json").read_text())
-        words = np.frombuffer((folder / "gaussians.bin").read_bytes(), "<u4")
-        halves = np.frombuffer((folder / "network.bin").read_bytes(), "<f2").astype(np.float64)
+        self.info, arrays = read_export(folder)
+        info, words = self.info, arrays["gaussians"]
+        halves = arrays["network"].view("<f2").astype(np.float64)
         self.words = words
         latent, hidden, count = info["latent"], info["hidden"], info["gaussians"]
         per, first = info["words_per_gaussian"], info["first_gaussian_word"]
@@ -102,7 +100,7 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
     model = random_model(**settings)
     export(model, tmp_path)
     files = Files(tmp_path)
-    expected = Decoder(model).decode(places())
+    expected = model.decoder().decode(places())
     assert np.ptp(expected, axis=0).min() > 0, "the light varies"
     # float32 in the decoder.
     np.testing.assert_allclose(files.values(places()), expected, rtol=0, atol=2e-5 * np.abs(expected).max())
@@ -112,11 +110,12 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
 def test_the_reference_is_the_files_light(settings, tmp_path):
     model = random_model(**settings)
     export(model, tmp_path)
-    reference = load(tmp_path / "reference.json")
-    assert reference.probes == min(model.count, 64) + 1 and reference.outputs == model.outputs
-    values = Files(tmp_path).values(reference.position)
-    np.testing.assert_allclose(values, reference.values, rtol=0, atol=2e-5 * np.abs(values).max())
-    outside = reference.position[-1]
+    _, arrays = read_export(tmp_path)
+    position = arrays["position"]
+    assert arrays["values"].shape == (min(model.content.count, 64) + 1, model.outputs)
+    values = Files(tmp_path).values(position)
+    np.testing.assert_allclose(values, arrays["values"], rtol=0, atol=2e-5 * np.abs(values).max())
+    outside = position[-1]
     assert (outside > ORIGIN + EXTENT * SIZE).all()
 
 
@@ -140,30 +139,30 @@ def test_what_is_written(tmp_path):
     assert [path.name for path in paths] == [
         "gaussians.bin",
         "network.bin",
-        "probe.glsl",
+        "position.bin",
         "positions.bin",
-        "reference.json",
-        "probe.json",
+        "probe.glsl",
+        "values.bin",
+        "bundle.json",
     ]
     assert sorted(paths) == sorted(tmp_path.iterdir())
-    info = json.loads(paths[-1].read_text())
-    assert info["bytes"] == {path.name: path.stat().st_size for path in paths[:4]}
+    info, arrays = read_export(tmp_path)
     assert (info["source"], info["probes"], info["gaussians"]) == (model.source, 200, 40)
     assert info["dead"] == np.flatnonzero(model.dead).tolist() and len(info["dead"]) == 4
-    assert set(info["about"]) >= {"place", "gaussian", "network", "lists", "dead", "positions", "reference"}
-    codes = np.frombuffer((tmp_path / "positions.bin").read_bytes(), "<u2").reshape(-1, 3)
+    assert set(info["about"]) >= {"position", "gaussian", "network", "lists", "dead", "positions", "reference"}
+    codes = arrays["positions"].reshape(-1, 3)
     position = np.array(info["origin"]) + info["extent"] * np.array(info["size"]) * codes / 65535
     np.testing.assert_allclose(position, model.stored_positions(), rtol=1e-12)
     # As many bytes as half floats would take, but for the head (section 5.3.2).
-    assert info["bytes"]["gaussians.bin"] == 40 * 40 + 4 * (10 + 2 * 19)
+    assert arrays["gaussians"].nbytes == 40 * 40 + 4 * (10 + 2 * 19)
 
 
 def test_what_cannot_be_exported(tmp_path):
     model = random_model()
-    net = model.net.copy()
-    net[5] = np.inf
-    with pytest.raises(WlmError, match="random: cannot export: a number is NaN or infinite"):
-        export(replace(model, net=net), tmp_path / "new")
+    net = model.content.net.copy()
+    net[-5:] = np.inf
+    with pytest.raises(WlmError, match="random: cannot export: the model decodes to NaN or infinity"):
+        export(with_content(model, net=net), tmp_path / "new")
     for extent in (1e39, 1e-60):
         with pytest.raises(WlmError, match="random: cannot export: the probes' box is too"):
             export(replace(model, extent=extent), tmp_path / "new")
@@ -205,14 +204,14 @@ SH_CALLER = """vec3 sh[%d];
 def test_the_shader_compiles(settings, version, options, tmp_path):
     model = random_model(**settings)
     sh = SH_CALLER % (model.outputs // 3) if model.outputs % 3 == 0 else ""
-    (tmp_path / "shader.comp").write_text(f"#version {version}\n" + CALLER % (probe_glsl(model), sh))
+    (tmp_path / "shader.comp").write_text(f"#version {version}\n" + CALLER % (probe_glsl(model.content), sh))
     done = subprocess.run(["glslangValidator", *options, "shader.comp"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
 def test_the_shader_depends_on_the_shape_alone():
-    assert probe_glsl(random_model(seed=0, dead=0)) == probe_glsl(random_model(seed=1, count=9, probes=50, bits=7))
-    assert probe_glsl(random_model()) != probe_glsl(random_model(support="sphere"))
+    assert probe_glsl(random_model(seed=0).content) == probe_glsl(random_model(seed=1, count=9, bits=7).content)
+    assert probe_glsl(random_model().content) != probe_glsl(random_model(support="sphere").content)
 
 
 # GLSL's vectors and functions for a C++ compiler, in single precision as a GPU has it.
@@ -320,7 +319,7 @@ def test_the_shaders_arithmetic(settings, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     files = Files(folder)
-    position = np.concatenate([places(), load(folder / "reference.json").position]).astype(np.float32)
+    position = np.concatenate([places(), read_export(folder)[1]["position"]]).astype(np.float32)
     words = [program, folder / "gaussians.bin", folder / "network.bin"]
     out = subprocess.run(words, input=position.tobytes(), capture_output=True, check=True).stdout
     values = np.frombuffer(out, np.float32).reshape(len(position), 3, model.outputs)

@@ -10,17 +10,19 @@ import wlm
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays, save_probes
 from wlm.probe.evaluation import evaluate
-from wlm.probe.fit import _frame, compress, open_checkpoint
-from wlm.probe.model import Profile
-from wlm.probe.start import first_gaussians, local_spread, morton_order
-from wlm.probe.trainer import Trainer
+from wlm.probe.fit import compress, open_checkpoint
+from wlm.probe.gaussian import trainer as training
+from wlm.probe.gaussian.start import first_gaussians, local_spread
+from wlm.probe.gaussian.trainer import Trainer
+from wlm.probe.model import Profile, box_of
+from wlm.probe.morton import morton_order
 
-SMALL = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
+SMALL = Profile(name="small", method="gaussians", ratio=0.1, latent=3, hidden=16, steps=60)
 RANDOM = np.random.default_rng(7)
 
 
 def arrays(model):
-    return [getattr(model, key) for key in ("centre", "code", "bounds", "net")]
+    return [getattr(model.content, key) for key in ("code", "bounds", "net")]
 
 
 def test_it_learns_and_says_how_well():
@@ -39,7 +41,7 @@ def test_from_file_to_light_by_the_public_names(tmp_path):
     probes = synthetic(60)
     save_probes(tmp_path / "street.npz", probes.position, probes.values, key="sh_12.00")
     probes = wlm.probe.load(tmp_path / "street.npz", key="12.00")
-    model = wlm.probe.compress(probes, "small", steps=20)
+    model = wlm.probe.compress(probes, "small", steps=20, method="gaussians")
     assert (model.profile.name, model.profile.hidden, model.profile.steps) == ("small", 24, 20)
     points = RANDOM.random((5, 3))
     light = model.decoder("cpu").decode(points)  # [M, 3] -> [M, 27]
@@ -56,7 +58,7 @@ def test_one_seed_gives_one_result():
     first, second = compress(probes, SMALL, seed=3), compress(probes, SMALL, seed=3)
     assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(second), strict=True))
     other = compress(probes, SMALL, seed=4)
-    assert not np.array_equal(first.net, other.net)
+    assert not np.array_equal(first.content.net, other.content.net)
 
 
 @pytest.mark.parametrize("stop", [20, 52, 58])  # in each of the stages, which begin at 0, 50 and 55
@@ -88,8 +90,8 @@ def test_an_interrupt_is_kept(tmp_path):
 
 
 def _input(probes):
-    origin, extent, _ = _frame(probes.position)
-    x = ((probes.position - origin) / extent).astype(np.float32)
+    box = box_of(probes.position)
+    x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
     return x[probes.live], probes.values[probes.live]
 
 
@@ -144,12 +146,13 @@ def test_hard_sets(kind, tmp_path):
 def test_more_gaussians_than_places_are_not_made():
     probes = from_arrays(np.repeat(RANDOM.random((6, 3)), 5, 0), RANDOM.normal(size=(30, 3)).astype(np.float32))
     model = compress(probes, SMALL, ratio=1.0)
-    assert model.count + model.dropped == 6
+    assert model.content.count + model.content.dropped == 6
 
 
-def test_useless_gaussians_are_dropped_within_the_bound():
+def test_useless_gaussians_are_dropped_within_the_bound(monkeypatch):
     probes = synthetic(200)
-    profile = SMALL.override({"steps": 300, "ratio": 0.3, "prune": 0.03})
+    monkeypatch.setattr(training, "_PRUNE", 0.03)
+    profile = SMALL.override({"steps": 300, "ratio": 0.3})
     x, values = _input(probes)
     trainer = Trainer(x, values, profile, 0, "cpu")
     try:
@@ -160,9 +163,10 @@ def test_useless_gaussians_are_dropped_within_the_bound():
     finally:
         trainer.close()
     model = compress(probes, profile)
-    assert model.dropped == dropped and model.count == 60 - dropped
-    # Nothing but what no probe feels goes where nothing may change.
-    assert compress(probes, profile, prune=0.0).dropped < dropped
+    assert model.content.dropped == dropped and model.content.count == 60 - dropped
+    # Only Gaussians that no probe needs are dropped where nothing may change.
+    monkeypatch.setattr(training, "_PRUNE", 0.0)
+    assert compress(probes, profile).content.dropped < dropped
 
 
 def test_a_fit_that_diverges_is_an_error(monkeypatch):

@@ -4,41 +4,42 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
 from pydantic import ValidationError
 
 from wlm.config import profile_names
 from wlm.errors import WlmError
-from wlm.probe.model import CENTRE, LATENT, Profile, layer_shapes
+from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, layer_shapes
+from wlm.probe.gaussian.trainer import CENTRE_BITS, CODE_BITS
+from wlm.probe.model import Profile
 
 
 @pytest.mark.parametrize("bits", [4, 10, 16])
 def test_codes_reach_from_the_lowest_to_the_highest_value(bits):
-    model = random_model(count=3, bits=bits)
-    centre, code = model.centre.copy(), model.code.copy()
-    centre[0], centre[1], code[0], code[1] = 0, 65535, 0, 2**bits - 1
-    model = replace(model, centre=centre, code=code)
-    rows = model.rows()
+    content = random_model(count=3, bits=bits).content
+    code = content.code.copy()
+    code[0], code[1] = 0, content.levels
+    rows = replace(content, code=code).rows()
     assert rows.dtype == np.float32
-    np.testing.assert_allclose(rows[:2], model.bounds, rtol=1e-6)
+    np.testing.assert_allclose(rows[:2], content.bounds, rtol=1e-6)
 
 
 def test_codes_in_between_are_those_of_the_equation():
-    model = random_model()
-    rows = model.rows()
-    low, high = model.bounds.astype(np.float64)
+    content = random_model().content
+    rows = content.rows()
+    low, high = content.bounds.astype(np.float64)
     # Eq. 14 in float64: two roundings of float32 at values up to 3 wide.
-    expected = low[LATENT] + model.code[:, 7:] * (high - low)[LATENT] / 1023.0
+    expected = low[LATENT] + content.code[:, LATENT] * (high - low)[LATENT] / 1023.0
     np.testing.assert_allclose(rows[:, LATENT], expected, rtol=0, atol=1e-6)
-    expected = low[CENTRE] + model.centre * (high - low)[CENTRE] / 65535.0
+    expected = low[CENTRE] + content.code[:, CENTRE] * (high - low)[CENTRE] / 65535.0
     np.testing.assert_allclose(rows[:, CENTRE], expected, rtol=0, atol=1e-6)
 
 
 def test_a_channel_of_one_value_is_that_value():
     model = random_model()
-    bounds = model.bounds.copy()
+    bounds = model.content.bounds.copy()
     bounds[:, 12] = 0.1
-    np.testing.assert_array_equal(replace(model, bounds=bounds).rows()[:, 12], np.float32(0.1))
+    np.testing.assert_array_equal(with_content(model, bounds=bounds).content.rows()[:, 12], np.float32(0.1))
 
 
 def test_positions_are_normalised_and_moved_into_the_box():
@@ -82,33 +83,32 @@ def test_positions_are_recognised_as_the_models_own():
     assert model.has_probes_at(position) and model.has_probes_at(position.astype(np.float32).astype(np.float64))
     moved = position + [[0, 0, 0], [1e-3, 0, 0], [0, 0, 0]]
     assert not model.has_probes_at(moved) and not model.has_probes_at(position[:2])
-    with pytest.raises(WlmError, match="random: holds no positions"):
+    with pytest.raises(WlmError, match="random: the file stores no positions"):
         model.stored_positions()
 
 
 def test_sizes_are_those_of_the_paper():
     # 9 + 3 inputs, two layers of 64, 27 numbers, a bias each.
     assert layer_shapes(9, 64, 27) == [(13, 64), (65, 64), (65, 27)]
-    assert Profile(name="x").code_bits().sum() == 208
-    assert Profile(name="x", bits=8, latent=12).code_bits().sum() == 3 * 16 + 19 * 8
+    assert (CENTRE_BITS, CODE_BITS, CUT) == (16, 10, 3.0)
     # As half floats, table 3: 19 numbers a Gaussian for 5% of 15,000 probes and the network, within 10% of 50.1 KB.
     assert (2 * 19 * 750 + 2 * (13 * 64 + 65 * 64 + 65 * 27)) / 1024 == pytest.approx(50.1, rel=0.2)
 
 
 def test_the_profiles_that_are_there():
-    assert {"compact", "paper", "standard"} <= set(profile_names("probe"))
+    assert {"compact", "paper", "pca", "small", "standard"} == set(profile_names("probe"))
     for name in ("compact", "paper", "standard"):
         assert Profile.load(name).name == name
     paper = Profile.load("paper")
-    assert (paper.ratio, paper.bits, paper.latent, paper.hidden, paper.cut) == (0.05, 10, 9, 64, 3.0)
+    assert (paper.ratio, paper.latent, paper.hidden) == (0.05, 9, 64)
     assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)
 
 
 def test_a_profile_from_a_file(tmp_path):
-    (tmp_path / "mine.yaml").write_text("name: mine\nbits: 8\n")
-    assert Profile.load(str(tmp_path / "mine.yaml")).bits == 8
-    (tmp_path / "mine.yaml").write_text("name: mine\nbitts: 8\n")
-    with pytest.raises(WlmError, match="mine.yaml: unknown key 'bitts'; did you mean 'bits'"):
+    (tmp_path / "mine.yaml").write_text("name: mine\nlatent: 8\n")
+    assert Profile.load(str(tmp_path / "mine.yaml")).latent == 8
+    (tmp_path / "mine.yaml").write_text("name: mine\nlatents: 8\n")
+    with pytest.raises(WlmError, match="mine.yaml: unknown key 'latents'; did you mean 'latent'"):
         Profile.load(str(tmp_path / "mine.yaml"))
     with pytest.raises(WlmError, match="profile 'tiny' of probe: expected one of"):
         Profile.load("tiny")
@@ -120,16 +120,14 @@ def test_a_profile_from_a_file(tmp_path):
         {"ratio": 0.0},
         {"ratio": 1.1},
         {"ratio": float("nan")},
-        {"bits": 3},
-        {"bits": 17},
+        {"method": "transform"},
         {"latent": 0},
         {"hidden": 20},
         {"support": "cube"},
         {"optimiser": "sgd"},
         {"steps": 9},
         {"net_rate": 0.0},
-        {"quantise_from": 0.95},
-        {"prune": -1.0},
+        {"gain": 0.0},
         {"colour": 1},
     ],
     ids=str,

@@ -8,8 +8,9 @@ import pytest
 from builders.probe_models import random_model
 
 from wlm.errors import WlmError
-from wlm.probe import export_grid, load, load_positions
-from wlm.probe.lattice import grid_places
+from wlm.export import export
+from wlm.probe import load, load_positions
+from wlm.probe.engines.lattice import grid_places
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +18,7 @@ def grid(tmp_path_factory):
     """A model and its grid: 6 x 3 x 5 cells of a box of 8 x 3 x 6."""
     model = random_model()
     folder = tmp_path_factory.mktemp("grid") / "out"
-    export_grid(model, folder, cells=6)
+    export(model, folder, "three", cells=6)
     return model, folder
 
 
@@ -87,5 +88,5 @@ def test_export_refuses(tmp_path):
         (random_model(), {"cells": 257}, "cells: expected"),
     ]:
         with pytest.raises(WlmError, match=message):
-            export_grid(model, tmp_path / "out", **settings)
+            export(model, tmp_path / "out", "three", **settings)
     assert not (tmp_path / "out").exists()

@@ -7,7 +7,8 @@ import pytest
 from builders.probe_models import random_model
 
 from wlm.errors import WlmError
-from wlm.probe import export_unity, load, load_positions
+from wlm.export import export
+from wlm.probe import load, load_positions
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 
@@ -22,7 +23,7 @@ def shade(sh: np.ndarray, n: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("outputs", [27, 12])
 def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
     model = random_model(outputs=outputs, probes=20, positions=True)
-    export_unity(model, tmp_path / "out", mirror=mirror)
+    export(model, tmp_path / "out", "unity", mirror=mirror)
     content = json.loads((tmp_path / "out" / "probes.json").read_text())
     position = np.array(content["position"]).reshape(-1, 3)
     sh = np.array(content["sh"]).reshape(-1, 3, 9)
@@ -40,7 +41,7 @@ def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
 
 def test_it_is_read_as_probes(tmp_path):
     model = random_model(probes=20, positions=True)
-    export_unity(model, tmp_path / "out")
+    export(model, tmp_path / "out", "unity")
     path = tmp_path / "out" / "probes.json"
     probes = load(path)
     np.testing.assert_allclose(probes.position, model.stored_positions(), rtol=1e-6)
@@ -61,13 +62,14 @@ def test_it_is_read_as_probes(tmp_path):
 
 
 def test_what_is_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", position=np.zeros((3, 3)))
     for model, settings, message in [
         (random_model(outputs=48, positions=True), {}, "expected L0, L1 or L2"),
         (random_model(outputs=5, positions=True), {}, "expected L0, L1 or L2"),
         (random_model(positions=True), {"mirror": "w"}, "mirror: expected x, y or z"),
-        (random_model(), {}, "holds no positions"),
-        (random_model(), {"position": np.zeros((3, 3))}, "expected the positions of 200 probes"),
+        (random_model(), {}, "stores no positions"),
+        (random_model(), {"original": tmp_path / "other.npz"}, "expected the 200 probes"),
     ]:
         with pytest.raises(WlmError, match=message):
-            export_unity(model, tmp_path / "out", **settings)
+            export(model, tmp_path / "out", "unity", **settings)
     assert not (tmp_path / "out").exists()

@@ -9,9 +9,10 @@ from reference import volume as reference
 from reference import volume_blocks
 
 from wlm.errors import WlmError
-from wlm.probe.light import DecodedLight, StoredLight, at_probes, light_of
-from wlm.probe.volume import FrameStats, Volume
-from wlm.probe.walk import settle
+from wlm.probe.gaussian.decode import GaussianLight
+from wlm.probe.volume.cascade import FrameStats, Volume
+from wlm.probe.volume.light import StoredLight, at_probes
+from wlm.probe.volume.walk import settle
 
 # A multiple of every block's side, so that all of a scene can move by it.
 FAR = np.array([1_000_000.0, -1_000_000.0, 3_200_000.0])
@@ -320,8 +321,8 @@ def test_a_model_is_decoded_where_it_is_asked(device: str):
     random = np.random.default_rng(4)
     position = model.origin + model.extent * model.size * random.random((90, 3))
     decoder = model.decoder(device)
-    light, stored = light_of(decoder, position), StoredLight(decoder.decode(position), device)
-    assert isinstance(light, DecodedLight)
+    light, stored = decoder.light(position), StoredLight(decoder.decode(position), device)
+    assert isinstance(light, GaussianLight)
     numbers = np.array([3, 80, 3, 0])
     np.testing.assert_allclose(at_probes(light, numbers), at_probes(stored, numbers), atol=1e-6)
     volumes = [Volume(position, source, side=16) for source in (light, stored)]

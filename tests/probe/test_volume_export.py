@@ -1,18 +1,20 @@
 """A volume's export: buffers that hold what is read, and shaders that read it, compiled and run as C++."""
 
-import json
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from builders.exported import read_export
 
 from wlm.errors import WlmError
-from wlm.probe.light import StoredLight
+from wlm.export import export
+from wlm.export.shading import translate
 from wlm.probe.sphere import irradiance
-from wlm.probe.volume import Volume
-from wlm.probe.volume_export import export_volume
-from wlm.probe.volume_shader import volume_glsl, volume_hlsl
+from wlm.probe.volume.bundle import volume_bundle
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.shader import volume_glsl
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +28,7 @@ def volume() -> Volume:
     return made
 
 
-# GLSL's and HLSL's types for a C++ compiler.
+# GLSL's types for a C++ compiler.
 _PRELUDE = """
 #include <cmath>
 #include <cstdint>
@@ -35,14 +37,12 @@ _PRELUDE = """
 #include <vector>
 typedef uint32_t uint;
 struct vec3 { float x, y, z; vec3(float x, float y, float z) : x(x), y(y), z(z) {} };
-typedef vec3 float3;
 vec3 operator*(float s, vec3 v) { return vec3(s * v.x, s * v.y, s * v.z); }
 vec3& operator+=(vec3& a, vec3 b) { a.x += b.x; a.y += b.y; a.z += b.z; return a; }
 template <class T, class U> T min(T a, U b) { return a < (T)b ? a : (T)b; }
 template <class T, class U> T max(T a, U b) { return a > (T)b ? a : (T)b; }
 float floor(float x) { return std::floor(x); }
 float uintBitsToFloat(uint i) { float f; std::memcpy(&f, &i, 4); return f; }
-float asfloat(uint i) { return uintBitsToFloat(i); }
 template <class T> std::vector<T> load(const char* path)
 {
     std::vector<T> data;
@@ -82,30 +82,27 @@ int main()
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
-def test_shaders_read_what_the_volume_has(volume, tmp_path):
-    export_volume(volume, tmp_path)
-    document = json.loads((tmp_path / "volume.json").read_text())
-    reference = json.loads((tmp_path / "reference.json").read_text())
-    points = np.array(reference["position"])
-    weight = np.array(reference["weight"])
+def test_the_shader_reads_what_the_volume_has(volume, tmp_path):
+    export(volume_bundle(volume), tmp_path)
+    document, arrays = read_export(tmp_path)
+    points, weight = arrays["position"], arrays["weight"]
     assert (weight == 0.0).any() and ((weight > 0.1) & (weight < 0.9)).any() and (weight > 0.999).any()
     normals = np.random.default_rng(1).normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sent = np.concatenate([points - document["viewpoint"], normals], 1).astype("<f4").tobytes()
-    for name in ("volume.glsl", "volume.hlsl"):
-        (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / name).read_text() + _MAIN)
-        subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
-        out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
-        got = np.frombuffer(out, "<f4").reshape(-1, 58)
-        np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
-        # Divided by a small weight, a rounding of the place counts for more.
-        want = np.array(reference["values"])
-        np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
-        ahead = volume.read(points, normals)
-        far = ahead.weight[:, None]
-        np.testing.assert_allclose(got[:, 28:55] * far, ahead.values * far, atol=2e-5)
-        shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 28:55], normals, strict=True)])
-        np.testing.assert_allclose(got[:, 55:], shown / np.pi, atol=2e-5)
+    (tmp_path / "run.cpp").write_text(_PRELUDE + (tmp_path / "probe.glsl").read_text() + _MAIN)
+    subprocess.run(["g++", "-O1", "-std=c++14", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
+    out = subprocess.run([tmp_path / "run"], cwd=tmp_path, input=sent, capture_output=True, check=True).stdout
+    got = np.frombuffer(out, "<f4").reshape(-1, 58)
+    np.testing.assert_allclose(got[:, 0], weight, atol=1e-5)
+    # Divided by a small weight, a rounding of the place counts for more.
+    want = arrays["values"]
+    np.testing.assert_allclose(got[:, 1:28] * weight[:, None], want * weight[:, None], atol=2e-5)
+    ahead = volume.read(points, normals)
+    far = ahead.weight[:, None]
+    np.testing.assert_allclose(got[:, 28:55] * far, ahead.values * far, atol=2e-5)
+    shown = np.stack([irradiance(v.reshape(9, 3), n[None])[0] for v, n in zip(got[:, 28:55], normals, strict=True)])
+    np.testing.assert_allclose(got[:, 55:], shown / np.pi, atol=2e-5)
 
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
@@ -114,7 +111,7 @@ def test_shaders_read_what_the_volume_has(volume, tmp_path):
 def test_the_shaders_compile(language, outputs, tmp_path):
     if language == "hlsl":
         call = "RWStructuredBuffer<float> o : register(u0);\n[numthreads(1, 1, 1)] void main()\n"
-        text, options = volume_hlsl(outputs) + call, ["-D", "-V", "-e", "main"]
+        text, options = translate(volume_glsl(outputs), "hlsl") + call, ["-D", "-V", "-e", "main"]
         body = f"{{ float v[{outputs}]; float3 p = float3(1.0, 2.0, 3.0); o[0] = wlm_volume_read(p, p, v) + v[0]; }}\n"
     else:
         body = "layout(std430, binding = 7) buffer O { float o[]; };\n"
@@ -131,19 +128,18 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     with pytest.raises(ValueError, match="viewpoint"):
         _ = nothing.viewpoint
     with pytest.raises(WlmError, match="no block"):
-        export_volume(nothing, tmp_path / "none")
+        export(volume_bundle(nothing), tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    paths = export_volume(volume, tmp_path / "out")
-    assert [path.exists() for path in paths] == [True] * 7 and export_volume(volume, tmp_path / "out") == paths
-    document = json.loads(paths[-1].read_text())
-    pages = np.fromfile(tmp_path / "out" / "pages.bin", "<i4").reshape(4, 8, 8, 8)
-    pool = np.fromfile(tmp_path / "out" / "pool.bin", "<f4").reshape(-1, 27)
+    paths = export(volume_bundle(volume), tmp_path / "out")
+    assert [path.exists() for path in paths] == [True] * 8 and export(volume_bundle(volume), tmp_path / "out") == paths
+    document, arrays = read_export(tmp_path / "out")
+    pages, pool = arrays["pages"].reshape(4, 8, 8, 8), arrays["pool"].reshape(-1, 27)
     values, valid = volume.unscroll()
     for level, described in enumerate(document["levels"]):
         place = np.argwhere(valid[level])
         block = place + np.array(described["base"]) - np.array(described["start"], int)
         np.testing.assert_array_equal(pool[pages[level][tuple((block % 8).T)]], values[level][tuple(place.T)])
     assert (pages >= 0).sum() == valid.sum() == len(pool)
-    (tmp_path / "out" / "volume.json").write_text("{}")
+    (tmp_path / "out" / "bundle.json").write_text("{}")
     with pytest.raises(WlmError):
-        export_volume(volume, tmp_path / "out")
+        export(volume_bundle(volume), tmp_path / "out")

@@ -8,9 +8,9 @@ import pytest
 
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
-from wlm.probe.light import StoredLight
-from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, loop_frames, score_volume, settle, summary, walk
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, settle, summary, walk
 
 
 def _hills(count: int = 900) -> np.ndarray:

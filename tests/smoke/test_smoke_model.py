@@ -195,7 +195,7 @@ def test_a_file_says_how_its_network_looks_at_smoke(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda settings, tensors: tensors.update(more=np.zeros(3, np.float16)), "part more is none of the file's"),
+        (lambda settings, tensors: tensors.update(more=np.zeros(3, np.float16)), "part more is unknown"),
         (
             lambda settings, tensors: settings["network"].update(width=16),
             r"encoder.2.2.weight is float16 \(32, 32, 3, 3\), expected float16 \(64, 64, 3, 3\)",

@@ -23,7 +23,7 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEveryIfKept,
     Device,
-    Engine,
+    EngineOrRaw,
     ExactShader,
     PageFile,
     ReportFile,
@@ -287,7 +287,7 @@ def decode(
 def export(
     file: _File,
     output: Annotated[Path, output_option("OUT", "The folder to write to.")],
-    engine: Engine = "raw",
+    engine: EngineOrRaw = "raw",
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
 ) -> None:

@@ -7,13 +7,12 @@ import typer
 
 from wlm.cli.console import escape, quiet_warp, show, table
 from wlm.cli.options import Device, ModelFile, ShaderLanguage, output_option, shader_of
-from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from wlm.probe import ProbeModel, Transform
+    from wlm.probe import ProbeModel
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +46,6 @@ def export(
         typer.Option(help="For Unity, which is left-handed: the axis to turn round; default none."),
     ] = None,
     shader: ShaderLanguage = None,
-    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the light for an engine, as files that it takes as they are.
@@ -60,43 +58,27 @@ def export(
         raise WlmError("--mirror: means nothing without --engine unity")
     language = shader_of(engine, shader)
     quiet_warp()
-    from wlm import probe
-    from wlm.probe.three_grid import CELLS
+    from wlm.export import export as export_files
     from wlm.system import load
 
-    model = at_time(load(file, "probe"), time)
-    if engine == "raw":
-        given = given_positions(model, original)
-        paths = probe.export(model, output, device=device, position=given, shader=language)
-    elif engine in ("three", "unreal"):
-        given, size = given_positions(model, original), CELLS if cells is None else cells
-        write = probe.export_grid if engine == "three" else probe.export_unreal
-        paths = write(model, output, cells=size, position=given, device=device)
-    elif engine == "godot":
-        bake = original if original is not None and original.suffix.lower() == ".lmbake" else None
-        given = None if bake is not None else given_positions(model, original)
-        paths = probe.export_godot(model, output, bake=bake, cells=cells, position=given, device=device)
-    else:
-        given = None if original is None else own_positions(model, original)
-        paths = probe.export_unity(model, output, mirror=mirror, position=given, device=device)
+    model = load(file, "probe")
+    given = {name: value for name, value in (("cells", cells), ("mirror", mirror), ("original", original))}
+    given = {name: value for name, value in given.items() if value is not None}
+    engine_or_raw = None if engine == "raw" else engine
+    paths = export_files(model, output, engine_or_raw, shader=language, device=device, **given)
     rows = table(str(output), ["file", "bytes"])
     for path in paths:
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 
 
-def given_positions(model: "ProbeModel | Transform", original: Path | None) -> "np.ndarray | None":
-    """The positions of the model's own probes in another file, if there is one; only a transform needs them."""
-    if original is None:
-        return None
-    position = own_positions(model, original)
-    if model.profile.method != "transform":
-        raise WlmError(f"--original: means nothing to {model.name}, which is decoded without its probes' positions")
-    return position
+def given_positions(model: "ProbeModel", original: Path | None) -> "np.ndarray | None":
+    """Returns the positions of the model's own probes in another file, or None."""
+    return None if original is None else own_positions(model, original)
 
 
-def own_positions(model: "ProbeModel | Transform", original: Path) -> "np.ndarray":
-    """The positions of the model's own probes in another file."""
+def own_positions(model: "ProbeModel", original: Path) -> "np.ndarray":
+    """Reads the positions of the model's own probes from another file."""
     from wlm.probe import load_positions
 
     position = load_positions(original)

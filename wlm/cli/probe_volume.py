@@ -7,14 +7,13 @@ import typer
 
 from wlm.cli.console import check_output, escape, number, quiet_warp, running, show, table, write_json
 from wlm.cli.options import Device, ModelFile, ReportFile, output_option
-from wlm.cli.probe_day import Time, at_time
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from wlm.probe import Decoder, ProbeModel, ProbeSet, Volume
-    from wlm.probe.seen import SeenScore
+    from wlm.probe.views import ViewScore
 
 _Block = Annotated[float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")]
 _Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
@@ -47,7 +46,6 @@ def walk(
     budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
     key: _Key = None,
     json_path: ReportFile = None,
-    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
@@ -60,10 +58,10 @@ def walk(
         raise WlmError(f"--up: expected x, y or z, got {up}")
     quiet_warp()
     from wlm.probe import load_positions
-    from wlm.probe.walk import STEP, camera_path, loop_frames, settle, summary, walk
+    from wlm.probe.volume.walk import STEP, camera_path, loop_frames, settle, summary, walk
     from wlm.system import load
 
-    model = at_time(load(file, "probe"), time)
+    model = load(file, "probe")
     decoder = model.decoder(device)
     volume, original = _volume(file, model, decoder, probes_path, key, block, budget)
     position = volume.position
@@ -96,21 +94,21 @@ def volume(
     ] = None,
     block: _Block = None,
     key: _Key = None,
-    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
     quiet_warp()
-    from wlm.probe.volume_export import export_volume
-    from wlm.probe.walk import settle
+    from wlm.export import export
+    from wlm.probe.volume.bundle import volume_bundle
+    from wlm.probe.volume.walk import settle
     from wlm.system import load
 
-    model = at_time(load(file, "probe"), time)
+    model = load(file, "probe")
     made, _ = _volume(file, model, model.decoder(device), probes_path, key, block, None)
     lit = made.position[made.numbers]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
     rows = table(str(output), ["file", "bytes"])
-    for path in export_volume(made, output):
+    for path in export(volume_bundle(made), output):
         rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
     show(rows)
 
@@ -137,9 +135,8 @@ def _volume(
     budget: int | None,
 ) -> "tuple[Volume, np.ndarray | None]":
     """A volume of a model's probes, and the light that was compressed, where it is given."""
-    from wlm.probe.light import light_of
     from wlm.probe.places import probes_of
-    from wlm.probe.volume import BUDGET, Volume
+    from wlm.probe.volume.cascade import BUDGET, Volume
 
     if probes_path is None:
         live = ~model.dead if len(model.dead) else None
@@ -149,19 +146,19 @@ def _volume(
     if probes_path is not None and not model.has_probes_at(position):
         raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
     budget = BUDGET if budget is None else budget
-    light = light_of(decoder, position)
+    light = decoder.light(position)
     return Volume(position, light, live=live, normal=normal, block=block, budget=budget), original
 
 
 def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
     """What is read along a walk, from the probes as they were and from the model's."""
-    from wlm.probe.light import StoredLight, light_of
-    from wlm.probe.walk import score_volume
+    from wlm.probe.volume.light import StoredLight
+    from wlm.probe.volume.walk import score_volume
 
     decoder = model.decoder(device)
     lights = {
         "lossless": StoredLight(probes.values, decoder.device),
-        "decoded": light_of(decoder, probes.position),
+        "decoded": decoder.light(probes.position),
     }
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
@@ -181,10 +178,10 @@ def show_walk_scores(walked: dict[str, dict[str, Any]]) -> None:
 
 def score_seen(
     model: "ProbeModel", probes: "ProbeSet", views: int, mesh: Path | None, device: str
-) -> "list[SeenScore]":
+) -> "list[ViewScore]":
     """Scores pictures under the decoded light, 50 of them where no number is given."""
     from wlm.formats.geometry import read_geometry
-    from wlm.probe.seen import VIEWS, score_views
+    from wlm.probe.views import VIEWS, score_views
 
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
     decoded = model.decoder(device).decode_probes(probes.position)
@@ -192,7 +189,7 @@ def score_seen(
         return score_views(probes, decoded, geometry, views=views or VIEWS, device=device, progress=progress)
 
 
-def show_seen(scores: "list[SeenScore]") -> None:
+def show_seen(scores: "list[ViewScore]") -> None:
     """Shows the scores of pictures; nothing without any."""
     if not scores:
         return

@@ -14,7 +14,8 @@ level, and beside it:
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -31,10 +32,10 @@ _VERSION = 1
 _KITS = {
     "lightmap": "wlm.export.engines.lightmap",
     "atlas": "wlm.export.engines.atlas",
-    "probe": "wlm.export.engines.probe",
+    "probe": "wlm.probe.engines.{engine}",
     "smoke": "wlm.export.engines.smoke",
 }
-"""Modules whose `write_kit` writes a bundle of a system for an engine."""
+"""Modules whose `write_kit` writes a bundle of a system for an engine; those of probes are beside their readers."""
 
 
 def export(
@@ -60,7 +61,9 @@ def export(
         shader: Language of the raw folder's shader, one of `wlm.export.LANGUAGES`.
         exact: Whether the raw folder's shader fetches texels and mixes them in floats instead of using the filter.
         device: Device that decodes the reference, "cpu" or "cuda:0" for example.
-        options: Options of the kit: keyword arguments of `write_kit` in the system's module of `wlm.export.engines`.
+        options: Options of the kit. Probes: `original`, the file that was compressed, if the model does not store its
+            positions; `cells` of a grid along its longest side (three, godot, unreal); `mirror`, the axis to mirror
+            (unity).
 
     Returns:
         The files written, the index last.
@@ -76,12 +79,12 @@ def export(
         raise WlmError(f"engine {engine}: shader and exact have no meaning for a kit, whose language is the engine's")
     folder = Path(folder)
     with made_parents(folder), staged(folder, INDEX_FILE, FORMAT) as staging:
-        bundle = model if isinstance(model, Bundle) else model.bundle(device=device)
+        bundle = model if isinstance(model, Bundle) else replace(model.bundle(device=device), model=model)
         if engine is None:
             _check_options(options, (), "a raw folder")
             _write_raw(bundle, staging, shader, exact)
         else:
-            _write_kit(bundle, staging, engine, options)
+            _write_kit(bundle, staging, engine, device, options)
     return [folder / name for name in (*read_index(folder / INDEX_FILE)["files"], INDEX_FILE)]
 
 
@@ -101,28 +104,34 @@ def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None
     for name, part in bundle.parts.items():
         (folder / name).mkdir()
         _write_raw(part, folder / name, language, exact)
-    _write_index(bundle, folder, entries | {"parts": list(bundle.parts)})
+    _write_index(bundle, folder, entries | {"parts": list(bundle.parts)}, bundle.document)
 
 
-def _write_kit(bundle: Bundle, folder: Path, engine: str, options: dict[str, Any]) -> None:
+def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: dict[str, Any]) -> None:
     """Writes the kit of a bundle, or of each of its parts that are light, in a subfolder each."""
     if not bundle.parts:
         if bundle.system not in _KITS:
             raise WlmError(f"{bundle.name}: there is no kit for {engine}; expected the raw folder")
-        write_kit = import_module(_KITS[bundle.system]).write_kit
-        _check_options(options, tuple(signature(write_kit).parameters)[3:], f"{bundle.system} and {engine}")
-        _write_index(bundle, folder, {"engine": engine} | write_kit(bundle, folder, engine, **options))
+        write_kit = import_module(_KITS[bundle.system].format(engine=engine)).write_kit
+        known = tuple(signature(write_kit).parameters)[3:]
+        _check_options(options, known, f"{bundle.system} and {engine}")
+        if "device" in known:
+            options = options | {"device": device}
+        entries = write_kit(bundle, folder, engine, **options)
+        # A kit with an explanation of its own does not have the bundle's buffers, which the document describes.
+        document = {} if "about" in entries else bundle.document
+        _write_index(bundle, folder, {"engine": engine} | entries, document)
         return
     parts = {name: part for name, part in bundle.parts.items() if "values" not in part.document}
     if not parts:
         raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found other values")
     for name, part in parts.items():
         (folder / name).mkdir()
-        _write_kit(part, folder / name, engine, options)
+        _write_kit(part, folder / name, engine, device, options)
         for script in (folder / name).glob("*.cs"):
             # A Unity project can hold a class only once.
             os.replace(script, folder / script.name)
-    _write_index(bundle, folder, {"engine": engine, "parts": list(parts)})
+    _write_index(bundle, folder, {"engine": engine, "parts": list(parts)}, bundle.document)
 
 
 def _check_options(options: Iterable[str], known: Sequence[str], where: str) -> None:
@@ -131,12 +140,12 @@ def _check_options(options: Iterable[str], known: Sequence[str], where: str) -> 
             raise WlmError(f"{name}: has no meaning for {where}")
 
 
-def _write_index(bundle: Bundle, folder: Path, entries: dict[str, Any]) -> None:
-    if wrong := RESERVED & set(bundle.document):
+def _write_index(bundle: Bundle, folder: Path, entries: dict[str, Any], document: Mapping[str, Any]) -> None:
+    if wrong := RESERVED & set(document):
         raise ValueError(f"document: expected none of the reserved keys, got {', '.join(sorted(wrong))}")
     head = {"format": FORMAT, "version": _VERSION, "system": bundle.system, "name": bundle.name}
     try:
-        text = compact_json(head | entries | dict(bundle.document))
+        text = compact_json(head | entries | dict(document))
     except ValueError as error:
         raise WlmError(f"{bundle.name}: cannot export: a number is NaN or infinite") from error
     (folder / INDEX_FILE).write_bytes(text.encode())

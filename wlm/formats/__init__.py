@@ -1,1 +1,1 @@
-"""Files: EXR pictures, BC7 blocks, DDS textures and the artifact."""
+"""Readers and writers of files: pictures, textures, block codecs, meshes, volumes, probes and artifacts."""

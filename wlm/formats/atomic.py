@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all."""
+"""Atomic writing: a file is written completely or not at all."""
 
 import os
 import stat
@@ -12,22 +12,22 @@ from wlm.formats.lock import temporary
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a temporary name beside `path`, and moves what was written there onto `path` at the end.
+    """Yields a temporary path beside `path`, and moves the file written there onto `path` at the end.
 
-    If the block raises, the temporary file is removed and `path` keeps what it held; so it is where the process is
-    killed, but that the next write to `path` removes the file. A link is followed: the file that it points to is
+    If the block raises, the temporary file is removed and `path` keeps its content. If the process is killed, `path`
+    keeps its content too, and the next write to it removes the temporary file. A link is followed: its target is
     replaced.
 
     Args:
         path: The file to write; its folder must exist.
 
     Yields:
-        The temporary name, of an empty file in the same folder.
+        The path of an empty file in the same folder.
 
     Raises:
-        WlmError: The folder is missing, `path` is not a regular file, or the system refused (a full disk).
+        WlmError: The folder is missing, `path` is not a regular file, or the system refuses (a full disk).
     """
-    # Resolved first: os.replace would put a file in place of the link.
+    # Links are resolved first: os.replace would replace the link itself.
     target = Path(os.path.realpath(path))
     with _as_wlm_error(path):
         # Renaming over a device such as /dev/null would destroy it.
@@ -37,7 +37,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise WlmError(f"{path}: cannot write: the folder {target.parent} does not exist")
         with temporary(target) as part:
             yield part
-            # Without it a crash of the machine after the rename could leave an empty file.
+            # Without fsync, a crash of the machine after the rename could leave an empty file.
             handle = os.open(part, os.O_RDWR)
             try:
                 os.fsync(handle)
@@ -48,7 +48,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes the renames in a folder outlast a crash of the machine, where the system can (Windows can't)."""
+    """Makes renames in a folder survive a crash of the machine, on systems that can (Windows cannot)."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -58,17 +58,17 @@ def sync_folder(folder: Path) -> None:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) -> int:
-    """Writes a file whole or not at all.
+    """Writes a file completely or not at all.
 
     Args:
         path: The file to write; its folder must exist.
-        data: The content, or its pieces in order; any object with the buffer protocol counts as bytes.
+        data: The content, or its pieces in order, as objects with the buffer protocol.
 
     Returns:
         The number of bytes written.
 
     Raises:
-        WlmError: As `atomic_path` raises it.
+        WlmError: See `atomic_path`.
     """
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
     total = 0
@@ -80,7 +80,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
                 if view.nbytes == 0:
                     continue
                 view = view.cast("B")
-                # The system may take less than it was given, as it does when a disk fills up.
+                # The system may write fewer bytes than requested, for example when a disk fills up.
                 while view:
                     written = os.write(handle, view)
                     view = view[written:]
@@ -92,7 +92,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
 
 @contextmanager
 def _as_wlm_error(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turns an `OSError` into a line that names the file that was to be written."""
+    """Turns an `OSError` into a line that names the output file."""
     try:
         yield
     except OSError as error:

@@ -1,8 +1,8 @@
-"""BC7 blocks of mode 6, exactly: one line in RGBA a block, 7-bit endpoints and a P bit for each, 16 levels.
+"""Exact packing and decoding of BC7 mode 6: per block two RGBA endpoints of 7 bits, a P bit each, and 16 levels.
 
 Bits from the lowest: 0-6 the mode (only bit 6 set); the endpoints' upper 7 bits R0 R1 G0 G1 B0 B1 A0 A1 from
 bit 7 on; P0 at 63, P1 at 64; the indices from 65, 3 bits for texel 0 and 4 for the others, row-major. An
-endpoint's byte is its 7 bits and then its P. A block is two 64-bit words here: P1 is bit 0 of the second.
+endpoint's byte is its 7 bits followed by its P bit. Here a block is two 64-bit words: P1 is bit 0 of the second.
 """
 
 import numpy as np
@@ -10,24 +10,24 @@ import numpy as np
 from wlm.errors import WlmError
 
 BLOCK_BYTES = 16
-"""Bytes of a block of 4 x 4 texels."""
+"""Size of a block of 4 x 4 texels, in bytes."""
 
 WEIGHTS = np.array([0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64], np.uint8)
-"""The share of endpoint 1 at each index, in 64ths."""
+"""Weight of endpoint 1 for each index, in 64ths."""
 WEIGHTS.flags.writeable = False
 
 _MODE_BITS = 7
 _MODE_6 = 1 << 6
 # Bit 7 + 14 c + 7 e of the first word: channel c of endpoint e.
 _ENDPOINT_SHIFTS = (7 + 14 * np.arange(4)[None, :] + 7 * np.arange(2)[:, None]).astype(np.uint64)
-# Texel 0 has its missing top bit below it: it begins at 1, the others at 4 i.
+# Texel 0 lacks its top bit, so its index starts at bit 1 and that of texel i at bit 4 i.
 _INDEX_SHIFTS = np.maximum(4 * np.arange(16), 1).astype(np.uint64)
 
 
 def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Packs endpoints and indices into blocks.
 
-    Texel 0's index must be below 8 in the file: where it isn't, the endpoints change places and the indices
+    The file requires an index below 8 for texel 0. Where it is larger, the endpoints are swapped and the indices
     become 15 - index, which decodes to the same texels.
 
     Args:
@@ -60,7 +60,7 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 
 def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the endpoints and indices of blocks; `pack_mode6` gives the same blocks back.
+    """Reads the endpoints and indices of blocks; the inverse of `pack_mode6`.
 
     Args:
         blocks: uint8 [..., 16].
@@ -89,7 +89,7 @@ def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def decode_mode6(blocks: np.ndarray) -> np.ndarray:
-    """Decodes blocks to texels, bit for bit as the format says.
+    """Decodes blocks to texels, bit-exact to the format.
 
     Args:
         blocks: uint8 [..., 16].
@@ -102,7 +102,7 @@ def decode_mode6(blocks: np.ndarray) -> np.ndarray:
         WlmError: A block is of another mode.
     """
     endpoints, indices = unpack_mode6(blocks)
-    # 16 bits hold the sum: at most 64 * 255 + 32.
+    # The sum fits in 16 bits: at most 64 * 255 + 32.
     share = WEIGHTS[indices].astype(np.uint16)[..., None]
     ends = endpoints.astype(np.uint16)
     mixed = (64 - share) * ends[..., None, 0, :] + share * ends[..., None, 1, :]
@@ -110,13 +110,13 @@ def decode_mode6(blocks: np.ndarray) -> np.ndarray:
 
 
 def decode_image(blocks: np.ndarray) -> np.ndarray:
-    """Decodes the blocks of a picture.
+    """Decodes the blocks of an image.
 
     Args:
         blocks: uint8 [H/4, W/4, 16].
 
     Returns:
-        The picture, uint8 [H, W, 4], RGBA.
+        The image, uint8 [H, W, 4], RGBA.
 
     Raises:
         ValueError: Wrong shape or type.
@@ -128,14 +128,14 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
 
 
 def blocks_image(texels: np.ndarray) -> np.ndarray:
-    """Texels of blocks [..., H/4, W/4, 16, C] as pictures [..., H, W, C]."""
+    """Rearranges texels by block, [..., H/4, W/4, 16, C], into images [..., H, W, C]."""
     *rest, rows, columns, _, channels = texels.shape
     image = texels.reshape(*rest, rows, columns, 4, 4, channels).swapaxes(-4, -3)
     return image.reshape(*rest, 4 * rows, 4 * columns, channels)
 
 
 def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gives the two 64-bit words of blocks whose anchor index is below 8."""
+    """Returns the two 64-bit words of blocks whose anchor index is below 8."""
     wide = endpoints.astype(np.uint64)
     low = np.bitwise_or.reduce((wide >> np.uint64(1)) << _ENDPOINT_SHIFTS, axis=(-2, -1))
     low |= np.uint64(_MODE_6) | ((wide[..., 0, 0] & np.uint64(1)) << np.uint64(63))
@@ -144,6 +144,6 @@ def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _mode_name(low: int) -> str:
-    """Names the mode of a block by its first set bit; a first byte of zero is reserved."""
+    """Names the mode of a block: the position of the lowest set bit; a first byte of zero is reserved."""
     byte = low & 0xFF
     return f"mode {(byte & -byte).bit_length() - 1}" if byte else "a reserved mode"

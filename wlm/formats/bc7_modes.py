@@ -1,10 +1,9 @@
-"""BC7 blocks of all eight modes: decoded exactly here, encoded by the package of an extra. `wlm.formats.bc7` has mode 6
-alone, and writes it.
+"""Exact decoding of all eight BC7 modes, and encoding by an optional package. `wlm.formats.bc7` packs mode 6.
 
-A block of 128 bits, from the lowest: the mode's number in ones' place (mode m is m zeros and a one), the partition, the
-rotation, the index selection; the endpoints, R of all subsets, then G, B and A; P bits; the indices of colour, and in
-modes 4 and 5 those of alpha. A subset's anchor texel, the first of them texel 0, has an index of one bit less. The
-format is that of Khronos' Data Format Specification 1.3, chapter 20 ("BPTC").
+The fields of a 128-bit block, from the lowest bit: the mode in unary (mode m is m zeros and a one), the partition, the
+rotation, the index selection; the endpoints, R of all subsets, then G, B and A; P bits; the colour indices, and in
+modes 4 and 5 the alpha indices. The index of a subset's anchor texel (texel 0 in subset 0) has one bit less. Source:
+Khronos Data Format Specification 1.3, chapter 20 ("BPTC").
 """
 
 import numpy as np
@@ -13,10 +12,10 @@ from wlm.formats.bc7 import BLOCK_BYTES, WEIGHTS
 from wlm.formats.hdr_blocks import need
 
 ENCODERS = ("ultrafast", "veryfast", "fast", "basic", "slow")
-"""Settings of `encode_image`, from the fastest to the best."""
+"""Presets of `encode_image`, from the fastest to the best."""
 
 RESERVED = 8
-"""What `block_modes` says of a block whose first byte is zero."""
+"""Value of `block_modes` for a block whose first byte is zero, which the format reserves."""
 
 FIELDS = (
     "subsets", "partition", "rotation", "selection", "colour", "alpha", "own_bits", "shared_bits", "index", "second"
@@ -36,15 +35,15 @@ MODES = np.array(
     ],
     np.int32,
 )
-"""Of each mode: subsets; bits of the partition's number, the rotation and the index selection; of a colour and an alpha
-of an endpoint; P bits of each endpoint and of each subset; bits of an index, and of the second index."""
+"""Per mode: number of subsets; bits of the partition number, the rotation and the index selection; bits of colour and
+alpha of an endpoint; P bits per endpoint and per subset; bits of an index and of the second index."""
 
 _TWO = """
 CCCC 8888 EEEE ECC8 C880 FEEC FEC8 EC80 C800 FFEC FE80 E800 FFE8 FF00 FFF0 F000
 F710 008E 7100 08CE 008C 7310 3100 8CCE 088C 3110 6666 366C 17E8 0FF0 718E 399C
 AAAA F0F0 5A5A 33CC 3C3C 55AA 9696 A55A 73CE 13C8 324C 3BDC 6996 C33C 9966 0660
 0272 04E4 4E40 2720 C936 936C 39C6 639C 9336 9CC6 817E E718 CCF0 0FCC 7744 EE22
-"""  # a bit a texel
+"""  # one bit per texel
 _THREE = """
 AA685050 6A5A5040 5A5A4200 5450A0A8 A5A50000 A0A05050 5555A0A0 5A5A5050
 AA550000 AA555500 AAAA5500 90909090 94949494 A4A4A4A4 A9A59450 2A0A4250
@@ -54,8 +53,8 @@ A9A58000 5090A0A8 A8A09050 24242424 00AA5500 24924924 24499224 50A50A50
 500AA550 AAAA4444 66660000 A5A0A5A0 50A050A0 69286928 44AAAA44 66666600
 AA444444 54A854A8 95809580 96969600 A85454A8 80959580 AA141414 96960000
 AAAA1414 A05050A0 A0A5A5A0 96000000 40804080 A9A8A9A8 AAAAAA44 2A4A5254
-"""  # two bits a texel
-# A digit for each partition: the anchor of subset 1 of two, and those of subsets 1 and 2 of three.
+"""  # two bits per texel
+# One hexadecimal digit per partition: the anchor of subset 1 of two, and the anchors of subsets 1 and 2 of three.
 _ANCHORS = (
     "FFFFFFFFFFFFFFFFF282288F28228822FF6828FF28222FF66268FF22FFFFF22F",
     "33FF83FF88666533338F336A588685FF8F356A8FF3F5FFFF3F55585A5A8DFC33",
@@ -80,26 +79,26 @@ def _anchors() -> np.ndarray:
 
 
 PARTITIONS = _partitions()
-"""uint32 [3, 64]: by the number of subsets less one, the subset of each texel, two bits from the lowest."""
+"""uint32 [3, 64], by the number of subsets - 1 and the partition: the subset of each texel, two bits each."""
 
 ANCHORS = _anchors()
-"""int32 [3, 64, 2]: by the number of subsets less one, the anchors of subsets 1 and 2; `NO_ANCHOR` for none."""
+"""int32 [3, 64, 2], indexed likewise: the anchors of subsets 1 and 2, or `NO_ANCHOR`."""
 
 SHARES = np.zeros((3, 16), np.int32)
-"""By an index's bits less two, the share of endpoint 1 at each index in 64ths."""
+"""Weight of endpoint 1 for each index, in 64ths, indexed by the number of index bits - 2."""
 SHARES[0, :4] = 0, 21, 43, 64
 SHARES[1, :8] = 0, 9, 18, 27, 37, 46, 55, 64
 SHARES[2] = WEIGHTS
 
-_PIECE = 1 << 16  # blocks at once: 8 MiB of bits
+_PIECE = 1 << 16  # blocks decoded at once: 8 MiB of unpacked bits
 
 
 def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.ndarray:
-    """Encodes an opaque picture, with Intel's ISPC texture compressor, in one thread.
+    """Encodes an opaque image by Intel's ISPC texture compressor, in one thread.
 
     Args:
         picture: uint8 [H, W, 3], multiples of 4.
-        extra: The extra that a message names.
+        extra: Name of the optional extra for the error message.
         profile: One of `ENCODERS`.
 
     Returns:
@@ -117,7 +116,7 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
 
 
 def block_modes(blocks: np.ndarray) -> np.ndarray:
-    """The mode of each block, uint8 [...]; `RESERVED` where there is none.
+    """Returns the mode of each block, uint8 [...]; `RESERVED` for the reserved encoding.
 
     Args:
         blocks: uint8 [..., 16].
@@ -128,7 +127,7 @@ def block_modes(blocks: np.ndarray) -> np.ndarray:
 
 
 def decode_blocks(blocks: np.ndarray) -> np.ndarray:
-    """Decodes blocks of any mode, bit for bit as the format says; reserved ones are transparent black.
+    """Decodes blocks of any mode, bit-exact to the format; reserved blocks become transparent black.
 
     Args:
         blocks: uint8 [..., 16].
@@ -154,7 +153,7 @@ def decode_blocks(blocks: np.ndarray) -> np.ndarray:
 
 
 def _texels(bits: np.ndarray, mode: int) -> np.ndarray:
-    """The texels [n, 16, 4] of blocks of one mode, given as bits [n, 128]."""
+    """Decodes blocks of one mode, given as bits [n, 128], to texels [n, 16, 4]."""
     is_of = dict(zip(FIELDS, MODES[mode].tolist(), strict=True))
     subsets, at = is_of["subsets"], mode + 1
 
@@ -196,12 +195,12 @@ def _texels(bits: np.ndarray, mode: int) -> np.ndarray:
 
 
 def _number(bits: np.ndarray) -> np.ndarray:
-    """Bits [n, count], the lowest first, as numbers [n]."""
+    """Converts bits [n, count], the lowest first, to numbers [n]."""
     return bits.astype(np.int64) @ (1 << np.arange(bits.shape[1]))
 
 
 def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.ndarray:
-    """Shares of endpoint 1 [n, 16] from indices of `count` bits that begin at bit `at`; anchors [n, 2]."""
+    """Returns weights of endpoint 1, [n, 16], from indices of `count` bits that start at bit `at`; anchors [n, 2]."""
     texel = np.arange(16)
     short = (texel == 0) | (texel == anchors[:, :1]) | (texel == anchors[:, 1:])
     start = at + count * texel - (np.cumsum(short, axis=1) - short)
@@ -213,7 +212,7 @@ def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.nd
 
 
 def _swapped(texels: np.ndarray, channel: int) -> np.ndarray:
-    """Texels with alpha in place of a channel and the other way round."""
+    """Swaps alpha with another channel."""
     order = list(range(4))
     order[channel], order[3] = 3, channel
     return texels[..., order]

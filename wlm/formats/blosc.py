@@ -1,4 +1,4 @@
-"""Blosc, in which files of volumes pack their numbers."""
+"""Blosc decompression, for volume files."""
 
 import struct
 
@@ -7,29 +7,29 @@ import numpy as np
 from wlm.formats.hdr_blocks import need
 
 EXTRA = "smoke"
-"""The extra whose package unpacks it."""
+"""The optional extra with the package that decompresses Blosc."""
 
 _HEADER = 16
-_PADDED = 128  # bytes to which OpenVDB fills up what is shorter
+_PADDED = 128  # OpenVDB pads shorter data to this number of bytes
 
 
 def unpacked_size(packed: bytes) -> int:
-    """Bytes that packed ones say that they become.
+    """Returns the decompressed size that the header states, in bytes.
 
     Raises:
-        ValueError: They are cut short.
+        ValueError: The data is cut short.
     """
     if len(packed) < _HEADER:
-        raise ValueError(f"expected {_HEADER} bytes of a header of Blosc, found {len(packed)}")
+        raise ValueError(f"expected a Blosc header of {_HEADER} bytes, found {len(packed)}")
     return struct.unpack_from("<I", packed, 4)[0]
 
 
 def unpack(packed: bytes, size: int) -> bytes:
-    """Unpacks bytes of a known size.
+    """Decompresses data of a known decompressed size.
 
     Raises:
-        ValueError: They are damaged or of another size.
-        WlmError: The package of the extra is missing.
+        ValueError: The data is damaged or has another size.
+        WlmError: The package imagecodecs is missing.
     """
     stated = unpacked_size(packed)
     if stated != size and not size < stated <= _PADDED:

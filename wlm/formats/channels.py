@@ -33,21 +33,21 @@ _RGBM, _DLDR = 5.0**2.2, 2.0**2.2
 _ALPHA = ("rgbm", "rgbe")
 
 ENCODINGS = ("linear", "srgb", "rgbm", "dldr", "rgbe")
-"""By name."""
+"""Names of the encodings in the module's table."""
 
 
 def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...], bool]:
-    """Reads all channels of a picture: of an EXR file any, of a PNG 8 bits or grey of 16, of others those of light.
+    """Reads all channels of an EXR file, a PNG (8 bits, or grey of 16 bits) or another picture of light.
 
     Args:
         path: The file.
 
     Returns:
-        The pixels, float32 [H, W, C], the top row first; the channels' names, R, G, B and A first; and whether the
-        values are levels, those of a PNG over the greatest that it can have.
+        The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the
+        values are PNG levels, which are divided by the largest level.
 
     Raises:
-        WlmError: The file is missing, of another kind, cut short or damaged, as the reader of its kind says.
+        WlmError: The file is missing, of another kind, cut short or damaged.
     """
     with open_file(path, "the picture") as file:
         magic = file.read(len(_PNG_MAGIC))
@@ -74,7 +74,7 @@ def _read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
 def _read_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     data = read_file(path, IMAGE_BYTES, "the PNG")
     try:
-        # Not `Image.open`: it would try other formats' readers too.
+        # `Image.open` would try the readers of other formats, too.
         with PngImageFile(io.BytesIO(data)) as image:
             check_sides(str(path), image.width, image.height)
             size = image.width * image.height * len(image.getbands())
@@ -99,14 +99,14 @@ def read_encoded(path: str | os.PathLike[str], encoding: str) -> np.ndarray:
         Linear light, float32 [H, W, 3], the top row first.
 
     Raises:
-        WlmError: No such encoding; the file is missing, damaged or no PNG, which says itself what light it holds; or it
-            has no colour, or not the alpha that the encoding needs.
+        WlmError: The encoding is unknown; the file is missing, damaged or not a PNG; or it lacks colour, or the alpha
+            that the encoding needs.
     """
     if encoding not in ENCODINGS:
         raise WlmError(f"encoding: expected one of {', '.join(ENCODINGS)}, got {encoding!r}")
     pixels, names, levels = read_channels(path)
     if not levels:
-        raise WlmError(f"{path}: encoding: expected a PNG; other files say themselves what light they hold")
+        raise WlmError(f"{path}: encoding: expected a PNG; other formats define their encoding themselves")
     if names not in (("R", "G", "B"), ("R", "G", "B", "A")) or encoding in _ALPHA and len(names) == 3:
         alpha = " with alpha" if encoding in _ALPHA else ""
         raise WlmError(f"{path}: encoding {encoding}: expected a PNG of RGB{alpha}, found {''.join(names)}")

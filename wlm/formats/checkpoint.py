@@ -1,7 +1,7 @@
-"""Where a fit is kept while it runs: finished batches as they will be stored, and the running ones' exact states.
+"""Checkpoints of a fit: finished batches in their stored form, and the exact states of the running batches.
 
-One file beside the output, an artifact of its own system, so that it is written whole or not at all and every byte
-of it is checked when it is read. It names what the fit depends on, and goes on with no other fit.
+A checkpoint is one file beside the output, an artifact of its own system: it is written atomically, and every byte is
+checked when it is read. It records the inputs of the fit and refuses to resume any other fit.
 """
 
 import json
@@ -23,37 +23,37 @@ from wlm.formats.parts import Part, check_parts
 
 SUFFIX = ".partial"
 EVERY = 30.0
-"""Seconds between two saves of running work: what a killed process loses at most, beside the step that it was in."""
+"""Seconds between two saves of running work, and so the most that a killed process loses besides its current step."""
 
-_SHARE = 0.05  # of the time that saving may take
+_SHARE = 0.05  # the largest fraction of the time spent on saving
 
 _FINISHED, _RUNNING = "finished", "running"
 
 
 class Pace:
-    """When running work is saved: every so many seconds, or so seldom that it takes a twentieth of the time."""
+    """Schedules saves: at a fixed interval, or less often where saving would take over a twentieth of the time."""
 
     def __init__(self, every: float) -> None:
         """Starts the clock.
 
         Args:
-            every: Seconds from one save to the next; 0: always, whatever it takes.
+            every: Seconds from one save to the next; 0: save whenever asked.
         """
         self._every = self._wait = every
         self._last = time.monotonic()
         self._took = 0.0
 
     def due(self) -> bool:
-        """Whether it is time for a save."""
+        """Whether a save is due."""
         return time.monotonic() - self._last >= self._wait
 
     def affordable(self) -> bool:
-        """Whether a save now keeps to its share of the time, before one is due."""
+        """Whether a save before the next due time would stay within the time budget."""
         return not self._every or time.monotonic() - self._last >= self._took * (1.0 / _SHARE - 1.0)
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Times a save, from whose end the wait for the next one counts."""
+        """Measures a save; the next interval starts at its end."""
         begin = time.monotonic()
         yield
         self._last = time.monotonic()
@@ -65,13 +65,12 @@ class Pace:
 class Checkpoint:
     """The state of one fit, in the file `OUTPUT.partial`.
 
-    Made for a system's fit, which asks it for what is done already and hands it what gets done. Batches are
-    numbered from 0; several may be running. A fit of one batch calls it number 0.
+    Batches are numbered from 0, and several may be running. A fit of one batch uses number 0.
 
     Attributes:
         path: The file.
-        system: The artifact's system, "lightmap-checkpoint" for example.
-        resumed: Whether anything was read from it.
+        system: The system of the artifact, for example "lightmap-checkpoint".
+        resumed: Whether a state was read from the file.
     """
 
     def __init__(
@@ -87,40 +86,40 @@ class Checkpoint:
         """Opens the checkpoint of a fit.
 
         Args:
-            output: The file that the fit is for; the checkpoint lies beside it.
-            system: The system whose fit it is, "lightmap" for example.
-            fit: What the fit depends on, each by the name that a message gives it: the input's hash, the settings,
-                the seed. JSON values; the version of this package is added.
+            output: The output file of the fit; the checkpoint is written beside it.
+            system: The system of the fit, for example "lightmap".
+            fit: The inputs that determine the fit (hash of the data, settings, seed) by their names in messages, as
+                JSON values; the version of this package is added.
             source: A hash of the input, one ASCII word.
-            resume: Whether to go on from the file, if there is one. Otherwise it is ignored, and replaced at the
-                first save.
-            every: Seconds between two saves of a running batch, as `Pace` has it.
+            resume: Whether to continue from an existing file. Otherwise the file is ignored, and replaced at the first
+                save.
+            every: Seconds between two saves of a running batch; see `Pace`.
 
         Raises:
-            WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
-            ValueError: `fit` holds NaN or Inf, which JSON has not.
+            WlmError: With `resume`: the file is damaged or belongs to another fit; the line names the difference.
+            ValueError: `fit` contains NaN or infinity, which JSON cannot represent.
         """
         self.path = Path(f"{os.fspath(output)}{SUFFIX}")
         self.system = f"{system}-checkpoint"
         self.resumed = False
         self._source = source
-        # Compared with what JSON gives back, which has no tuples.
+        # The round trip through JSON makes the key comparable with a stored one: JSON has no tuples.
         self._key: dict[str, Any] = json.loads(json.dumps({**fit, "wlm": __version__}, allow_nan=False))
         self._finished: dict[int, dict[str, np.ndarray]] = {}
         self._running: dict[int, dict[str, np.ndarray]] = {}
         self._unwritten = False
         self._pace = Pace(every)
-        # The run that goes on may end before it saves anything.
+        # The resumed run may end before its first save.
         sweep(Path(os.path.realpath(self.path)))
         if resume and self.path.exists():
             self._read()
             self.resumed = True
 
     def finished(self, number: int, table: Mapping[str, Part]) -> dict[str, np.ndarray] | None:
-        """The stored parts of a finished batch, or None if it isn't finished.
+        """Returns the stored parts of a finished batch, or None if it is not finished.
 
         Raises:
-            WlmError: They are not what the table says.
+            WlmError: The parts do not match the table.
         """
         if (parts := self._finished.get(number)) is None:
             return None
@@ -130,21 +129,21 @@ class Checkpoint:
             raise WlmError(f"{self.path}: finished batch {number}: {error}") from error
 
     def running(self, number: int) -> dict[str, np.ndarray] | None:
-        """The state of a batch that was running when it was last saved, or None if it wasn't."""
+        """Returns the state of a batch that was running at the last save, or None."""
         return self._running.get(number)
 
     def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
-        """Hands the state of batch `number`, if it was running, to the fit.
+        """Restores the state of a batch that was running.
 
         Args:
             number: The batch.
-            load: Goes back to a state; checks it, and raises ValueError before anything is changed by a wrong one.
+            load: Restores a state; it raises ValueError, before it changes anything, for an invalid one.
 
         Returns:
-            Whether there was one.
+            Whether a state was restored.
 
         Raises:
-            WlmError: The state is wrong.
+            WlmError: The state is invalid.
         """
         if (state := self.running(number)) is None:
             return False
@@ -155,38 +154,37 @@ class Checkpoint:
         return True
 
     def wrong(self, number: int, error: ValueError) -> WlmError:
-        """The line that says that the state of batch `number` is wrong."""
+        """Returns the error for an invalid state of batch `number`."""
         return WlmError(f"{self.path}: state of batch {number}: {error}")
 
     def due(self) -> bool:
-        """Whether it is time to save what is running."""
+        """Whether a save of the running batches is due."""
         return self._pace.due()
 
     def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
-        """Writes the state of a running batch, in place of an older one.
+        """Writes the state of a running batch, which replaces an older one.
 
         Raises:
-            WlmError: The file can't be written; what was there before stays.
+            WlmError: The file cannot be written; the old content stays.
         """
         self.save({number: state})
 
     def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
-        """Writes the states of running batches by number, in place of older ones of these batches.
+        """Writes the states of running batches by number, which replace older ones of these batches.
 
         Raises:
-            WlmError: The file can't be written; what was there before stays.
+            WlmError: The file cannot be written; the old content stays.
         """
         self._running |= {number: dict(state) for number, state in states.items()}
         self._write()
 
     def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
-        """Keeps the parts of a finished batch; its running state is dropped.
+        """Adds the parts of a finished batch and drops its running state.
 
-        The whole file is written, at once where that takes a twentieth of the time at most, as it does unless batches
-        come fast; otherwise at the next save.
+        The file is written at once if that takes at most a twentieth of the time, otherwise at the next save.
 
         Raises:
-            WlmError: The file can't be written; what was there before stays.
+            WlmError: The file cannot be written; the old content stays.
         """
         self._finished[number] = dict(result)
         self._running.pop(number, None)
@@ -195,19 +193,19 @@ class Checkpoint:
             self._write()
 
     def flush(self) -> None:
-        """Writes what has been kept and isn't written.
+        """Writes finished batches that are not written yet.
 
         Raises:
-            WlmError: The file can't be written; what was there before stays.
+            WlmError: The file cannot be written; the old content stays.
         """
         if self._unwritten:
             self._write()
 
     def remove(self) -> None:
-        """Removes the file, if there is one: the output has been written.
+        """Removes the file, if it exists, once the output has been written.
 
         Raises:
-            WlmError: It can't be removed.
+            WlmError: The file cannot be removed.
         """
         try:
             self.path.unlink(missing_ok=True)
@@ -230,26 +228,26 @@ class Checkpoint:
         artifact = read_artifact(self.path, self.system)
         stored = artifact.settings.get("fit")
         if not isinstance(stored, dict):
-            raise WlmError(f"{self.path}: the checkpoint does not say which fit it is of")
+            raise WlmError(f"{self.path}: the checkpoint does not state its fit")
         if difference := _difference(stored, self._key):
             raise WlmError(
-                f"{self.path}: a checkpoint of another fit: {difference}; resume with what it was started with, or "
-                "start anew without --resume"
+                f"{self.path}: the checkpoint is of another fit: {difference}; resume with the original inputs, or "
+                "start again without --resume"
             )
         for name, value in artifact.tensors.items():
             state, number, key = (*name.split(".", 2), "", "")[:3]
-            # Nine digits: a longer number is no batch, and int() refuses very long ones in its own words.
+            # At most nine digits: int() refuses very long numbers with its own message.
             if state not in (_FINISHED, _RUNNING) or not re.fullmatch("[0-9]{1,9}", number) or not key:
                 raise WlmError(
                     f"{self.path}: part {one_line(repr(name), 60)}: expected one of a finished or a running batch"
                 )
-            # A copy: the file is replaced at the next save, and a mapped one would stay on the disk.
+            # A copy, since the next save replaces the file, and a mapped one would stay on the disk.
             kept = self._finished if state == _FINISHED else self._running
             kept.setdefault(int(number), {})[key] = np.array(value)
 
 
 def _difference(stored: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """Names the first thing in which two fits differ; empty if they are one."""
+    """Names the first difference between two fits; empty if they are the same."""
     for key, value in expected.items():
         before = stored.get(key)
         if isinstance(value, dict) and isinstance(before, dict):

@@ -1,7 +1,8 @@
-"""DDS files of block-compressed textures and of a few uncompressed formats, with the DX10 header: a 2D texture, an
-array of them or a volume, the first with mips if need be.
+"""DDS files: writing of 2D textures (with mips), arrays and volumes, and reading of light.
 
-Slices and layers follow each other, each a 2D grid of blocks (or of texels, row by row without padding); so do mips.
+Slices, layers and mips follow each other, each a 2D grid of blocks or of texels, row by row without padding. Only the
+largest mip of a texture of light is read. Sources: Microsoft's DDS_HEADER and DDS_HEADER_DXT10, and the FourCC codes of
+Direct3D 9's float formats.
 """
 
 import os
@@ -33,11 +34,11 @@ DXGI_FORMATS = {
     "BC7_UNORM": 98,
     "BC7_UNORM_SRGB": 99,
 }
-"""The formats that can be written and their DXGI numbers: those of BC with 16 bytes a block of 4 x 4 texels, the
-others with a texel's channels one after another, little-endian; those of 10 bits in a word, the first in its lowest."""
+"""Formats that can be written, with their DXGI numbers. BC formats have 16 bytes per block of 4 x 4 texels. The others
+store the channels of a texel in order, little-endian, and R10G10B10A2 in one word with red in the lowest bits."""
 
 _BLOCK_BYTES = 16
-# Of the formats without blocks.
+# Bytes of a texel, for the formats without blocks.
 _TEXEL_BYTES = {
     "R32G32B32A32_FLOAT": 16,
     "R16G16B16A16_UINT": 8,
@@ -53,7 +54,7 @@ _TEXEL_BYTES = {
     "R9G9B9E5_SHAREDEXP": 4,
 }
 MOST_SIDE = 16384
-"""Texels along a side: the limit of a 2D texture in Direct3D 11 and 12."""
+"""Largest side of a 2D texture in Direct3D 11 and 12, in texels."""
 _MAX_DEPTH = 2048
 
 MAGIC = b"DDS "
@@ -64,7 +65,7 @@ _HEADER_SIZE = 124
 _PIXEL_FORMAT_SIZE = 32
 
 _CAPS, _HEIGHT, _WIDTH, _PIXEL_FORMAT, _DEPTH = 0x1, 0x2, 0x4, 0x1000, 0x800000
-_PITCH, _LINEAR_SIZE = 0x8, 0x80000  # which of the two the size field holds: bytes of a row, or of a slice
+_PITCH, _LINEAR_SIZE = 0x8, 0x80000  # the size field states the bytes of a row, or of a slice
 _REQUIRED = _CAPS | _HEIGHT | _WIDTH | _PIXEL_FORMAT
 _FOUR_CC = 0x4
 _CAPS_COMPLEX, _CAPS_TEXTURE, _CAPS_MIPS = 0x8, 0x1000, 0x400000
@@ -104,26 +105,24 @@ def write_dds(
     mips: int = 0,
     layers: int = 0,
 ) -> None:
-    """Writes blocks or texels as a DDS file, whole or not at all.
+    """Writes blocks or texels as a DDS file, atomically.
 
     Args:
         path: The file to write; its folder must exist.
-        blocks: 16 bytes a block, ceil(width / 4) * ceil(height / 4) blocks a slice, slices one after another;
-            of a format without blocks the texels, row by row.
+        blocks: 16 bytes per block, ceil(width / 4) * ceil(height / 4) blocks per slice, slice by slice; for a format
+            without blocks the texels, row by row.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         depth: Slices, 1 to 2048.
         fmt: A key of `DXGI_FORMATS`.
-        volume: Whether it is a volume, which a shader reads through another sampler; None: if `depth` is
-            above 1.
-        mips: Levels after the first of a 2D texture, of half the size each, rounded down; `blocks` holds them one
-            after another.
-        layers: Of an array of 2D textures, 1 to 2048, one after another in `blocks`; 0: no array.
+        volume: Whether the texture is a volume, which shaders sample as 3D; None: if `depth` is above 1.
+        mips: Levels after the first of a 2D texture, each of half the size rounded down; they follow in `blocks`.
+        layers: Number of layers of an array of 2D textures, 1 to 2048, layer by layer in `blocks`; 0: no array.
 
     Raises:
-        ValueError: An unknown format, a size or a number of mips or layers out of range, several slices of what is no
-            volume, mips of a volume, layers of a volume or of what has mips, or blocks that don't fill the texture.
-        WlmError: The file can't be written; what was there before stays.
+        ValueError: The format is unknown; a size, the mips or the layers are out of range; slices, mips and layers are
+            combined in a way that DDS cannot store; or the blocks do not fill the texture.
+        WlmError: The file cannot be written; the old content stays.
     """
     if fmt not in DXGI_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
@@ -141,7 +140,7 @@ def write_dds(
     if len(blocks) != whole:
         raise ValueError(f"blocks: expected {whole} bytes, got {len(blocks)}")
     if depth > 1 and not volume:
-        raise ValueError(f"depth: expected 1 of a 2D texture, got {depth}")
+        raise ValueError(f"depth: expected 1 for a 2D texture, got {depth}")
     size_flag, size = _LINEAR_SIZE, slice_bytes
     if fmt in _TEXEL_BYTES:
         size_flag, size = _PITCH, width * _TEXEL_BYTES[fmt]
@@ -184,8 +183,8 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
         The pixels, float32 [H, W, 3 or 4], and the channels' names.
 
     Raises:
-        WlmError: The file is missing, not a DDS, cut short or damaged, of another format, an array, a cube or a volume,
-            or the package that decodes it is missing.
+        WlmError: The file is missing, is not a DDS file, is cut short or damaged, has another format, is an array, a
+            cube or a volume, or the package that decodes it is missing.
     """
     with open_file(path, "the DDS file") as file:
         held = os.fstat(file.fileno()).st_size
@@ -221,7 +220,7 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
 
 
 def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, int, int]) -> np.ndarray:
-    """Reads a volume texture of four bytes a texel.
+    """Reads a volume texture with four bytes per texel.
 
     Args:
         path: The file.
@@ -232,7 +231,7 @@ def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, in
         uint32 [depth, height, width], little-endian, the first channel in the lowest bits.
 
     Raises:
-        WlmError: The file can't be read, is another kind of texture or of another size, or is cut short.
+        WlmError: The file cannot be read, is another kind of texture, has another size or is cut short.
     """
     width, height, depth = size
     head = _READ_HEADER.size + _DX10.size
@@ -254,7 +253,7 @@ def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, in
 
 
 def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:
-    """The format that the DX10 header states."""
+    """Returns the format that the DX10 header states."""
     if len(data) < _DX10.size:
         raise WlmError(f"{path}: the file is cut short within its DX10 header")
     number, dimension, flags, layers, _ = _DX10.unpack(data)
@@ -273,7 +272,7 @@ def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:
 
 
 def _of_code(path: str | os.PathLike[str], flags: int, code: bytes) -> tuple[str, Layout]:
-    """The format of a file without the DX10 header."""
+    """Returns the format of a file without the DX10 header."""
     number = int.from_bytes(code, "little")
     if flags & _FOUR_CC and number in _LEGACY:
         return _LEGACY[number]

@@ -1,18 +1,19 @@
-"""Reading zlib streams whose size is known."""
+"""Decompression of zlib streams of known size."""
 
 import zlib
 
 
 def inflate(data: bytes, size: int, where: str, expected: str) -> bytes:
-    """Unpacks a stream, and never more than a byte beyond what it must become.
+    """Decompresses a stream and never allocates more than one byte beyond the expected size.
 
     Args:
-        data: One zlib stream, with nothing behind it.
-        size: Bytes that it must become.
-        where, expected: What it is and what it should be, for messages.
+        data: One zlib stream, with nothing after it.
+        size: Expected size, in bytes.
+        where: Name of the stream for messages.
+        expected: Description of the expected content for messages.
 
     Raises:
-        ValueError: It is damaged, or becomes another number of bytes.
+        ValueError: The stream is damaged or has another size.
     """
     reader = zlib.decompressobj()
     try:

@@ -21,7 +21,7 @@ from wlm.formats.reading import open_file
 MAGIC = b"\x76\x2f\x31\x01"
 """The first bytes of an EXR file."""
 
-_SAMPLE_BYTES = 2  # of a half: the header as the library gives it doesn't tell halves from floats
+_SAMPLE_BYTES = 2  # of a half float: the library's header does not distinguish half and float
 _STDERR = 2
 _STDERR_LOCK = threading.Lock()
 
@@ -36,8 +36,8 @@ _NOTE = "wlm"  # the header's attribute
 def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the colour channels of a single-part EXR file, over its data window.
 
-    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are left out. Values
-    come as they are in the file, NaN and Inf too: the caller checks what it can't use.
+    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values
+    are returned unchanged, NaN and infinity included: the caller checks them.
 
     Args:
         path: The EXR file.
@@ -46,8 +46,8 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
         The pixels, float32 [H, W, 3 or 4], and the channels' names, ("R", "G", "B") or ("R", "G", "B", "A").
 
     Raises:
-        WlmError: The file is missing, not an EXR, cut short or damaged, has several parts or deep data, or
-            lacks one of R, G and B.
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data,
+            or lacks one of R, G and B.
     """
     channels = read_part(path).channels
     if any(name not in channels for name in _COLOUR):
@@ -64,16 +64,16 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
-    """Writes RGB or RGBA pixels as an EXR file of scan lines under lossless ZIP, whole or not at all.
+    """Writes RGB or RGBA pixels as an EXR file of scan lines with lossless ZIP compression, atomically.
 
     Args:
         path: The file to write; its folder must exist.
         pixels: Linear values, [H, W, 3 or 4], neither side empty.
-        half: Whether to round to half floats. Values beyond their range, Inf too, become +-65504; NaN stays.
+        half: Whether to round to half floats. Values beyond their range, infinity included, become +-65504; NaN stays.
 
     Raises:
-        ValueError: The shape isn't that of a picture.
-        WlmError: The file can't be written; what was there before stays.
+        ValueError: The shape is not that of a picture.
+        WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
@@ -82,7 +82,7 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
     else:
         pixels = pixels.astype(np.float32, copy=False)
     planes = zip((*_COLOUR, _ALPHA), np.moveaxis(pixels, -1, 0), strict=False)
-    # The library wants every plane contiguous.
+    # The library requires contiguous planes.
     write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes}, read_exr)
 
 
@@ -93,17 +93,17 @@ def write_planes(
     *,
     whole: tuple[str, ...] = (),
 ) -> None:
-    """Writes planes as an EXR file of scan lines under lossless ZIP, whole or not at all.
+    """Writes planes as an EXR file of scan lines with lossless ZIP compression, atomically.
 
     Args:
         path: The file to write; its folder must exist.
         planes: [H, W] each, linear, not empty; the keys name the channels.
-        note: JSON that goes into the header.
-        whole: Planes that stay float32; the others become half floats, and what is beyond their range +-65504.
+        note: JSON for the header.
+        whole: Planes that stay float32. The others become half floats, clamped to +-65504.
 
     Raises:
-        ValueError: Not planes of one shape.
-        WlmError: The file can't be written; what was there before stays.
+        ValueError: The planes differ in shape.
+        WlmError: The file cannot be written; the old content stays.
     """
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
@@ -125,11 +125,12 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
         path: The EXR file.
 
     Returns:
-        The planes by name, float32 [H, W], as they are in the file, NaN too; and the header's note, empty if there is
+        The planes by name, float32 [H, W], unchanged, NaN included; and the note of the header, empty if the file has
         none.
 
     Raises:
-        WlmError: The file is missing, not an EXR, damaged, of several parts or deep, or a channel isn't half or float.
+        WlmError: The file is missing, is not an EXR file, is damaged, has several parts or deep data, or a channel is
+            neither half nor float.
     """
     part = read_part(path)
     planes = {}
@@ -139,7 +140,7 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
             content = "no pixels" if pixels is None else pixels.dtype
             raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
         if planes and pixels.shape != next(iter(planes.values())).shape:
-            raise WlmError(f"{path}: channel {name}: expected as many pixels as the others, found {pixels.shape}")
+            raise WlmError(f"{path}: channel {name}: expected the shape of the other channels, found {pixels.shape}")
         planes[name] = pixels.astype(np.float32)
     try:
         note = json.loads(part.header.get(_NOTE, "{}"))
@@ -154,10 +155,10 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     """Reads an EXR file of one flat part.
 
     Returns:
-        The part, its channels separate.
+        The part, with separate channels.
 
     Raises:
-        WlmError: The file is missing, not an EXR, cut short or damaged, of several parts or deep.
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data.
     """
     size = _check_magic(path)
     file, complaints = _open(path, size)
@@ -172,10 +173,10 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
 
 
 def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]]:
-    """Reads what an EXR file says of its first part: width, height and the channels' names; no pixels.
+    """Reads the width, height and channel names of the first part of an EXR file, without its pixels.
 
     Raises:
-        WlmError: The file is missing, not an EXR, or its header is damaged, or claims more than a picture may have.
+        WlmError: The file is missing, is not an EXR file, or its header is damaged or exceeds the limits.
     """
     size = _check_magic(path)
     with _captured_chatter() as chatter:
@@ -196,16 +197,16 @@ def write_part(
     read: Callable[[Path], object],
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes channels as an EXR file of scan lines under lossless ZIP, whole or not at all.
+    """Writes channels as an EXR file of scan lines with lossless ZIP compression, atomically.
 
     Args:
         path: The file to write; its folder must exist.
         channels: half or float [H, W] each, contiguous, not empty.
-        read: Reads the file back, before it takes its place; raises WlmError.
-        attributes: More for the header.
+        read: Reads the file back before it replaces the old one; raises WlmError.
+        attributes: Further header attributes.
 
     Raises:
-        WlmError: The file can't be written; what was there before stays.
+        WlmError: The file cannot be written; the old content stays.
     """
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     with atomic_path(path) as temporary:
@@ -217,7 +218,7 @@ def write_part(
                 raise WlmError(f"{path}: cannot write: {reason}") from error
         if chatter.text:
             raise WlmError(f"{path}: cannot write: {chatter.text}")
-        # The library says nothing where a full disk swallows what it still held when it closed the file.
+        # The library reports no error if the disk is full when it flushes its buffer at the end.
         try:
             read(temporary)
         except WlmError as error:
@@ -226,7 +227,7 @@ def write_part(
 
 
 def _check_magic(path: str | os.PathLike[str]) -> int:
-    """Checks that it is an EXR file; gives its size in bytes."""
+    """Checks the magic number of an EXR file and returns the file size in bytes."""
     with open_file(path, "the EXR file") as file:
         magic, size = file.read(len(MAGIC)), os.fstat(file.fileno()).st_size
     if magic != MAGIC:
@@ -235,7 +236,7 @@ def _check_magic(path: str | os.PathLike[str]) -> int:
 
 
 def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Part]) -> None:
-    """Says where a file of so many bytes claims more pixels than it may have, or than it can hold."""
+    """Raises an error if the header claims more pixels than the limits or the file size allow."""
     total = 0
     for part in parts:
         first, last = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
@@ -246,30 +247,30 @@ def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Par
 
 
 def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
-    """Opens a file; gives None or a file without parts where that failed, and what the library said."""
+    """Opens a file. Returns the file, or None or a file without parts on failure, and the library's messages."""
     with _captured_chatter() as chatter:
         try:
-            # Separate channels: joined, `RGB` and `RGBA` would differ in name and layered files would be odd.
-            # The header first: the library makes room for all that it claims before it reads a pixel.
+            # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
+            # The header is checked first, since the library allocates the claimed size before it reads a pixel.
             _check_size(path, size, OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
             file = OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, MemoryError) as error:
             return None, chatter.text or one_line(error)
-    # A part that could not be read is missing from the list, and only the chatter tells.
+    # A part that cannot be read is missing from the list; only the printed message reports it.
     return file, chatter.text
 
 
 class _Chatter:
-    """What OpenEXR printed in a block, on one line."""
+    """Messages that OpenEXR printed in a block, on one line."""
 
     text = ""
 
 
 @contextlib.contextmanager
 def _captured_chatter() -> Iterator[_Chatter]:
-    """Catches what OpenEXR prints: its C library on the process's stderr, its Python module on sys.stdout.
+    """Captures the messages of OpenEXR: of its C library on the process's stderr, of its Python module on sys.stdout.
 
-    Lines of others, from other threads for example, are passed on afterwards.
+    Other lines, for example from other threads, are passed on afterwards.
     """
     chatter = _Chatter()
     printed = io.StringIO()
@@ -288,7 +289,7 @@ def _captured_chatter() -> Iterator[_Chatter]:
                 if line not in ours:
                     os.write(saved, line)
             os.close(saved)
-            # The reason follows the code; what precedes it is the file's name, which our own line has.
+            # The reason follows the error code; our own message names the file.
             reasons = [line.decode(errors="replace").partition(") ")[2] for line in ours]
             messages = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
             chatter.text = one_line(messages, 200)

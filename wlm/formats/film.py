@@ -1,4 +1,4 @@
-"""Writing films: H.264 in an `.mp4`, frame by frame, by the ffmpeg of a package."""
+"""Writing of H.264 films (`.mp4`), frame by frame, by the ffmpeg of an optional package."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -11,31 +11,31 @@ from wlm.formats.atomic import atomic_path
 from wlm.formats.hdr_blocks import need
 
 EXTRA = "film"
-"""The extra whose package writes them."""
+"""The optional extra with the package that writes films."""
 
-_QUALITY = 8  # of that package, from 0 to 10
+_QUALITY = 8  # imageio-ffmpeg's quality, 0 to 10
 
 
 @contextmanager
 def film(path: str | os.PathLike[str], height: int, width: int, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Writes a film, whole once the block ends, or not at all.
+    """Writes a film atomically, at the end of the block.
 
     Args:
         path: The `.mp4` to write; its folder must exist.
-        height, width: Of each frame, in pixels; even, since colours have half the size.
-        rate: Frames a second.
+        height, width: Size of each frame, in pixels; even, since chroma has half the resolution.
+        rate: Frames per second.
 
     Yields:
         A function that adds a frame, uint8 [H, W, 3] in sRGB.
 
     Raises:
-        WlmError: The package is missing, a size is odd, or the file can't be written.
+        WlmError: The package is missing, a size is odd, or the file cannot be written.
     """
     if height % 2 or width % 2:
-        raise WlmError(f"{path}: expected frames of even sizes for a film, found {width} x {height} pixels")
+        raise WlmError(f"{path}: expected frames of even width and height, found {width} x {height} pixels")
     ffmpeg = need("imageio_ffmpeg", EXTRA)
     options = {"fps": rate, "codec": "libx264", "quality": _QUALITY, "macro_block_size": 2}
-    # The temporary file's name doesn't tell the format.
+    # The name of the temporary file has no suffix that states the format.
     options["output_params"] = ["-f", "mp4", "-movflags", "+faststart"]
     with atomic_path(path) as part:
         frames = ffmpeg.write_frames(str(part), (width, height), **options)

@@ -1,7 +1,7 @@
-"""Light as textures hold it, made into float32: plain floats, floats packed into 32 bits, and blocks.
+"""Decoding of HDR texel formats to float32: plain floats, floats packed into 32 bits, and blocks.
 
-Shared exponents are those of OpenGL's EXT_texture_shared_exponent, floats of 11 and 10 bits those of EXT_packed_float.
-Blocks are decoded by the packages of an extra.
+Shared exponents follow OpenGL's EXT_texture_shared_exponent, floats of 11 and 10 bits EXT_packed_float. Optional
+packages decode blocks.
 """
 
 import os
@@ -18,21 +18,21 @@ from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, chec
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
 EXTRA = "atlas"
-"""The extra with the packages that decode blocks and zstd."""
+"""The optional extra with the packages that decode blocks."""
 
-_BAND = 1 << 20  # texels that are decoded at once: what is made on the way stays small
+_BAND = 1 << 20  # texels decoded at once, which bounds the temporary memory
 _HALF_BYTES = 2
-_ASTC_LOCK = threading.Lock()  # one context decodes one picture at a time
+_ASTC_LOCK = threading.Lock()  # a context decodes one picture at a time
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the texels of a format lie in memory.
+    """Memory layout of a texel format.
 
     Attributes:
-        channels: Of a decoded texel: 3, or 4 with alpha.
+        channels: Channels of a decoded texel: 3, or 4 with alpha.
         size: Bytes of a texel, or of a block.
-        decode: Makes half or float [rows, columns, channels] of the bytes of whole rows of whole blocks.
+        decode: Decodes whole rows of whole blocks to half or float [rows, columns, channels].
         block: Width and height of a block in texels.
     """
 
@@ -43,32 +43,32 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The channels' names."""
+        """Names of the channels."""
         return tuple("RGBA"[: self.channels])
 
     @property
     def unpacked(self) -> int:
-        """Bytes of a texel as half floats, or as they are stored where that is more."""
+        """Bytes of a texel: as half floats or as stored, whichever is larger."""
         across, down = self.block
         return max(_HALF_BYTES * self.channels, self.size // (across * down))
 
     def bytes_of(self, width: int, height: int) -> int:
-        """Bytes of a picture."""
+        """Returns the size of a picture, in bytes."""
         across, down = self.block
         return -(-width // across) * -(-height // down) * self.size
 
 
 def check_picture(path: str | os.PathLike[str], held: int, width: int, height: int, texel: int) -> None:
-    """Checks the size that a picture claims, before room is made for it.
+    """Checks the claimed size of a picture before memory is allocated.
 
     Args:
         path: The file, for messages.
-        held: Its bytes.
-        width, height: Texels.
-        texel: Bytes of one once it is unpacked.
+        held: Size of the file, in bytes.
+        width, height: Claimed size, in texels.
+        texel: Bytes of a decoded texel.
 
     Raises:
-        WlmError: It has no texels or too many, or more than so many bytes may become.
+        WlmError: The picture has no texels, too many, or more than a file of this size may expand to.
     """
     if not (width and height):
         raise WlmError(f"{path}: expected at least one texel, found {width} x {height}")
@@ -79,7 +79,7 @@ def check_picture(path: str | os.PathLike[str], held: int, width: int, height: i
 def decode_texels(
     path: str | os.PathLike[str], layout: Layout, data: bytes | memoryview, width: int, height: int
 ) -> np.ndarray:
-    """Makes float32 [H, W, channels] of a picture's bytes, `Layout.bytes_of` of them.
+    """Decodes the bytes of a picture (`Layout.bytes_of`) to float32 [H, W, channels].
 
     Raises:
         WlmError: The package that decodes the format is missing, or refuses the data; the line names the file.
@@ -102,10 +102,10 @@ def decode_texels(
 
 
 def unpack_zstd(path: str | os.PathLike[str], data: bytes, size: int) -> bytes:
-    """Unpacks zstd to at most `size` bytes.
+    """Decompresses zstd to at most `size` bytes.
 
     Raises:
-        WlmError: It is damaged, becomes more, or the package is missing.
+        WlmError: The data is damaged or larger, or the package is missing.
     """
     try:
         return need("imagecodecs", EXTRA).zstd_decode(data, out=size)
@@ -118,7 +118,7 @@ def _plain(data: memoryview, rows: int, columns: int, *, dtype: str) -> np.ndarr
 
 
 def _packed(data: memoryview, rows: int, columns: int) -> np.ndarray:
-    """Red and green with 6 bits of mantissa, blue with 5; the exponent's 5 bits and bias are those of half floats."""
+    """Decodes R11G11B10: mantissas of 6, 6 and 5 bits, with the exponent bits and bias of half floats."""
     words = np.frombuffer(data, "<u4").reshape(rows, columns)
     bits = np.stack([(words & 0x7FF) << 4, (words >> 11 & 0x7FF) << 4, words >> 22 << 5], axis=-1)
     return bits.astype(np.uint16).view(np.float16)

@@ -1,27 +1,27 @@
-"""glTF 2.0, `.glb` and `.gltf`: the triangles that a scene draws, and copies of the file with one more UV set.
+"""Reading of glTF 2.0 (`.glb`, `.gltf`): the triangles that a scene draws. `gltf_writer` writes copies with new UVs.
 
-A file is kept as the JSON tree that it is, and only the primitives that get new UVs are touched. A library of typed
-classes, such as pygltflib, is longer to use here and drops the fields that it has no class for.
+The file stays a JSON tree, so that a copy keeps every field that this package does not know. A library of typed
+classes, such as pygltflib, would drop them.
 
 ====================================  ================================================================
 in the file                           behaviour
 ====================================  ================================================================
 points, lines; no `POSITION`          left out; kept in copies
 strips, fans                          read; a list of triangles in copies
-no `indices`                          vertices in their order
+no `indices`                          vertices are used in order
 integer UVs and positions             read, normalised or not (KHR_mesh_quantization)
 strided, sparse, absent (zero) data   read
-a mesh under two nodes                given twice; in copies each node has a mesh of its own, and equal
+a mesh under two nodes                returned twice; in copies each node has its own mesh, and equal
                                       data is stored once
-a node that mirrors                   vertices keep the file's order: such triangles face the other way
-skins, morph targets, animations      left out: the mesh is given at rest, under its node's transform
+a node that mirrors                   vertices keep their order, so triangles face the other way
+skins, morph targets, animations      ignored: the mesh is read in its rest pose, with its node's transform
 nodes outside the scene               left out; kept in copies
-external `.bin`, `data:` URIs         read; in copies all in the one `.glb`
-external images                       in copies inside the `.glb`; one that is missing or isn't PNG, JPEG,
-                                      WebP, KTX2 or DDS keeps its URI
+external `.bin`, `data:` URIs         read; copies embed them in the `.glb`
+external images                       copies embed them; an image that is missing or not PNG, JPEG, WebP,
+                                      KTX2 or DDS keeps its URI
 a buffer outside the file's folder    error, unless the file is trusted; such an image keeps its URI
 more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
-`limits` allow
+the limits
 Draco, meshopt, GPU instances         error that names the extension
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
@@ -53,13 +53,13 @@ _URI_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-"""NumPy's names of glTF's component types."""
+"""NumPy types of glTF component types."""
 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
-_LABEL = 60  # letters of a name
-_OVERHEAD = 256  # corners that take about as long as a primitive without any
+_LABEL = 60  # characters of a name in a message
+_OVERHEAD = 256  # cost of an empty primitive, in corners
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
     "KHR_draco_mesh_compression": "decompress the mesh first",
@@ -71,14 +71,14 @@ _REFUSED = {
 
 @dataclass(frozen=True, eq=False)
 class GltfDocument:
-    """A glTF file as it was read.
+    """A glTF file.
 
     Attributes:
-        path: Its name, for messages and for what it refers to.
-        content: The JSON tree; not to be changed.
-        buffers: The bytes of each of its buffers.
-        trust: Whether it may name files outside its folder, and draw more than its bytes account for.
-        most: Corners and vertices that it may draw, and elements that an accessor without data may have.
+        path: Path of the file, for messages and for the files that it refers to.
+        content: The JSON tree; it must not be changed.
+        buffers: The bytes of each buffer.
+        trust: Whether the file may name files outside its folder and exceed the limits for its size.
+        most: Limit of drawn corners and vertices, and of the elements of an accessor without data.
     """
 
     path: str
@@ -88,10 +88,10 @@ class GltfDocument:
     most: int = CORNERS
 
     def item(self, kind: str, number: object) -> dict:
-        """Gives an entry of one of the tree's lists, `accessors` for example.
+        """Returns an entry of one of the lists of the tree, for example `accessors`.
 
         Raises:
-            WlmError: There is none of this number.
+            WlmError: The number is out of range.
         """
         entries = self.content.get(kind, [])
         if not isinstance(number, int) or not 0 <= number < len(entries):
@@ -104,16 +104,16 @@ class GltfPrimitive:
     """Triangles of one primitive under one node, with the vertices that they use.
 
     Attributes:
-        node: Number of the node.
-        mesh: Number of its mesh.
-        primitive: Number of the primitive in the mesh.
-        name: What messages call it.
+        node: Index of the node.
+        mesh: Index of its mesh.
+        primitive: Index of the primitive in the mesh.
+        name: Name for messages.
         position: float64 [V, 3], in the scene's space.
         triangle: int32 [F, 3].
-        uv: For each set n that the file has as `TEXCOORD_n`, float32 [V, 2]; u right, v down.
-        row: int64 [V], where each vertex is in the primitive's accessors.
-        label, mesh_label: The names of the node and of its mesh; "node 3", "mesh 2" where they have none.
-        material: Number of its material; None: none.
+        uv: float32 [V, 2] for each UV set n (`TEXCOORD_n`); u right, v down.
+        row: int64 [V], the row of each vertex in the primitive's accessors.
+        label, mesh_label: Names of the node and of its mesh; "node 3" and "mesh 2" if they have none.
+        material: Index of the material, or None.
     """
 
     node: int
@@ -130,18 +130,18 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Reads a `.glb` or `.gltf` file; its first bytes tell which it is.
+    """Reads a `.glb` or `.gltf` file, recognised by its first bytes.
 
     Args:
         path: The file.
-        trust: As in `GltfDocument`.
+        trust: See `GltfDocument`.
 
     Returns:
-        The document, and the primitives with triangles that its scene draws (the default scene, else the first,
-        else all nodes), in the order of the nodes, depth first.
+        The document, and the primitives with triangles that its scene draws (the default scene, else the first scene,
+        else all nodes), in depth-first order of the nodes.
 
     Raises:
-        WlmError: One line that names the file and the field, for each error of the module's table.
+        WlmError: An error in the table of this module; the line names the file and the field.
     """
     return parse_gltf(path, read_file(path, MESH_BYTES, "the glTF file"), trust)
 
@@ -179,18 +179,27 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a document of one mesh, as `document_from_meshes`."""
+    """Makes a document of one mesh from arrays.
+
+    Args:
+        position: [V, 3], in any unit; stored as float32.
+        triangle: int [F, 3], at least one.
+        uv: [V, 2]; u right, v down; stored as float32, as `TEXCOORD_0`.
+        name: Name of the mesh.
+
+    Returns:
+        The document and its one primitive.
+    """
     document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
     return document, primitive
 
 
 def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a document of meshes, for geometry that came from elsewhere. Each mesh has a node of its own.
+    """Makes a document of several meshes from arrays. Each mesh has its own node.
 
     Args:
-        meshes: At least one. Positions are in any unit and are stored as float32, UVs (u right, v down) as float32
-            and `TEXCOORD_0`.
-        name: What the document is called.
+        meshes: Name, positions, triangles and UVs of each mesh, as for `document_from_arrays`; at least one.
+        name: Name of the document.
 
     Returns:
         The document and its primitives, one for each mesh.
@@ -233,18 +242,18 @@ def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocum
 
 
 def elements(document: GltfDocument, number: int) -> np.ndarray:
-    """Reads an accessor as it is encoded, its sparse part applied.
+    """Reads the encoded elements of an accessor, with its sparse part applied.
 
     Args:
         document: The document.
-        number: Of the accessor.
+        number: Index of the accessor.
 
     Returns:
-        uint8 [count, bytes of an element], columns of small matrices padded as glTF pads them; maybe a view of
-        the file's bytes.
+        uint8 [count, bytes of an element], with the column padding that glTF requires for small matrices; it may be a
+        view of the file's bytes.
 
     Raises:
-        WlmError: The accessor lies outside its view or buffer, or has an unknown type.
+        WlmError: The accessor exceeds its view or buffer, or has an unknown type.
     """
     accessor = document.item("accessors", number)
     where = f"{document.path}: accessors[{number}]"
@@ -280,18 +289,18 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
 
 
 def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
-    """Reads an accessor's numbers in their own type.
+    """Reads the numbers of an accessor in their stored type.
 
     Args:
         document: The document.
-        number: Of the accessor.
-        kind: The type that it must have, "VEC3" for example.
+        number: Index of the accessor.
+        kind: The required type, for example "VEC3".
 
     Returns:
         [count, components].
 
     Raises:
-        WlmError: It has another type, or an error of `elements`.
+        WlmError: The accessor has another type, or an error of `elements` occurs.
     """
     accessor = document.item("accessors", number)
     if accessor.get("type") != kind:
@@ -300,14 +309,14 @@ def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
 
 
 def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) -> list[np.ndarray | None]:
-    """The vertices' normals in the scene's space.
+    """Returns the vertex normals in the space of the scene.
 
     Returns:
-        For each primitive of the document float64 [V, 3], of unit length, or 0 where the file has none of any length;
-        None: it has no `NORMAL`.
+        For each primitive float64 [V, 3], of unit length, or 0 where the stored normal has no length; None for a
+        primitive without `NORMAL`.
 
     Raises:
-        WlmError: As for `read_gltf`.
+        WlmError: See `read_gltf`.
     """
     with reported(document.path):
         transforms = dict(_walk(document))
@@ -320,7 +329,8 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
             local = _floats(document, attributes["NORMAL"], "VEC3")
             if len(local) <= each.row.max():
                 raise WlmError(f"{document.path}: {each.name}: NORMAL: expected {each.row.max() + 1} vertices or more")
-            # By the cofactors, which are the inverse's transpose times the determinant, and exist for flat scales too.
+            # Normals transform by the cofactor matrix: the inverse transpose times the determinant. It exists for a
+            # scale of 0, too.
             a, b, c = transforms[each.node][:3, :3].T
             side = -1.0 if a @ np.cross(b, c) < 0 else 1.0
             turn = side * np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
@@ -333,7 +343,7 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
 
 @contextmanager
 def reported(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turns what Python raises on a malformed tree into one line."""
+    """Turns the exceptions of a malformed tree into one-line errors."""
     try:
         yield
     except KeyError as error:
@@ -345,7 +355,7 @@ def reported(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _check_view(document: GltfDocument, number: int, view: dict) -> None:
-    """Says where a buffer view is not within its buffer."""
+    """Raises an error if a buffer view exceeds its buffer."""
     where = f"{document.path}: bufferViews[{number}]"
     document.item("buffers", view["buffer"])
     start, length, held = view.get("byteOffset", 0), view["byteLength"], len(document.buffers[view["buffer"]])
@@ -356,7 +366,7 @@ def _check_view(document: GltfDocument, number: int, view: dict) -> None:
 
 
 def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int, strided: bool = False) -> np.ndarray:
-    """Views `count` elements of `size` bytes at a place, an object with a bufferView and maybe a byteOffset."""
+    """Returns a view of `count` elements of `size` bytes; `place` has a bufferView and perhaps a byteOffset."""
     view = document.item("bufferViews", place["bufferView"])
     offset, length = place.get("byteOffset", 0), view["byteLength"]
     stride = view.get("byteStride", size) if strided else size
@@ -382,8 +392,8 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
         drawn += count
         if drawn > document.most:
             raise WlmError(
-                f"{document.path}: draws more than {document.most} corners and vertices, which is more than its data "
-                "accounts for; trust=True (--trust of commands that have it) allows it, where the author is trusted"
+                f"{document.path}: draws more than {document.most} corners and vertices, the limit for its size; "
+                "trust=True (--trust on the command line) lifts the limit for files from a trusted author"
             )
 
     def floats(number: int, kind: str) -> np.ndarray:
@@ -403,7 +413,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 continue
             local = floats(attributes["POSITION"], "VEC3")
             where = f"{document.path}: meshes[{mesh_number}].primitives[{i}]"
-            # Of strips and fans three for each index; each attribute is gathered in copies.
+            # Strips and fans have three corners for each index; copies gather each attribute.
             corners = _count(document, primitive["indices"]) if "indices" in primitive else len(local)
             spend(corners * (1 if mode == TRIANGLES else 3) + min(corners, len(local)) * len(attributes) + _OVERHEAD)
             triangle = _triangles(_corners(document, where, primitive, len(local)), mode, where)
@@ -448,13 +458,13 @@ def _material(where: str, primitive: dict) -> int | None:
 
 
 def _count(document: GltfDocument, number: int) -> int:
-    """Elements that an accessor states; 0 where it states none, which is told when it is read."""
+    """Returns the number of elements that an accessor states; 0 if it is invalid, which reading it reports."""
     count = document.item("accessors", number).get("count")
     return count if isinstance(count, int) else 0
 
 
 def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
-    """Reads an accessor as float32 [count, components], integers scaled where it says so."""
+    """Reads an accessor as float32 [count, components]; normalised integers are scaled."""
     values = components(document, number, kind)
     if values.dtype.kind != "f" and document.content["accessors"][number].get("normalized", False):
         scaled = values.astype(np.float64) / np.iinfo(values.dtype).max
@@ -463,7 +473,7 @@ def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
 
 
 def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int) -> np.ndarray:
-    """Gives the vertex of every corner, int64 [N]."""
+    """Returns the vertex of every corner, int64 [N]."""
     if "indices" not in primitive:
         return np.arange(vertices)
     index = components(document, primitive["indices"], "SCALAR")[:, 0]
@@ -475,10 +485,10 @@ def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int)
 
 
 def _triangles(corner: np.ndarray, mode: int, where: str) -> np.ndarray:
-    """Makes triangles [F, 3] of corners [N], as the specification's section on primitive topology orders them."""
+    """Makes triangles [F, 3] from corners [N] in the order of the specification (section on primitive topology)."""
     if mode == TRIANGLES:
         if len(corner) % 3:
-            raise WlmError(f"{where}: expected three corners a triangle, found {len(corner)} corners")
+            raise WlmError(f"{where}: expected three corners per triangle, found {len(corner)} corners")
         return corner.reshape(-1, 3)
     first = np.arange(max(len(corner) - 2, 0))
     if mode == FAN:
@@ -488,7 +498,7 @@ def _triangles(corner: np.ndarray, mode: int, where: str) -> np.ndarray:
 
 
 def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields the scene's nodes, depth first, each with its transform [4, 4] to the scene's space."""
+    """Yields the nodes of the scene, depth first, each with its transform [4, 4] to the space of the scene."""
     content = document.content
     nodes = content.get("nodes", [])
     if content.get("scenes"):
@@ -502,7 +512,7 @@ def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
         number, above = stack.pop()
         node = document.item("nodes", number)
         if number in visited:
-            raise WlmError(f"{document.path}: nodes[{number}]: expected one parent, found it twice in the scene")
+            raise WlmError(f"{document.path}: nodes[{number}]: expected one parent, found the node twice in the scene")
         visited.add(number)
         transform = above @ _transform(node)
         yield number, transform
@@ -510,13 +520,13 @@ def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _transform(node: dict) -> np.ndarray:
-    """The node's own transform [4, 4]: its matrix, else translation * rotation * scale."""
+    """Returns the local transform [4, 4] of a node: its matrix, else translation * rotation * scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
     transform = np.eye(4)
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     norm = x * x + y * y + z * z + w * w
-    if norm > 0:  # exporters round quaternions; of an all-zero one nothing can be made
+    if norm > 0:  # exporters round quaternions; an all-zero one has no rotation
         s = 2.0 / norm
         transform[:3, :3] = [
             [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
@@ -529,7 +539,7 @@ def _transform(node: dict) -> np.ndarray:
 
 
 def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
-    """Gives the JSON and the binary chunk of a `.glb`."""
+    """Returns the JSON chunk and the binary chunk of a `.glb`."""
     if len(data) < 12:
         raise WlmError(f"{path}: the file is cut short: expected a header of 12 bytes, found {len(data)}")
     version, length = struct.unpack_from("<2I", data, 4)
@@ -553,16 +563,16 @@ def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes 
 def _load_buffers(
     path: str | os.PathLike[str], buffers: Sequence[dict[str, Any]], binary: bytes | None, trust: bool
 ) -> tuple[bytes, ...]:
-    """Gives the bytes of each buffer, at least as many as it states.
+    """Returns the bytes of each buffer, at least the stated number.
 
     Args:
         path: The document.
-        buffers: Their entries in the tree.
-        binary: The `.glb`'s binary chunk, if there is one.
-        trust: Whether they may be files outside the document's folder.
+        buffers: The entries of the buffers in the tree.
+        binary: The binary chunk of the `.glb`, if it has one.
+        trust: Whether buffers may be files outside the folder of the document.
 
     Raises:
-        WlmError: One can't be read, is shorter, or is the file of an earlier one.
+        WlmError: A buffer cannot be read, is too short, or is the file of an earlier buffer.
     """
     files: dict[Path, int] = {}
     return tuple(_load_buffer(path, number, buffer, binary, trust, files) for number, buffer in enumerate(buffers))
@@ -580,12 +590,12 @@ def _load_buffer(
     where = f"{path}: buffers[{number}]"
     if uri is None:
         if number or binary is None:
-            raise WlmError(f"{where}: has no uri, and the file no binary chunk for it")
+            raise WlmError(f"{where}: has no uri, and the file has no binary chunk")
         data = binary
     elif uri.startswith("data:"):
         head, comma, body = uri.partition(",")
         if not comma:
-            raise WlmError(f"{where}.uri: expected data: with a comma before its content")
+            raise WlmError(f"{where}.uri: expected a data: URI with a comma before its content")
         data = unquote_to_bytes(body)
         if head.endswith(";base64"):
             try:
@@ -596,10 +606,10 @@ def _load_buffer(
         if not isinstance(length, int) or length < 1:
             raise WlmError(f"{where}.byteLength: expected at least 1, found {length}")
         file = local_file(str(path), uri, f"{where}.uri", trust).resolve()
-        # One file, read for each of thousands of buffers, would fill any memory.
+        # One file, read once per buffer of thousands, would exhaust the memory.
         earlier = files.setdefault(file, number)
         if earlier != number:
-            raise WlmError(f"{where}.uri: expected another file than that of buffers[{earlier}], found {uri}")
+            raise WlmError(f"{where}.uri: expected a file other than that of buffers[{earlier}], found {uri}")
         data = read_file(file, MESH_BYTES, f"buffers[{number}] of {path}", first=length)
     if len(data) < length:
         raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
@@ -607,13 +617,13 @@ def _load_buffer(
 
 
 def local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:
-    """Gives the file that a URI names relative to the document.
+    """Returns the path of the file that a URI names, relative to the document.
 
     Raises:
-        WlmError: The URI has a scheme or is an absolute path, or the file lies outside the document's folder and the
-            document isn't trusted.
+        WlmError: The URI has a scheme or is an absolute path, or the file is outside the folder of a document that is
+            not trusted.
     """
     name = unquote(uri)
     if _URI_SCHEME.match(uri) or Path(name).is_absolute():
-        raise WlmError(f"{where}: expected a file relative to it, found {uri}")
+        raise WlmError(f"{where}: expected a path relative to the document, found {uri}")
     return named_file(document_path, name, where, trust)

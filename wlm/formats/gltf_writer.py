@@ -1,4 +1,4 @@
-"""Copies of a glTF file, as `.glb`, in which some primitives have other vertices and one more UV set."""
+"""Writing of copies of a glTF file as `.glb`, in which some primitives have new vertices and one more UV set."""
 
 import copy
 import hashlib
@@ -32,7 +32,7 @@ from wlm.formats.reading import read_file
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _MAX_GLB = 2**32 - 1
-# By a file's first bytes; "." stands for any.
+# Keyed by the first bytes of a file; "." matches any byte.
 _IMAGE_TYPES = {
     rb"\x89PNG\r\n\x1a\n": "image/png",
     rb"\xff\xd8\xff": "image/jpeg",
@@ -40,9 +40,9 @@ _IMAGE_TYPES = {
     rb"\xabKTX 20\xbb\r\n\x1a\n": "image/ktx2",
     rb"DDS ": "image/vnd-ms.dds",
 }
-# Extensions that number a primitive's vertices and would be wrong for the new ones.
+# Extensions that refer to vertices by index and would be wrong for the new vertices.
 _OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility")
-# Extensions that name no accessor and no buffer view, so that unused ones are known to be so.
+# Extensions that refer to no accessor and no buffer view, so that unused ones can be found.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
 
 
@@ -51,9 +51,9 @@ class Replacement:
     """New vertices and triangles of a primitive.
 
     Attributes:
-        primitive: The primitive, as it was read.
-        gather: int [V'], for each new vertex the vertex of `primitive` whose attributes it has.
-        triangle: int [F', 3], at least one, numbers of new vertices.
+        primitive: The primitive to replace.
+        gather: int [V'], for each new vertex the vertex of `primitive` whose attributes it takes.
+        triangle: int [F', 3], at least one, indices of new vertices.
         uv: [V', 2], the new UV; u right, v down; stored as float32.
     """
 
@@ -66,18 +66,18 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Writes `encode_glb` to a file, whole or not at all.
+    """Writes the `.glb` file of `encode_glb`, atomically.
 
     Args:
         path: The file to write; its folder must exist.
-        document, replacements, uv_set: As for `encode_glb`.
+        document, replacements, uv_set: See `encode_glb`.
 
     Returns:
         The number of bytes written.
 
     Raises:
-        ValueError: As for `encode_glb`.
-        WlmError: As for `encode_glb`, or the file can't be written.
+        ValueError: See `encode_glb`.
+        WlmError: See `encode_glb`; or the file cannot be written.
     """
     return atomic_write(path, encode_glb(document, replacements, uv_set, path))
 
@@ -88,26 +88,26 @@ def encode_glb(
     uv_set: int = 1,
     path: str | os.PathLike[str] | None = None,
 ) -> list[bytes]:
-    """Encodes a document as `.glb` with some primitives replaced and all else as it was.
+    """Encodes a document as `.glb` with some primitives replaced and everything else unchanged.
 
-    Attributes and morph targets keep their encoding. Where a primitive lacks sets below `uv_set`, which glTF wants in
-    a row, they are given the new UVs too. Data that nothing uses any more is left out, unless the file has an
-    extension that may refer to it in a way unknown here. Extensions of a replaced primitive that number its vertices
-    (CESIUM_primitive_outline, EXT_mesh_primitive_edge_visibility) are dropped.
+    Attributes and morph targets keep their encoding. glTF requires consecutive UV sets, so missing sets below `uv_set`
+    get the new UVs too. Unused data is dropped, unless the file has an extension that may refer to it in an unknown
+    way. Extensions of a replaced primitive that refer to its vertices (CESIUM_primitive_outline,
+    EXT_mesh_primitive_edge_visibility) are dropped.
 
     Args:
-        document: As it was read.
-        replacements: At most one for each of its primitives.
-        uv_set: n of the new `TEXCOORD_n`, the same for all of them.
-        path: The file that is written, for messages; None: the document's own.
+        document: The document.
+        replacements: At most one for each primitive.
+        uv_set: n of the new `TEXCOORD_n`, the same for all replacements.
+        path: Name of the file in messages; None: that of the document.
 
     Returns:
         The bytes of the file, in pieces.
 
     Raises:
-        ValueError: A primitive replaced twice or with that set already, a shape that is wrong or a number out of range.
-        WlmError: What isn't drawn, and so wasn't checked when it was read, is malformed; or the file would be beyond
-            the 4 GiB that the format allows.
+        ValueError: A primitive is replaced twice or already has the UV set, a shape is wrong or an index out of range.
+        WlmError: A part of the document that reading did not check, since the scene does not draw it, is malformed;
+            or the file would exceed the 4 GiB of the format.
     """
     for each in replacements:
         _check(each, uv_set)
@@ -127,7 +127,7 @@ def encode_glb(
 
 
 class _Tree:
-    """A copy of a document that grows: its JSON, and the bytes of each of its buffer views.
+    """A growing copy of a document: its JSON tree, and the bytes of each buffer view.
 
     Attributes:
         content: The JSON tree.
@@ -146,7 +146,7 @@ class _Tree:
         self._known: dict[object, int] = {}  # new views and accessors by their content
 
     def own_mesh(self, node: int) -> dict:
-        """Gives a node's mesh, made its alone if others use it too."""
+        """Returns the mesh of a node; a mesh that other nodes use too is copied first."""
         number = self.content["nodes"][node]["mesh"]
         if self._users[number] > 1:
             self._users[number] -= 1
@@ -155,7 +155,7 @@ class _Tree:
         return self.content["meshes"][number]
 
     def replace(self, primitive: dict, new: Replacement, uv_set: int) -> None:
-        """Gives a primitive of the tree its new vertices and triangles."""
+        """Replaces the vertices and triangles of a primitive of the tree."""
         rows = new.primitive.row[new.gather]
         for attributes in (primitive["attributes"], *primitive.get("targets", [])):
             for name, number in attributes.items():
@@ -163,7 +163,7 @@ class _Tree:
         uv = self._accessor(np.ascontiguousarray(new.uv, "<f4").view(np.uint8), _FLOAT, "VEC2", _VERTICES)
         for number in range(uv_set + 1):
             primitive["attributes"].setdefault(f"TEXCOORD_{number}", uv)
-        # 65535 would restart the primitive.
+        # Index 65535 would restart the primitive.
         component, name = (_UINT16, "<u2") if len(new.gather) < 65536 else (_UINT32, "<u4")
         corners = np.ascontiguousarray(new.triangle, name).reshape(-1, 1)
         primitive["indices"] = self._accessor(corners.view(np.uint8), component, "SCALAR", _INDICES)
@@ -174,7 +174,7 @@ class _Tree:
             del primitive["extensions"]
 
     def embed_images(self) -> None:
-        """Takes images of files into the tree; what can't be read, or is no image, keeps its URI."""
+        """Embeds the images of other files; an image that cannot be read or recognised keeps its URI."""
         for number, image in enumerate(self.content.get("images", [])):
             if "uri" not in image:
                 continue
@@ -191,7 +191,7 @@ class _Tree:
             image |= {"bufferView": self._view(data, {}), "mimeType": kind}
 
     def drop_unused(self) -> None:
-        """Leaves out accessors and buffer views that nothing refers to, if that is sure."""
+        """Drops unused accessors and buffer views, unless an extension may refer to them."""
         used = self.content.get("extensionsUsed", [])
         if all(name.startswith(_HARMLESS) for name in used):
             self._keep("accessors", _accessor_slots)
@@ -199,7 +199,7 @@ class _Tree:
             self.payloads = [self.payloads[number] for number in numbers]
 
     def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
-        """Keeps those entries of a list that the slots refer to, and numbers them anew; returns the old numbers."""
+        """Keeps the entries of a list that the slots refer to and renumbers them; returns their old indices."""
         places = list(slots(self.content))
         numbers = sorted({holder[key] for holder, key in places})
         new = {old: number for number, old in enumerate(numbers)}
@@ -209,7 +209,7 @@ class _Tree:
         return numbers
 
     def _gathered(self, number: int, rows: np.ndarray, bounds: bool) -> int:
-        """Adds an accessor with some rows of another one in the same encoding."""
+        """Adds an accessor with some rows of another accessor, in the same encoding."""
         old = self._document.content["accessors"][number]
         values = elements(self._document, number)[rows]
         extra = {"normalized": True} if old.get("normalized", False) else {}
@@ -219,7 +219,7 @@ class _Tree:
         return self._accessor(values, old["componentType"], old["type"], _VERTICES, **extra)
 
     def _accessor(self, values: np.ndarray, component: int, kind: str, target: int, **extra: object) -> int:
-        """Adds an accessor of encoded elements, uint8 [count, size], or finds an equal one."""
+        """Adds an accessor of encoded elements, uint8 [count, size], or returns an equal one."""
         head: dict[str, object] = {"target": target}
         if target == _VERTICES:  # each vertex begins at a multiple of 4 bytes
             values = np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))
@@ -238,7 +238,7 @@ class _Tree:
         return self._known[key]
 
     def _view(self, data: bytes, head: dict) -> int:
-        """Adds a buffer view, or finds one that was added with the same bytes."""
+        """Adds a buffer view, or returns an added one with the same bytes."""
         key = (hashlib.blake2b(data).digest(), tuple(head.items()))
         if key not in self._known:
             self.content["bufferViews"].append({"buffer": 0, "byteLength": len(data), **head})
@@ -248,10 +248,10 @@ class _Tree:
 
 
 def _check(new: Replacement, uv_set: int) -> None:
-    """Says what of a replacement is wrong."""
+    """Raises an error if a replacement is invalid."""
     where = new.primitive.name
     if uv_set < 0 or uv_set in new.primitive.uv:
-        raise ValueError(f"uv_set: expected a number that {where} has not yet, got {uv_set}")
+        raise ValueError(f"uv_set: expected a UV set that {where} does not have, got {uv_set}")
     count = len(new.gather)
     if new.uv.shape != (count, 2) or new.triangle.ndim != 2 or new.triangle.shape[1] != 3 or not len(new.triangle):
         raise ValueError(f"{where}: expected uv [{count}, 2] and triangles, got {new.uv.shape}, {new.triangle.shape}")
@@ -264,7 +264,7 @@ def _check(new: Replacement, uv_set: int) -> None:
 
 
 def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
-    """Every place in core glTF that holds the number of an accessor, as an object and its key."""
+    """Yields every reference to an accessor in core glTF, as an object and its key."""
     for mesh in content.get("meshes", []):
         for primitive in mesh["primitives"]:
             for attributes in (primitive["attributes"], *primitive.get("targets", [])):
@@ -282,7 +282,7 @@ def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
 
 
 def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
-    """Every place in core glTF that holds the number of a buffer view."""
+    """Yields every reference to a buffer view in core glTF."""
     for accessor in content["accessors"]:
         sparse = accessor.get("sparse", {})
         for holder in (accessor, sparse.get("indices", {}), sparse.get("values", {})):
@@ -296,7 +296,7 @@ def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
 def _pack(
     path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]
 ) -> list[bytes | memoryview]:
-    """Lays the views one after another in one buffer, and gives the file's pieces."""
+    """Places the views one after another in one buffer and returns the pieces of the file."""
     pieces: list[bytes | memoryview] = []
     start = 0
     for view, data in zip(content["bufferViews"], payloads, strict=True):
@@ -308,11 +308,11 @@ def _pack(
     for kind in ("accessors", "bufferViews"):  # glTF has no empty lists
         if not content[kind]:
             del content[kind]
-    # Half a character can't be written but as JSON's escape, which is Python's.
+    # An unpaired surrogate can only be written as an escape, which JSON and Python share.
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode("utf-8", "backslashreplace")
     text += b" " * (-len(text) % 4)
     length = 12 + 8 + len(text) + 8 + start
     if length > _MAX_GLB:
-        raise WlmError(f"{path}: cannot write: {length} bytes are beyond the 4 GiB of the .glb format")
+        raise WlmError(f"{path}: cannot write: {length} bytes exceed the 4 GiB of the .glb format")
     head = struct.pack("<4s4I", MAGIC, 2, length, len(text), JSON_CHUNK)
     return [head, text, struct.pack("<2I", start, BINARY_CHUNK), *pieces]

@@ -1,13 +1,13 @@
-"""Reading the light probes of a Godot 4 lightmap bake (`.lmbake`) and who uses its textures; replacing the probes.
+"""Light probes and lightmap users of a Godot 4 lightmap bake (`.lmbake`): reading, replacing and writing.
 
-The file is Godot's binary resource (`RSRC`, or `RSCC` where it was saved compressed) of the type `LightmapGIData`.
-Its property `probe_data` is a dictionary with `points` and, for each of them, nine colours `sh`; the tetrahedra and the
-BSP tree are stepped over. `lightmap_textures` refers to pictures, each of one or more slices; `user_data` has four
-values for each mesh that reads them: the path of its node, its rectangle, its slice, and -1 or the cell of a GridMap.
+The file is a Godot binary resource (`RSRC`, or compressed `RSCC`) of the type `LightmapGIData`. Its property
+`probe_data` is a dictionary with `points` and nine colours `sh` for each point; the tetrahedra and the BSP tree are
+skipped. `lightmap_textures` refers to pictures, each of one or more slices; `user_data` has four values for each mesh
+that uses them: the path of its node, its rectangle, its slice, and -1 or the cell of a GridMap.
 
-Those nine are spherical harmonics L0 to L2 in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus, in the
-scene's axes (right-handed, y up, metres). They hold the incoming radiance, not convolved with the cosine, divided by
-pi: see "godot" in `wlm.probe.conventions`. Probes inside walls are often all zero.
+The nine colours are spherical harmonics L0 to L2 in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2, all signs plus, in
+the axes of the scene (right-handed, y up, metres). They represent the incoming radiance divided by pi, without the
+cosine convolution: see "godot" in `wlm.probe.conventions`. Probes inside walls are often all zero.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ _HAS_UIDS, _IS_DOUBLE, _HAS_SCRIPT_CLASS = 2, 4, 8
 _RESERVED = 11
 _WRITTEN_FORMAT, _NAMED_IDS = 4, 1  # every Godot 4 reads it
 
-# Compressed files: Zstandard in blocks of 4096 bytes. The limit keeps a damaged size from filling the memory.
+# Compressed files use Zstandard in blocks of 4096 bytes. The limit bounds the memory for a damaged size.
 _ZSTD = 2
 _LARGEST_BLOCK = 1 << 20
 
-# Types of values. A real has 4 bytes, or 8 in a file of a double-precision build.
+# Types of values. A real number has 4 bytes, or 8 in a file of a double-precision build.
 _BOOL, _INT, _FLOAT, _RECTANGLE, _AABB, _LONG = 2, 3, 4, 11, 15, 40
 _STRING, _STRING_NAME, _NODE_PATH, _OBJECT, _DICTIONARY, _ARRAY = 5, 44, 22, 24, 26, 30
 _BYTES, _INTS, _STRINGS, _VECTOR3S, _COLOURS = 31, 32, 34, 35, 36
-# Those of a fixed size: reals, and bytes.
+# Types of a fixed size: number of reals and number of further bytes.
 _FIXED = {
     1: (0, 0),  # nil
     2: (0, 4),  # bool
@@ -70,7 +70,7 @@ _FIXED = {
     51: (0, 16),  # Vector4i
     52: (16, 0),  # Projection
 }
-# Packed arrays: reals and bytes of one element.
+# Packed arrays: reals and further bytes of one element.
 _PACKED = {
     _BYTES: (0, 1),
     _INTS: (0, 4),  # of 32 bits
@@ -82,21 +82,21 @@ _PACKED = {
     49: (0, 8),  # doubles
     53: (4, 0),  # Vector4
 }
-# Numbers that follow a reference to a resource: none; an old file's two strings; an index.
+# Kinds of references to a resource: no content, two strings (in old files), an index, an index.
 _EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
 
-# Real files nest two deep. A damaged one must not exhaust the stack.
+# Real files nest values two deep. The limit keeps a damaged file from exhausting the stack.
 _DEEPEST = 32
 
 
 @dataclass(frozen=True)
 class GodotUser:
-    """A mesh that reads a lightmap.
+    """A mesh that uses a lightmap.
 
     Attributes:
-        node: The path of its node, names with "/" between them.
-        rectangle: x, y, width, height: UV2 times the last two, plus the first two, v down.
-        slice: Of the textures, counted through all of them.
+        node: Path of its node, with "/" between names.
+        rectangle: x, y, width, height: UV2 is scaled by the last two and offset by the first two, v down.
+        slice: Index of the slice, counted through all textures.
     """
 
     node: str
@@ -109,9 +109,9 @@ class GodotUsers:
     """The lightmaps of a bake and their users.
 
     Attributes:
-        textures: Names of the pictures, as Godot has them (res://...).
-        users: In the file's order.
-        directional: Whether each slice has four: one of light and three of directions.
+        textures: Godot's names of the pictures (res://...).
+        users: The users in the order of the file.
+        directional: Whether each slice has four parts: one of light and three of directions.
     """
 
     textures: tuple[str, ...]
@@ -120,10 +120,10 @@ class GodotUsers:
 
 
 def read_users(path: str | os.PathLike[str]) -> GodotUsers:
-    """Reads which meshes read which part of a bake's lightmaps.
+    """Reads the meshes that use a bake's lightmaps, and their rectangles.
 
     Raises:
-        WlmError: The file is missing, not a bake, damaged, or holds something else in their place.
+        WlmError: The file is missing, is not a bake, is damaged, or has other values in their place.
     """
     reader = _reader(path)
     names, external = _open(reader)
@@ -160,34 +160,34 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         path: The `.lmbake` file.
 
     Returns:
-        The positions, float64 [N, 3] in metres, and the coefficients, float32 [N, 9, 3] in RGB, as the file has them
-        (the module's notes say what they are); N is at least 1.
+        The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
+        description defines them); N is at least 1.
 
     Raises:
-        WlmError: The file is missing, not a Godot resource, of another version or type, cut short or damaged, has no
-            probes, or is compressed and imagecodecs is not installed.
+        WlmError: The file is missing, is not a Godot resource, has another version or type, is cut short or damaged,
+            or has no probes.
     """
     points, colours, _, _ = _read(path)
     return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()
 
 
 def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
-    """A bake with other light at its probes: textures, meshes and all else stay as they are.
+    """Replaces the light of the probes of a bake and keeps everything else.
 
     Args:
         path: The `.lmbake`, not compressed.
-        sh: [N, 9, 3], for each of its N probes, as the file has them.
+        sh: [N, 9, 3], coefficients for each of its N probes, as stored in the file.
 
     Returns:
-        The file's new content.
+        The new content of the file.
 
     Raises:
-        WlmError: As for `read_lmbake`, or the bake is compressed.
-        ValueError: Another shape.
+        WlmError: See `read_lmbake`; or the bake is compressed.
+        ValueError: The shape is wrong.
     """
     points, colours, reader, at = _read(path)
     if bytes(reader.data[:4]) != b"RSRC":
-        raise WlmError(f"{path}: is compressed: expected a bake that was saved without, to replace its light")
+        raise WlmError(f"{path}: the bake is compressed: expected one saved without compression, to replace its light")
     if sh.shape != (len(points), COEFFICIENTS, 3):
         raise ValueError(f"expected ({len(points)}, {COEFFICIENTS}, 3), got {sh.shape}")
     changed = colours.reshape(len(points), COEFFICIENTS, 4)
@@ -197,7 +197,7 @@ def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader, int]:
-    """Points [N, 3], colours [9 N, 4], the bytes they are from, and where in these the colours begin."""
+    """Returns the points [N, 3], the colours [9 N, 4], the reader, and the offset of the colours in its bytes."""
     reader = _reader(path)
     names, _ = _open(reader)
     points = colours = None
@@ -217,7 +217,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader
             else:
                 reader.skip()
     if points is None or colours is None or len(points) == 0:
-        raise WlmError(f"{path}: {_PROPERTY} holds no probes: bake with LightmapProbe nodes or with generated probes")
+        raise WlmError(f"{path}: {_PROPERTY} has no probes: bake with LightmapProbe nodes or with generated probes")
     if len(colours) != COEFFICIENTS * len(points):
         raise WlmError(
             f"{path}: {_PROPERTY}.sh: expected {COEFFICIENTS} colours for each of {len(points)} points, "
@@ -230,7 +230,7 @@ def _reader(path: str | os.PathLike[str]) -> _Reader:
     data = read_file(path, BAKE_BYTES, "the bake")
     magic = data[:4]
     if magic == b"RSCC":
-        # A compressed resource has no magic of its own inside, and its offsets count from there.
+        # The decompressed content has no magic number, and its offsets count from its start.
         return _Reader(path, _decompress(_Reader(path, data, 4)), 0)
     if magic == b"RSRC":
         return _Reader(path, data, 4)
@@ -238,13 +238,13 @@ def _reader(path: str | os.PathLike[str]) -> _Reader:
 
 
 def _open(reader: _Reader) -> tuple[list[str], list[str]]:
-    """Reads the header and goes to the main resource's properties; returns the table of names, and the files' names."""
+    """Reads the header, seeks the main resource's properties, and returns the names and the external file names."""
     path = reader.path
     big = reader.u32()
     if big > 1:
         raise WlmError(f"{path}: byte order: expected 0 or 1, found {big}: the file is damaged")
     reader.order = "<>"[big]
-    reader.u32()  # for doubles, never set
+    reader.u32()  # a flag for doubles that is never set
     major, minor, version = reader.u32(), reader.u32(), reader.u32()
     if major != _ENGINE or version not in _FORMATS:
         raise WlmError(
@@ -264,7 +264,7 @@ def _open(reader: _Reader) -> tuple[list[str], list[str]]:
     names = [reader.string() for _ in range(reader.u32())]
     external = []
     for _ in range(reader.u32()):
-        reader.string()  # type of an external resource
+        reader.string()  # the type of an external resource
         external.append(reader.string())
         if flags & _HAS_UIDS:
             reader.take(8)
@@ -275,14 +275,14 @@ def _open(reader: _Reader) -> tuple[list[str], list[str]]:
     if offset is None:
         raise WlmError(f"{path}: expected at least one resource inside, found none")
     reader.seek(offset)
-    reader.string()  # the type once more
+    reader.string()  # the type, repeated
     return names, external
 
 
 class _Reader:
-    """Numbers and values from bytes; whatever reaches past their end is an error.
+    """Reads numbers and values from bytes, and raises an error at their end.
 
-    No length that the file states is used to allocate: it is first held against the bytes that are left.
+    A stated length is compared with the remaining bytes before anything is allocated.
     """
 
     def __init__(self, path: str | os.PathLike[str], data: bytes, start: int) -> None:
@@ -313,11 +313,11 @@ class _Reader:
         return struct.unpack(self.order + "Q", self.take(8))[0]
 
     def string(self) -> str:
-        """A length in bytes, then UTF-8 that ends in a NUL."""
+        """Reads a length in bytes and UTF-8 text that ends in a NUL."""
         return self._text(self.u32())
 
     def name(self, names: list[str]) -> str:
-        """An entry of the table of names, or text in place of one where the highest bit is set."""
+        """Reads an index into the name table, or inline text if the highest bit is set."""
         index = self.u32()
         if index & 0x80000000:
             return self._text(index & 0x7FFFFFFF)
@@ -326,7 +326,7 @@ class _Reader:
         return names[index]
 
     def key(self) -> str | None:
-        """A key of a dictionary; None if it isn't text."""
+        """Reads a key of a dictionary; returns None if it is not text."""
         start = self.position
         if self.u32() in (_STRING, _STRING_NAME):
             return self.string()
@@ -340,7 +340,7 @@ class _Reader:
             raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {marker}")
 
     def user(self, names: list[str]) -> GodotUser:
-        """Four values of `user_data`."""
+        """Reads the four values of an entry of `user_data`."""
         self.expect(_USERS, _NODE_PATH, "a path")
         steps, below = struct.unpack(self.order + "HH", self.take(4))
         path = [self.name(names) for _ in range(steps)]
@@ -358,21 +358,21 @@ class _Reader:
         return struct.unpack(self.order + ("i" if kind == _INT else "q"), self.take(4 if kind == _INT else 8))[0]
 
     def vectors(self) -> np.ndarray:
-        """A packed array of Vector3, float64 [N, 3]."""
+        """Reads a packed array of Vector3 as float64 [N, 3]."""
         self.expect(f"{_PROPERTY}.points", _VECTOR3S, "a packed array of Vector3")
         values = np.frombuffer(self.take(self.u32() * 3 * self.real), f"{self.order}f{self.real}")
         return values.reshape(-1, 3).astype(np.float64)
 
     def colours(self) -> np.ndarray:
-        """A packed array of Color, float32 [N, 4]."""
+        """Reads a packed array of Color as float32 [N, 4]."""
         self.expect(f"{_PROPERTY}.sh", _COLOURS, "a packed array of Color")
         values = np.frombuffer(self.take(self.u32() * 16), f"{self.order}f4")
         return values.reshape(-1, 4).astype(np.float32)
 
     def skip(self, depth: int = 0) -> None:
-        """Steps over one value of any type."""
+        """Skips one value of any type."""
         if depth > _DEEPEST:
-            raise WlmError(f"{self.path}: damaged: values inside values, more than {_DEEPEST} deep")
+            raise WlmError(f"{self.path}: damaged: values are nested more than {_DEEPEST} deep")
         kind = self.u32()
         if kind in _FIXED:
             reals, size = _FIXED[kind]
@@ -415,17 +415,17 @@ class _Reader:
             raise WlmError(f"{self.path}: damaged: expected a reference of kind 0 to 3, found {kind}")
 
     def _repeat(self, count: int, read: Callable[[], object]) -> None:
-        # Each call takes at least four bytes, so the file's size bounds the loop.
+        # Each call reads at least four bytes, so the size of the file bounds the loop.
         for _ in range(count):
             read()
 
 
 def _decompress(reader: _Reader) -> bytes:
-    """Unpacks the blocks of a compressed resource."""
+    """Decompresses the blocks of a compressed resource."""
     path = reader.path
     mode, block, total = reader.u32(), reader.u32(), reader.u32()
     if mode != _ZSTD:
-        raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}: save it in Godot without")
+        raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}: save without compression")
     if not 0 < block <= _LARGEST_BLOCK:
         raise WlmError(f"{path}: compression: expected blocks of 1 to {_LARGEST_BLOCK} bytes, found {block}")
     try:
@@ -434,7 +434,7 @@ def _decompress(reader: _Reader) -> bytes:
         raise WlmError(
             f"{path}: is compressed: needs the extra: pip install 'wlm[baselines]', or save it in Godot without"
         ) from error
-    # The last block, of what is left, is stored even where nothing is.
+    # The last block contains the rest and is stored even if it is empty.
     full, rest = divmod(total, block)
     sizes = np.frombuffer(reader.take(4 * (full + 1)), "<u4")
     check_growth(f"{path}: compression", len(reader.data), total)
@@ -457,14 +457,14 @@ def _decompress(reader: _Reader) -> bytes:
 def lmbake_bytes(
     points: np.ndarray, sh: np.ndarray, tetrahedra: np.ndarray, planes: np.ndarray, children: np.ndarray
 ) -> bytes:
-    """What a new bake holds.
+    """Returns the content of a new bake in format 4, with a `LightmapGIData` that sets only `probe_data`.
 
     Args:
         points: [N, 3], metres.
         sh: [N, 9, 3], the numbers that the module's description defines.
-        tetrahedra: int [T, 4], between points.
-        planes, children: [M, 4] and int [M, 2], a tree of planes n x = d: where n x > d the first child is next, else
-            the second; a child is a node from 0, or -1 - t for the tetrahedron t.
+        tetrahedra: int [T, 4], indices of points.
+        planes: [M, 4], planes n x = d of a BSP tree.
+        children: int [M, 2], the child where n x > d and the other child: a node, or -1 - t for tetrahedron t.
     """
     low, high = points.min(0), points.max(0)
     node = np.zeros((len(planes), 6), "<u4")
@@ -481,9 +481,9 @@ def lmbake_bytes(
     }
     content = _u32(_DICTIONARY, len(data)) + b"".join(_u32(_STRING) + _text(key) + each for key, each in data.items())
     head = b"RSRC" + _u32(0, 0, _ENGINE, 0, _WRITTEN_FORMAT) + _text(_TYPE)
-    # No import metadata, no UID of its own, no name of a script's class.
+    # No import metadata, no UID, no script class.
     head += struct.pack("<QIQ", 0, _NAMED_IDS, 0) + _u32(*[0] * _RESERVED)
-    head += _u32(1) + _text(_PROPERTY) + _u32(0)  # names; resources elsewhere
+    head += _u32(1) + _text(_PROPERTY) + _u32(0)  # names; external resources
     head += _u32(1) + _text("local://1")
     body = _text(_TYPE) + _u32(1) + _u32(0) + content
     return head + struct.pack("<Q", len(head) + 8) + body + b"RSRC"

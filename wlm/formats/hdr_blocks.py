@@ -1,7 +1,6 @@
-"""BC6H and ASTC blocks of 16 bytes, by the packages of an extra: half-float RGB in and out.
+"""BC6H and ASTC coding by optional packages: half-float RGB in and out, 16 bytes per block, row by row.
 
-Blocks follow each other row by row. All runs on the CPU, ASTC's encoder in threads. The packages are imported when they
-are used.
+All work runs on the CPU; the ASTC encoder uses threads. The packages are imported when they are used.
 """
 
 import functools
@@ -22,20 +21,20 @@ ASTC_BLOCKS = (
     (4, 4), (5, 4), (5, 5), (6, 5), (6, 6), (8, 5), (8, 6), (8, 8), (10, 5), (10, 6), (10, 8), (10, 10), (12, 10),
     (12, 12),
 )  # fmt: skip
-"""Width and height of every block that the format has in two dimensions."""
+"""Width and height of every 2D block size of the format, in texels."""
 # astcenc's presets "medium" and "thorough".
 ASTC_MEDIUM = 60.0
 ASTC_THOROUGH = 98.0
-# Beyond any block's PSNR: in the LDR profile the presets stop a block's search at 29 to 32 dB.
+# Above the PSNR of any block. In the LDR profile the presets stop the search of a block at 29 to 32 dB.
 _NO_LIMIT_DB = 999.0
-_TEXELS_A_THREAD = 4096  # at least: some 20 ms of work
+_TEXELS_A_THREAD = 4096  # the least work of a thread, about 20 ms
 
 
 def need(package: str, extra: str) -> ModuleType:
-    """Imports a package of an extra.
+    """Imports an optional package.
 
     Raises:
-        WlmError: It is missing; the line names the extra.
+        WlmError: The package is missing; the line names the extra to install.
     """
     try:
         return importlib.import_module(package)
@@ -44,12 +43,12 @@ def need(package: str, extra: str) -> ModuleType:
 
 
 def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
-    """Encodes unsigned BC6H, with Intel's ISPC texture compressor.
+    """Encodes unsigned BC6H by Intel's ISPC texture compressor.
 
     Args:
         texels: half [H, W, 3], finite, not negative; H and W multiples of 4.
         profile: One of `BC6H_PROFILES`, from the fastest to the best.
-        extra: The extra that a message names.
+        extra: Name of the optional extra for the error message.
 
     Raises:
         WlmError: The package is missing.
@@ -62,7 +61,7 @@ def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
 
 
 def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:
-    """Decodes BC6H, unsigned or signed, to half [H, W, 3], multiples of 4; reserved modes are black.
+    """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black.
 
     Raises:
         WlmError: The package is missing.
@@ -71,20 +70,20 @@ def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool
 
 
 class Astc:
-    """ASTC in blocks of one size, by astcenc; made by `astc`."""
+    """An ASTC codec (astcenc) for one block size; created by `astc`."""
 
     def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float, ldr: bool) -> None:
         profile = codec.ASTCProfile.LDR if ldr else codec.ASTCProfile.HDR_RGB_LDR_A
         config = codec.ASTCConfig(profile, *block, 1, quality)
         if ldr:
-            config.tune_db_limit = _NO_LIMIT_DB  # HDR has no such stop
+            config.tune_db_limit = _NO_LIMIT_DB  # the HDR profile has no such limit
         self._codec, self._config, self._rows = codec, config, block[1]
-        self._idle: list[Any] = []  # contexts, each for one thread at a time
+        self._idle: list[Any] = []  # idle contexts; a context serves one thread at a time
 
     def encode(self, texels: np.ndarray) -> bytes:
-        """Encodes half [H, W, 3], finite, not negative, in LDR up to 1; astcenc repeats the border to whole blocks.
+        """Encodes half [H, W, 3], finite and not negative, in LDR at most 1; astcenc pads to whole blocks.
 
-        Threads take some rows of blocks each; the bytes are the same for any number of them.
+        Each thread encodes some rows of blocks; the result does not depend on the number of threads.
         """
         codec, (height, width) = self._codec, texels.shape[:2]
         least = self._rows * math.ceil(_TEXELS_A_THREAD / (self._rows * width))
@@ -99,7 +98,7 @@ class Astc:
         return b"".join(each(strip, range(0, height, step)))
 
     def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
-        """Decodes to half [H, W, 3]; blocks that break the format are NaN in HDR, magenta in LDR."""
+        """Decodes to half [H, W, 3]; invalid blocks become NaN in HDR and magenta in LDR."""
         codec = self._codec
         target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
         with self._context() as context:
@@ -117,13 +116,13 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
-    """Gives the codec of a setting, the same one every time.
+    """Returns the codec of a setting; equal settings share one codec.
 
     Args:
         block: One of `ASTC_BLOCKS`.
-        quality: astcenc's effort, 0 (fastest) to 100 (exhaustive); decoding is the same for all.
-        extra: The extra that a message names.
-        ldr: Whether texels are in [0, 1], linear in what is stored; else HDR.
+        quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
+        extra: Name of the optional extra for the error message.
+        ldr: Whether to use the LDR profile, for values in [0, 1]; else HDR.
 
     Raises:
         WlmError: The package is missing.
@@ -131,7 +130,7 @@ def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) 
     return _astc(need("astc_encoder", extra), block, float(quality), ldr)
 
 
-# Building a context's tables takes 15 ms.
+# Building the tables of a context takes 15 ms.
 _astc = functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))(Astc)
 
 

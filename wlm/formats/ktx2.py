@@ -1,8 +1,8 @@
-"""KTX2 files of the textures that we export: 2D, the tail of an atlas with mips, or 3D for grids of probes; none is
-supercompressed.
+"""KTX2 files: writing of 2D textures (with mips) and 3D textures without supercompression, and reading of light.
 
-Layout: the KTX file format specification 2.0; the data format descriptor: Khronos Data Format specification 1.3, the
-basic descriptor block.
+Only the largest mip of a 2D texture of light is read; arrays, cubes, volumes and formats of low range or of fewer than
+three channels are refused. Sources: KTX file format specification 2.0; for the data format descriptor, Khronos Data
+Format specification 1.3, basic descriptor block.
 """
 
 import math
@@ -31,18 +31,17 @@ VK_FORMATS = {
     "BC6H_UFLOAT_BLOCK": 143,
     "ASTC_4x4_SFLOAT_BLOCK": 1000066000,
 }
-"""The formats that can be written and their Vulkan numbers: 16 or 32 bits a channel, RGB9E5, or 16 bytes a block of 4 x
-4."""
+"""Formats that can be written, with their Vulkan numbers: 16 or 32 bits per channel, RGB9E5, or blocks of 16 bytes."""
 
 MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
-# length of the descriptor and of the key/value data; of the supercompression's data.
+# length of the descriptor, of the key/value data and of the supercompression data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
 _LEVEL = struct.Struct("<3Q")  # a level's offset, length and length without supercompression
 _BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
 _MAX_DEPTH = 2048  # slices, likewise
-_MOST_TEXELS = 2**22  # that are read: 600,000 probes
+_MOST_TEXELS = 2**22  # texels of a volume that is read: 600,000 probes
 _MOST_PAIRS = 4096  # bytes of the descriptor and the key/value data
 
 _CHANNELS = {
@@ -58,13 +57,13 @@ _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
 _FLOAT, _SIGNED, _EXPONENT = 0x80, 0x40, 0x20  # a sample's qualifiers
 _SHARED = "E5B9G9R9_UFLOAT_PACK32"
-# Its mantissa that stands for 1 at the exponent's middle, and the exponent's middle and most (section 5.21).
+# The mantissa of 1 at the middle exponent, the middle exponent and the largest exponent (section 5.21).
 _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 
 # The header and the first entry of the level index, which describes the largest level.
 _READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
-_PAIRS_BYTES = 1 << 20  # of the key/value data
-_DESCRIPTOR_BYTES = 20  # of the descriptor, up to its colours
+_PAIRS_BYTES = 1 << 20  # limit of the key/value data
+_DESCRIPTOR_BYTES = 20  # the descriptor up to its transfer function
 _TRANSFERS = (0, 1)  # unspecified, linear
 
 _LAYOUTS: dict[int, tuple[str, Layout]] = {
@@ -88,26 +87,25 @@ _NONE, _ZSTD, _ZLIB = 0, 2, 3
 def write_ktx2(
     path: str | os.PathLike[str], data: bytes, width: int, height: int, fmt: str, depth: int = 0, mips: int = 0
 ) -> int:
-    """Writes texels or blocks as a KTX2 file, whole or not at all.
+    """Writes texels or blocks as a KTX2 file, atomically.
 
     Args:
         path: The file to write; its folder must exist.
         data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
-            blocks of 16 bytes; of RGB9E5 one word of 32 bits a texel.
+            blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
-        mips: Levels after the first of a 2D texture, of half the size each, rounded down; `data` holds them one after
-            another.
+        mips: Levels after the first of a 2D texture, each of half the size rounded down; they follow in `data`.
 
     Returns:
         The number of bytes written.
 
     Raises:
-        ValueError: An unknown format, a size or a number of mips out of range, mips of a 3D texture, or data that
-            doesn't fill the texture.
-        WlmError: The file can't be written; what was there before stays.
+        ValueError: The format is unknown, a size or the number of mips is out of range, a 3D texture has mips, or the
+            data does not fill the texture.
+        WlmError: The file cannot be written; the old content stays.
     """
     if fmt not in VK_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
@@ -122,11 +120,11 @@ def write_ktx2(
     if len(data) != sum(sizes):
         raise ValueError(f"data: expected {sum(sizes)} bytes, got {len(data)}")
     descriptor = _descriptor(fmt)
-    # In the order of their keys; r, d and i: to the right, down and inwards.
+    # Sorted by key; r, d and i stand for right, down and inwards.
     pairs = _pair("KTXorientation", "rdi" if depth else "rd") + _pair("KTXwriter", "wlm")
     begin = _HEADER.size + _LEVEL.size * len(sizes)
     end = begin + len(descriptor) + len(pairs)
-    # A level begins at a multiple of both 4 and the bytes of a texel or block; the smallest comes first.
+    # A level starts at a multiple of both 4 and the bytes of a texel or block; the smallest level comes first.
     step = math.lcm(4, _texel_bytes(fmt))
     index, pieces, place = [], [], end
     for level in reversed(range(len(sizes))):
@@ -152,7 +150,7 @@ def write_ktx2(
 
 
 def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads a 3D texture of half floats in RGBA as `write_ktx2` writes it.
+    """Reads a 3D texture of RGBA half floats that `write_ktx2` wrote.
 
     Args:
         path: The file.
@@ -161,7 +159,7 @@ def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
         float16 [D, H, W, 4].
 
     Raises:
-        WlmError: The file can't be read, is another kind of texture, or is cut short.
+        WlmError: The file cannot be read, is another kind of texture, or is cut short.
     """
     head = _HEADER.size + _LEVEL.size
     largest = head + _MOST_TEXELS * 8 + _MOST_PAIRS
@@ -195,15 +193,15 @@ def _size(fmt: str, width: int, height: int) -> int:
 
 
 def _pair(key: str, value: str) -> bytes:
-    """One key and its value, with their length before and zeros to a multiple of 4 bytes behind."""
+    """Encodes one key and its value: their length, the text, and zeros up to a multiple of 4 bytes."""
     text = f"{key}\0{value}\0".encode()
     return struct.pack("<I", len(text)) + text + bytes(-len(text) % 4)
 
 
 def _descriptor(fmt: str) -> bytes:
-    """The data format descriptor: its total length and one basic descriptor block."""
+    """Returns the data format descriptor: its total length and one basic descriptor block."""
     if fmt == _SHARED:
-        # The exponent is named once for each channel.
+        # The exponent is listed once for each channel.
         shared = []
         for i, channel in enumerate(_CHANNEL_IDS[:3]):
             shared.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
@@ -216,10 +214,10 @@ def _descriptor(fmt: str) -> bytes:
     else:
         model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
         samples = [(0, 8 * _BLOCK_BYTES, 0)]
-    if fmt.endswith(("_UNORM", "_UINT")):  # what stands for 0 and for 1; an integer stands for itself
+    if fmt.endswith(("_UNORM", "_UINT")):  # the codes of 0 and of 1
         unity = 0xFFFF if fmt.endswith("_UNORM") else 1
         qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", unity)
-    else:  # of floats the range that stands for -1 or 0 to 1, as floats of 32 bits
+    else:  # the codes of -1 or 0 and of 1, as 32-bit floats
         unsigned = "UFLOAT" in fmt
         qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED
         lowest, highest = struct.pack("<f", 0.0 if unsigned else -1.0), struct.pack("<f", 1.0)
@@ -232,26 +230,26 @@ def _descriptor(fmt: str) -> bytes:
 
 def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) -> bytes:
     size = 24 + 16 * len(samples)
-    # Vendor and type; version and size; model, primaries, transfer and flags; the block's sides; bytes of a plane.
+    # Vendor and type; version and size; model, primaries, transfer and flags; block sides; bytes of a plane.
     head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, texel_bytes)
     block = struct.pack("<I 2H 4B 4B B7x", *head) + b"".join(samples)
     return struct.pack("<I", 4 + size) + block
 
 
 def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest level of a KTX2 file of light, plain or under zstd or zlib.
+    """Reads the largest level of a KTX2 file of light, plain or compressed by zstd or zlib.
 
-    `KTXorientation` is honoured: the pixels' first row is the top one.
+    The first row of the result is the top one, whatever `KTXorientation` states.
 
     Args:
         path: The file.
 
     Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channels' names. Of ASTC the alpha is left out.
+        The pixels, float32 [H, W, 3 or 4], and the channel names. The alpha of ASTC is ignored.
 
     Raises:
-        WlmError: The file is missing, not a KTX2, cut short or damaged, of another format, an array, a cube or a
-            volume, its channels are exchanged or not linear, or the package that unpacks it is missing.
+        WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
+            cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
     """
     with open_file(path, "the KTX2 file") as file:
         held = os.fstat(file.fileno()).st_size
@@ -285,7 +283,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
                 raise WlmError(
                     f"{path}: {field} of level 0: expected {expected}, of {width} x {height} {name}, found {found}"
                 )
-        if stored > 2 * expected + 1024:  # no packer makes it longer than that
+        if stored > 2 * expected + 1024:  # no compressor expands data further
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
         _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
         words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
@@ -307,7 +305,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
 def _part(
     path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
 ) -> bytes:
-    """Reads a part of the file, its first bytes alone where it has more than `most`."""
+    """Reads a part of the file, at most its first `most` bytes."""
     if start + size > held:
         raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
     file.seek(start)
@@ -318,7 +316,7 @@ def _part(
 
 
 def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
-    """Checks that the light is linear: its size, a block's kind and size, then model, primaries and transfer."""
+    """Checks that the transfer function in the data format descriptor is linear."""
     if len(data) < _DESCRIPTOR_BYTES:
         raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
     transfer = data[14]
@@ -327,7 +325,7 @@ def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
-    """Whether columns go to the right and rows down, as they do without a word; checks the order of channels."""
+    """Returns whether columns go right and rows go down, the defaults, and checks the order of the channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
     while at < len(data):

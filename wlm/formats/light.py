@@ -1,4 +1,4 @@
-"""Pictures of light, as bakers and engines hand them over: EXR, Radiance, KTX2 and DDS, told apart by their content."""
+"""Reading of pictures of light from bakers and engines: EXR, Radiance, KTX2 and DDS, recognised by their content."""
 
 import os
 
@@ -11,10 +11,10 @@ from wlm.formats.exr import read_exr
 from wlm.formats.reading import open_file
 
 SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds")
-"""The usual ends of their names, by which they are found in a folder."""
+"""Suffixes by which pictures of light are found in a folder."""
 
 EXPECTED = "EXR, Radiance (.hdr), KTX2 or DDS"
-"""What they are, for messages."""
+"""Names of the formats, for messages."""
 
 _READERS = {
     EXR_MAGIC: read_exr,
@@ -22,21 +22,21 @@ _READERS = {
     ktx2.MAGIC: ktx2.read_ktx2,
     dds.MAGIC: dds.read_dds,
 }
-# Of others that are taken for light, for the message.
+# Formats that users mistake for light, with the message.
 _OTHERS = {
-    b"\x89PNG": "a PNG: its 8 or 16 bits don't say what light they stand for",
-    b"\xff\xd8\xff": "a JPEG: its 8 bits don't say what light they stand for",
+    b"\x89PNG": "a PNG, whose encoding of light is unknown",
+    b"\xff\xd8\xff": "a JPEG, whose encoding of light is unknown",
     b"\xabKTX 11": "a KTX file of version 1",
     b"II*\0": "a TIFF",
     b"MM\0*": "a TIFF",
 }
-_FIRST = 12  # bytes that tell
+_FIRST = 12  # bytes that identify a format
 
 
 def read_light(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture of linear light, whatever its name ends in.
+    """Reads a picture of linear light, whatever its suffix.
 
-    Values come as they are in the file, NaN, Inf and negative ones too: the caller checks what it can't use.
+    Values are returned unchanged, including NaN, infinity and negative ones: the caller checks them.
 
     Args:
         path: The file.
@@ -46,7 +46,7 @@ def read_light(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...
         ("R", "G", "B", "A").
 
     Raises:
-        WlmError: The file is missing, of another kind, cut short or damaged, as the reader of its kind says.
+        WlmError: The file is missing, of another kind, cut short or damaged.
     """
     with open_file(path, "the lightmap") as file:
         first = file.read(_FIRST)

@@ -1,108 +1,106 @@
-"""What readers take at most: bounds on the work and the memory that a file can ask for.
+"""Limits of readers: bounds on the work and the memory that a file can demand.
 
-Honest inputs pass: lightmaps of 16384 x 16384, meshes of ten million vertices, a million probes, volumes of 1024^3
-voxels. What a file claims beyond a size that any machine holds must be in the file: compressed data may grow by a
-stated factor, and no more. `trust=True` of the loaders, `--trust` of the commands, lifts what the table of
-`docs/limits.md` says; the two state the same numbers.
+Realistic inputs pass: lightmaps of 16384 x 16384, meshes of ten million vertices, a million probes, volumes of 1024^3
+voxels. Beyond a size that any machine can store, a claimed size must be backed by bytes of the file: compressed data
+may grow by at most a stated factor. `trust=True` of the loaders (`--trust` of the commands) lifts the limits that the
+table in `docs/limits.md` marks; the table states the same numbers.
 """
 
 from wlm.errors import WlmError
 
 SETTINGS_BYTES = 64 << 10
-"""Of a YAML file: settings have some kilobytes, a path of a thousand positions 40, and the parser is slow."""
+"""Largest YAML file. Settings have some kilobytes, a path of a thousand positions 40, and the parser is slow."""
 
 INTEGER = 1 << 63
-"""Integers of settings are below it, either way: beyond, arrays and counters can't hold them."""
+"""Bound of the magnitude of integers in settings; larger ones do not fit arrays and counters."""
 
 INDEX_BYTES = 64 << 20
-"""Of JSON that describes other files: `set.json`, `scene.json`, indices of exports, rows of the bench."""
+"""Largest JSON file that describes other files: `set.json`, `scene.json`, indices of exports, benchmark rows."""
 
 JSON_BYTES = 512 << 20
-"""Of JSON with the numbers themselves: a million probes with 27 numbers, or a glTF tree with its buffers in it."""
+"""Largest JSON file of data: a million probes with 27 numbers, or a glTF tree with embedded buffers."""
 
 BAKE_BYTES = 1 << 30
-"""Of a Godot bake: a probe has 156 bytes, and its tetrahedra and BSP tree some hundred."""
+"""Largest Godot bake. A probe has 156 bytes, and its tetrahedra and BSP tree some hundred."""
 
 MODEL_BYTES = 2 << 30
-"""Of an OBJ, PLY, STL or OFF file: ten million vertices of an OBJ have about 1.5 GB."""
+"""Largest OBJ, PLY, STL or OFF file. Ten million vertices of an OBJ take about 1.5 GB."""
 
 MESH_BYTES = (4 << 30) - 1
-"""Of a `.glb`, whose format allows no more, and of a buffer or an image beside a glTF file."""
+"""Largest `.glb`, by its format, and largest buffer or image beside a glTF file."""
 
 VOLUME_BYTES = 16 << 30
-"""Of a `.npz`, `.nvdb` or `.vdb`: 1024^3 voxels in float64 have 8.6 GB, twice that with their temperatures."""
+"""Largest `.npz`, `.nvdb` or `.vdb`: 1024^3 voxels in float64 take 8.6 GB, twice that with temperatures."""
 
 GROWTH = 256
-"""Bytes that a compressed byte may become. Zeros become 1,032 under deflate, honest arrays some ten."""
+"""Largest expansion of compressed data. Zeros expand 1,032 times under deflate, realistic arrays about ten times."""
 
 SURE_BYTES = 64 << 20
-"""Bytes that compressed data may become however small it is."""
+"""Decompressed bytes that are allowed for any size of compressed data."""
 
 CORNERS_A_BYTE = 8
-"""Corners and vertices of a drawn glTF mesh for a byte of the file and its buffers. Without instances it is below 1."""
+"""Drawn corners and vertices of a glTF file per byte of the file and its buffers; below 1 without instances."""
 
 SURE_CORNERS = 4 << 20
-"""The same of a file however small."""
+"""Drawn corners and vertices that are allowed for any size of file."""
 
 CORNERS = 1 << 28
-"""The same of any file."""
+"""Largest number of drawn corners and vertices."""
 
 PICTURE_SIDE = 65_536
-"""Texels along a side of a lightmap's file: EXR, Radiance, KTX2, DDS."""
+"""Longest side of a lightmap file (EXR, Radiance, KTX2, DDS), in texels."""
 
 PICTURE_TEXELS = 1 << 28
-"""Texels of one: 16384 x 16384, the largest texture of most GPUs."""
+"""Most texels of a lightmap file: 16384 x 16384, the largest texture of most GPUs."""
 
 PICTURE_GROWTH = 2048
-"""Bytes of pixels, as half floats, that a byte of one may become. Black ones become 950 under ZIP."""
+"""Largest expansion of a lightmap file to half floats. Black pixels expand 950 times under ZIP."""
 
 PICTURE_BYTES = 256 << 20
-"""The same of one however small it is: 6000 x 6000 black texels under any compression."""
+"""Bytes of half floats that are allowed for any size of file: 6000 x 6000 black texels under any compression."""
 
 IMAGE_BYTES = 2 << 30
-"""Of a PNG or TGA: 16384 x 16384 texels of 8 bytes."""
+"""Largest PNG or TGA: 16384 x 16384 texels of 8 bytes."""
 
 VIDEO_GROWTH = 4096
-"""Bytes of a video's pictures, 6 for a texel, that a byte of it may become: 0.012 bits a texel. One that stands still
-takes less."""
+"""Largest expansion of a video to pictures of 6 bytes per texel: 0.012 bits per texel."""
 
 VIDEO_BYTES = 256 << 20
-"""The same of one however small it is."""
+"""Bytes of pictures that are allowed for any size of video."""
 
 TIMES = 100_000
-"""Lightmaps of a set."""
+"""Most lightmaps of a set."""
 
 FRAMES = 1 << 30
-"""Bytes of a set's lightmaps in memory that they may have however small their files are."""
+"""Decoded bytes of a set of lightmaps that are allowed for any size of its files."""
 
 VOXELS = 1 << 30
-"""Voxels of a volume: 1024^3."""
+"""Most voxels of a volume: 1024^3."""
 
 SURE_VOXELS = 1 << 27
-"""Voxels that a volume may have however small its file is: 512^3, for a simulation's frames without smoke."""
+"""Voxels that are allowed for any size of file: 512^3, for frames of a simulation without smoke."""
 
 SURE_BOX = 1 << 24
-"""Voxels that the box of a VDB grid may have however small the grid is: 256^3."""
+"""Voxels of the bounding box of a VDB grid that are allowed for any size of grid: 256^3."""
 
 VOXELS_A_BYTE = 64
-"""Voxels in the box of a NanoVDB grid for a byte of the grid, or of a `.vdb` for one of the file: 1 of 256 may be
-stored."""
+"""Voxels of the bounding box per byte of a NanoVDB grid or of a `.vdb` file: 1 of 256 voxels may be stored."""
 
 RESAMPLED = 8
-"""Cubic voxels that a voxel of another shape may become."""
+"""Most cubic voxels into which a non-cubic voxel is resampled."""
 
 PROBES = 1 << 24
-"""Probes of a set."""
+"""Most probes of a set."""
 
 NUMBERS = 4096
-"""Numbers of a probe: colours of spherical harmonics up to the 36th order. Kernels are compiled for their number."""
+"""Most numbers per probe: spherical harmonics in RGB up to order 36. Kernels are compiled for the number."""
 
 
 def check_sides(where: str, width: int, height: int) -> None:
-    """Checks the size that a picture claims.
+    """Checks the claimed size of a picture.
 
     Raises:
-        WlmError: It has more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
+        WlmError: The picture has more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
     """
     if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
         raise WlmError(
@@ -111,16 +109,17 @@ def check_sides(where: str, width: int, height: int) -> None:
 
 
 def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure: int = SURE_BYTES) -> None:
-    """Checks what compressed data says that it becomes.
+    """Checks the claimed size of decompressed data.
 
     Args:
         where: The file and the field.
-        small, large: Bytes as stored, and as they would become.
-        growth: Bytes that a byte may become.
-        sure: Bytes that are allowed however few are stored.
+        small: Compressed size, in bytes.
+        large: Claimed decompressed size, in bytes.
+        growth: Largest allowed expansion.
+        sure: Decompressed bytes that are allowed for any compressed size.
 
     Raises:
-        WlmError: It is more.
+        WlmError: The claimed size is larger.
     """
     if large > max(sure, growth * small):
         raise WlmError(

@@ -1,11 +1,10 @@
-"""Locks that fall away with their process: on an output while it is written, and on what a write has in the making.
+"""Locks that the system releases when their process ends: on outputs while they are written, and on temporary files.
 
-What is in the making has a name such as `.wlm-0123456789abcdef-0123456789abcdef.tmp`, beside its destination: a hash of
-the destination's name, and a random number. Its maker holds a lock on it, so one without a lock was left by a process
-that was killed, and the next write to that destination removes it.
+A temporary file is beside its destination and has a name such as `.wlm-0123456789abcdef-0123456789abcdef.tmp`: a hash
+of the name of the destination, and a random number. Its process locks it, so a temporary file without a lock was left
+by a killed process, and the next write to that destination removes it.
 
-Where the system has no such locks (Windows, some file systems of networks) there are none: nobody is kept from an
-output, and nothing is removed.
+On systems without such locks (Windows, some network file systems) outputs are not protected and nothing is removed.
 """
 
 import hashlib
@@ -26,25 +25,25 @@ except ImportError:
     fcntl = None
 
 _PASSING = re.compile(r"\.wlm-[0-9a-f-]+\.(tmp|lock)")
-_held: Counter[Path] = Counter()  # outputs that this process has locked, and how many times
+_held: Counter[Path] = Counter()  # how many times this process has locked each output
 
 
 def is_passing(name: str) -> bool:
-    """Whether a file's name is that of a lock or of what is in the making: nothing that a folder holds."""
+    """Whether a file name is that of a lock or of a temporary file, which is no content of a folder."""
     return _PASSING.fullmatch(name) is not None
 
 
 @contextmanager
 def locked(output: str | os.PathLike[str]) -> Iterator[None]:
-    """Keeps other processes from writing an output, and removes what killed ones left of it.
+    """Locks an output against other processes, and removes temporary files that killed processes left.
 
-    The lock is on a file beside the output that is gone at the end. Within one process locks may be nested.
+    The lock is on a file beside the output, which is removed at the end. Locks may be nested within one process.
 
     Args:
         output: A file or a folder; it need not exist.
 
     Raises:
-        WlmError: Another process has the lock.
+        WlmError: Another process holds the lock.
     """
     target = Path(os.path.realpath(output))
     lock = target.parent / f"{_stem(target)}.lock"
@@ -58,7 +57,7 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
     finally:
         _held[target] -= 1
         if handle is not None:
-            # Before it is released: otherwise it could be another process's by then.
+            # The file is removed before its lock is released; later, it could be the lock of another process.
             with suppress(OSError):
                 lock.unlink()
             os.close(handle)
@@ -66,17 +65,17 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Makes an empty file or folder beside its destination, and removes it at the end if it is still there.
+    """Makes an empty file or folder beside its destination, and removes it at the end if it still exists.
 
     Args:
         target: The destination, without links.
-        folder: Whether it is a folder.
+        folder: Whether to make a folder.
 
     Yields:
-        Its path. The name is short: the destination's may already be as long as the system allows.
+        The path. Its name is short, since the name of the destination may have the longest length allowed.
 
     Raises:
-        OSError: It can't be made.
+        OSError: The file or folder cannot be made.
     """
     sweep(target)
     handle = None
@@ -84,7 +83,7 @@ def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
         while True:
             path = target.parent / f"{_stem(target)}-{secrets.token_hex(8)}.tmp"
             handle = _make(path, folder)
-            # Another process may have taken it for a dead one's before it was locked.
+            # Another process may have removed it as abandoned before it was locked.
             if path.exists():
                 break
             if handle is not None:
@@ -98,7 +97,7 @@ def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def sweep(target: Path) -> None:
-    """Removes what killed processes left of writing to a file or folder: beside it, and in the folder."""
+    """Removes the temporary files that killed processes left beside a file or folder and in the folder."""
     stem = _stem(target)
     for parent, prefix in ((target.parent, f"{stem}-"), (target, ".wlm-")):
         with suppress(OSError):
@@ -112,12 +111,12 @@ def _stem(target: Path) -> str:
 
 
 def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
-    """Locks a file, which is made if it isn't there; None where that can't be."""
+    """Locks a file, which is made if it does not exist; returns None if that is impossible."""
     while fcntl is not None:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError:
-            # Writing will say what is wrong with the folder.
+            # Writing the output will report the problem.
             return None
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,9 +124,9 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
                 return handle
         except BlockingIOError:
             os.close(handle)
-            raise WlmError(f"{output}: is being written by another process") from None
+            raise WlmError(f"{output}: another process is writing it") from None
         except FileNotFoundError:
-            # Its holder ended, and took it along, after it was opened.
+            # Its owner removed it after it was opened here.
             os.close(handle)
             continue
         except OSError:
@@ -139,12 +138,12 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
 
 
 def _make(path: Path, folder: bool) -> int | None:
-    """Makes a file or folder and locks it; returns the lock's handle, None where there are no locks."""
+    """Makes a file or folder and locks it; returns the handle of the lock, or None without locks."""
     if folder:
         path.mkdir()
     else:
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-    # Windows renames no file that is open.
+    # Windows cannot rename an open file.
     if fcntl is None:
         return None
     handle = None
@@ -155,7 +154,7 @@ def _make(path: Path, folder: bool) -> int | None:
 
 
 def _remove_if_dead(path: Path) -> None:
-    """Removes a file or folder in the making whose process is gone."""
+    """Removes a temporary file or folder whose process has ended."""
     if fcntl is None:
         return
     with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Masks of lightmaps: PNGs that say which texels belong to a chart."""
+"""Masks of lightmaps: PNGs that mark the texels of charts."""
 
 import io
 import os
@@ -30,30 +30,30 @@ DAMAGED_PICTURE = (
     zlib.error,
     Image.DecompressionBombError,
 )
-"""What Pillow raises on a picture that is none, or damaged."""
+"""Exceptions that Pillow raises for a damaged picture or other content."""
 
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
-    """Reads a PNG as [H, W] bool: valid where any colour channel is above 0.
+    """Reads a PNG as bool [H, W]: valid where any colour channel is above 0.
 
     Args:
         path: The PNG.
-        beside: The lightmap whose size it must have; for the message.
-        size: Its rows and columns.
-        others: What else than a PNG is expected, for the message of one that isn't there.
+        beside: The lightmap of the mask, for messages.
+        size: Expected rows and columns.
+        others: Alternatives to a PNG, for the message of a missing file.
 
     Raises:
-        WlmError: It is missing, damaged or of another size.
+        WlmError: The mask is missing, damaged or of another size.
     """
     data = read_file(path, IMAGE_BYTES, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})")
     try:
-        # Not `Image.open`: it would try other formats' readers too, and refuses masks of 16384 x 16384. Of a file on
-        # disk it would make room for as many bytes as a chunk claims to have.
+        # `Image.open` would try the readers of other formats and refuse masks of 16384 x 16384. From a file on disk,
+        # Pillow would allocate the claimed size of a chunk.
         with PngImageFile(io.BytesIO(data)) as image:
-            # The header's size first: a wrong one need not be decoded.
+            # The size in the header is checked before anything is decoded.
             if (image.height, image.width) != size:
                 raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
-            # A palette's index says nothing; an alpha channel is not coverage here.
+            # The index of a palette has no meaning here, and alpha is not coverage.
             colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
     except DAMAGED_PICTURE as error:
         problem = str(error) or type(error).__name__
@@ -62,10 +62,10 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
 
 
 def write_mask(path: str | os.PathLike[str], mask: np.ndarray) -> None:
-    """Writes a mask, bool [H, W], as a PNG of one bit a texel, whole or not at all.
+    """Writes a mask, bool [H, W], as a PNG of one bit per texel, atomically.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     with atomic_path(path) as temporary:
         Image.fromarray(np.asarray(mask, bool)).save(temporary, format="PNG")

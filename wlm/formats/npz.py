@@ -1,6 +1,6 @@
-"""Reading `.npz` files: named arrays in a ZIP file. What each claims to be is looked at before it is inflated.
+"""Reading of `.npz` files, named arrays in a ZIP file, whose headers are checked before they are inflated.
 
-Arrays above `wlm.formats.scratch.IN_MEMORY` lie in a file without a name.
+Arrays above `wlm.formats.scratch.IN_MEMORY` are mapped from an unnamed temporary file.
 """
 
 import io
@@ -32,15 +32,15 @@ def read_npz(
 
     Args:
         path: The file.
-        choose: Takes the names of the arrays and gives those to be read. It may raise WlmError.
+        choose: Selects from the names of the arrays. It may raise WlmError.
         numbers: Most numbers of an array.
-        sure: Bytes that an array may have however few are stored; see `check_growth`.
+        sure: Bytes of an array that are allowed for any compressed size; see `check_growth`.
 
     Returns:
-        The chosen arrays by name. None of them is an array of Python objects.
+        The selected arrays by name. None of them has Python objects.
 
     Raises:
-        WlmError: The file is missing, damaged or no `.npz`, or an array claims to be larger than it may be.
+        WlmError: The file is missing, damaged or not a `.npz` file, or an array exceeds the limits.
     """
     try:
         with open_file(path, "the arrays") as file:
@@ -58,15 +58,14 @@ def read_npz(
                 return arrays
     except WlmError:
         raise
-    # Whatever a stranger's file can make zipfile and NumPy raise, and that is nearly anything: they parse its header
-    # as Python.
+    # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     except Exception as error:
         raise WlmError(f"{path}: cannot read the arrays: {str(error) or type(error).__name__}") from error
 
 
 def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, sure: int) -> np.ndarray:
     with archive.open(info) as member:
-        # NumPy would inflate a header of any length before it looks at it.
+        # NumPy would inflate a header of any length before it checks it.
         begin = io.BytesIO(member.read(_PIECE))
         shape, by_columns, dtype = _header(where, begin)
         count = math.prod(shape)
@@ -82,17 +81,17 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
         while piece and len(piece) <= len(unfilled):
             unfilled[: len(piece)] = piece
             unfilled = unfilled[len(piece) :]
-            # At the member's end this compares its checksum.
+            # At the end of the member, zipfile compares the checksum.
             piece = member.read(_PIECE)
         if piece or unfilled:
             raise WlmError(f"{where}: the array is {'longer' if piece else 'shorter'} than its file states")
         if dtype.kind == "U":
-            flat.tolist()  # what is no character fails here, not when it is used
+            flat.tolist()  # invalid characters fail here rather than at their first use
     return flat.reshape(shape, order="F" if by_columns else "C")
 
 
 def _header(where: str, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether it is stored by columns, and type."""
+    """Returns the shape, whether the order is Fortran's, and the type."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:

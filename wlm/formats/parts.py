@@ -1,7 +1,7 @@
-"""A file's parts held against a table: their types, shapes and ranges, before anything is made of them.
+"""Validation of the parts of a file against a table of types, shapes and ranges, before they are used.
 
-The digest of an artifact says that it is whole, not who made it: anyone can write one that fits. So what a part holds
-is believed no more than a file without a digest would be.
+The digest of an artifact detects damage but not malice, since anyone can compute it. So the content of a part is
+trusted no more than that of a file without a digest.
 """
 
 from collections.abc import Mapping
@@ -11,18 +11,18 @@ import numpy as np
 
 from wlm.errors import one_line
 
-_PIECE = 1 << 20  # numbers that are looked at in one go, so that a mask of a large part takes no memory to speak of
+_PIECE = 1 << 20  # numbers checked at once, which bounds the memory of masks
 
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a file: a row of its table of parts.
+    """One row of the table of parts of a file.
 
     Attributes:
-        dtype: NumPy type, or the types of which it is one.
-        shape: Sizes; None where any size will do. A part with a size of 0 is left out of the file.
-        optional: Whether the file may lack it; it is then empty along its first axis.
-        least, most: Bounds of its numbers; None: any. NaN is within none.
+        dtype: NumPy type, or the allowed types.
+        shape: Sizes; None for any size. A part with a size of 0 is left out of the file.
+        optional: Whether the file may lack the part, which is then empty along its first axis.
+        least, most: Bounds of the numbers, or None. NaN violates any bound.
         finite: Whether floats must be finite.
     """
 
@@ -38,23 +38,23 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
     """Checks the tensors of a file against its table of parts.
 
     Args:
-        tensors: By name, as read.
-        table: By name, all parts that the file may have.
+        tensors: The tensors by name.
+        table: All parts that the file may have, by name.
 
     Returns:
-        Every part of the table; those that the file leaves out are empty.
+        Every part of the table; parts that the file leaves out are empty.
 
     Raises:
-        ValueError: A part is none of the table, is missing, of another type or shape, holds NaN or infinity, or is out
-            of its range.
+        ValueError: A part is unknown, is missing, has another type or shape, contains NaN or infinity, or is out of
+            range.
     """
     if extra := tensors.keys() - table.keys():
-        raise ValueError(f"part {one_line(min(extra), 60)} is none of the file's")
+        raise ValueError(f"part {one_line(min(extra), 60)} is unknown")
     return {name: check_part(tensors, name, part) for name, part in table.items()}
 
 
 def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.ndarray:
-    """Checks one tensor of a file, as `check_parts`: for those that say how large the others are."""
+    """Checks one tensor of a file like `check_parts`, for parts that determine the shapes of other parts."""
     kinds = part.dtype if isinstance(part.dtype, tuple) else (part.dtype,)
     value = tensors.get(name)
     if value is None:
@@ -76,7 +76,7 @@ def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.n
         raise ValueError(f"part {name}: expected finite numbers, found NaN or infinity")
     if value.size and (part.least is not None or part.most is not None):
         low, high = np.minimum.reduce(value, axis=None), np.maximum.reduce(value, axis=None)
-        # This way round NaN is out of range.
+        # The negated comparison makes NaN out of range.
         if part.least is not None and not low >= part.least:
             raise ValueError(f"part {name}: expected {_range(part)}, found {low:g}")
         if part.most is not None and not high <= part.most:
@@ -85,7 +85,7 @@ def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.n
 
 
 def all_finite(value: np.ndarray) -> bool:
-    """Whether an array holds neither NaN nor infinity."""
+    """Whether an array has neither NaN nor infinity."""
     if value.dtype.kind != "f":
         return True
     if value.size <= _PIECE:

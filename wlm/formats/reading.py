@@ -1,4 +1,4 @@
-"""Files from strangers: opened once, regular files only, read up to a stated size; and what a file may name."""
+"""Safe reading of untrusted files: opened once, regular files only, up to a stated size; and references to files."""
 
 import json
 import os
@@ -11,35 +11,35 @@ from typing import Any, BinaryIO
 from wlm.errors import WlmError
 from wlm.formats.limits import INDEX_BYTES
 
-# Windows lacks the first two: there, no name of a file blocks. The last keeps its bytes as they are.
+# Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
-_LONGEST_NAME = 1024  # characters; systems allow 255 between two slashes
+_LONGEST_NAME = 1024  # characters; systems allow 255 for each component
 
 
 @contextmanager
 def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
-    """Opens a regular file; what the system refuses in the block is a line that names it too.
+    """Opens a regular file; system errors inside the block become one-line errors that name it.
 
     Args:
         path: The file. Links are followed.
-        what: What is read, for messages: "the OBJ file".
+        what: Description of the file for messages, for example "the OBJ file".
 
     Yields:
         The open file.
 
     Raises:
-        WlmError: It is missing, a folder, a device or a pipe, or can't be read.
+        WlmError: The file is missing, is a folder, a device or a pipe, or cannot be read.
     """
     try:
-        # Without blocking: a pipe that nobody writes to would never open.
+        # Opened without blocking, since a pipe without a writer would never open.
         handle = os.open(path, _FLAGS)
     except OSError as error:
         raise WlmError(f"{path}: cannot read {what}: {error.strerror or error}") from error
-    except ValueError as error:  # a NUL, or half a character
-        raise WlmError(f"{path}: cannot read {what}: no file can have that name") from error
+    except ValueError as error:  # a NUL or an unpaired surrogate
+        raise WlmError(f"{path}: cannot read {what}: a file cannot have that name") from error
     try:
-        # Checked once it is open: until then, the name could be given to another file.
+        # Checked after opening: before, the name could be given to another file.
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise WlmError(f"{path}: cannot read {what}: expected a file, found a folder, a device or a pipe")
         with os.fdopen(handle, "rb", closefd=False) as file:
@@ -55,15 +55,15 @@ def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | 
 
     Args:
         path: The file.
-        limit: Most bytes that it may have.
-        what: What is read, for messages.
-        first: Bytes to read from its beginning, no more than it has; None: all.
+        limit: Most bytes to read.
+        what: Description of the file for messages.
+        first: Number of bytes to read from the start; None: all.
 
     Returns:
-        Its bytes.
+        The bytes.
 
     Raises:
-        WlmError: As `open_file`; or the file is larger than the limit, shorter than `first`, or changes meanwhile.
+        WlmError: See `open_file`; or the file is larger than the limit, shorter than `first`, or changes meanwhile.
     """
     with open_file(path, what) as file:
         size = os.fstat(file.fileno()).st_size
@@ -72,7 +72,7 @@ def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | 
         wanted = size if first is None else first
         if wanted > limit:
             raise WlmError(f"{path}: cannot read {what}: expected at most {limit} bytes, found {wanted}")
-        # One more than it has, to see that it has no more.
+        # One byte more than the size, to detect that the file grows.
         data = file.read(wanted + (first is None))
     if len(data) != wanted:
         raise WlmError(f"{path}: cannot read {what}: expected {wanted} bytes, found another number: does it change?")
@@ -84,11 +84,11 @@ def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_B
 
     Args:
         path: The file.
-        what: What is read, for messages.
-        limit: Most bytes that it may have.
+        what: Description of the file for messages.
+        limit: Most bytes to read.
 
     Raises:
-        WlmError: As `read_file`, or it isn't JSON.
+        WlmError: See `read_file`; or the content is not JSON.
     """
     data = read_file(path, limit, what)
     try:
@@ -98,32 +98,32 @@ def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_B
 
 
 def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool = False) -> Path:
-    """Gives the file that a document names, which has to lie in the document's folder, links resolved.
+    """Returns the path of a file that a document names, which must be inside the document's folder, links resolved.
 
-    A document from a stranger could otherwise have any file of the machine read, and copied into what is written.
+    An untrusted document could otherwise make this package read any file and copy it into an output.
 
     Args:
-        document: The file that names another.
-        name: Relative to the document's folder.
+        document: The file that names another file.
+        name: Path relative to the folder of the document.
         where: The document and its field, for messages.
-        trust: Whether the file may lie elsewhere.
+        trust: Whether the file may be outside the folder.
 
     Raises:
-        WlmError: It lies elsewhere.
+        WlmError: The file is outside the folder.
     """
     if len(name) > _LONGEST_NAME:
         raise WlmError(f"{where}: expected a name of at most {_LONGEST_NAME} characters, found {len(name)}")
     folder = Path(document).parent
     path = folder / name
     try:
-        # Nearly all are plain names, for which one look at the disk is enough.
+        # Nearly all names are plain, for which one access to the disk is enough.
         plain = name not in (".", "..") and os.path.basename(name) == name and not os.path.islink(path)
         inside = trust or plain or path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a NUL in it, links in a circle
+    except (OSError, ValueError, RuntimeError) as error:  # a name that is too long or has a NUL, or a cycle of links
         raise WlmError(f"{where}: cannot follow the name {name}: {error}") from error
     if not inside:
         raise WlmError(
-            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust of commands that have it) "
-            "allows it, where the author is trusted"
+            f"{where}: expected a file within {folder}, found {name}; trust=True (--trust on the command line) "
+            "allows files elsewhere, for documents from a trusted author"
         )
     return path

@@ -1,4 +1,4 @@
-"""Arrays that need not fit in memory: large ones lie in a file without a name, which is gone with the process."""
+"""Arrays that may exceed the memory: large ones are mapped from an unnamed file, which vanishes with the process."""
 
 import math
 import mmap
@@ -10,29 +10,29 @@ import numpy as np
 from wlm.errors import WlmError
 
 IN_MEMORY = 1 << 30
-"""Bytes of an array that are held in memory; a larger one is in a file of the folder for temporary files (TMPDIR)."""
+"""Largest array in memory, in bytes; a larger one is mapped from a file in the temporary folder (TMPDIR)."""
 
 _PIECE = 1 << 24
 
 
 def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str, beside: int = 0) -> np.ndarray:
-    """Makes an array of zeros, in memory or in a file that is mapped.
+    """Makes an array of zeros, in memory or mapped from a file.
 
-    The system writes parts of a mapped array to the disk and drops them from memory when that is short. The file has no
-    name, so that nothing is left of it however the process ends, and all of its space is taken at once: a disk that
-    fills up later would end the process without a word.
+    The system moves parts of a mapped array to the disk when memory is short. The file has no name, so that nothing
+    remains however the process ends. All of its space is allocated at once, since a disk that fills up later would end
+    the process without a message.
 
     Args:
-        shape: Of the array.
-        dtype: Of its values.
-        where: What it is for, for messages.
-        beside: Bytes of other arrays that are needed with it: they count too.
+        shape: Shape of the array.
+        dtype: Type of its values.
+        where: Purpose of the array for messages.
+        beside: Bytes of other arrays that count towards the limit.
 
     Returns:
-        A plain array of that shape, written and read as any other.
+        An ordinary array.
 
     Raises:
-        WlmError: Memory or the disk hasn't that much room.
+        WlmError: The memory or the disk is too small.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     try:
@@ -49,7 +49,7 @@ def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str,
 
 
 def _fill(handle: int, size: int) -> None:
-    """Takes the space of a file, as zeros."""
+    """Allocates the space of a file, filled with zeros."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, size)
         return

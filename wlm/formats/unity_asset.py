@@ -1,9 +1,8 @@
-"""Unity's `LightingData.asset` and `LightProbes.asset`: light probes, and where renderers are in lightmaps.
+"""Reading of light probes and lightmap rectangles from Unity's `LightingData.asset` and `LightProbes.asset`.
 
-UnityPy (extra `unity`) reads the list of objects and how each is laid out, which the file says itself, in a process of
-its own (`unity_child`). The objects are read here: UnityPy makes room for as many values as a file claims. Only binary
-assets: Unity writes lighting data so whatever a project's serialization mode is.
-"""
+UnityPy (extra `unity`) lists the objects and their layouts, which the file contains, in a separate process
+(`unity_child`). The objects are read here, since UnityPy allocates as many values as a file claims. Only binary assets
+are read: Unity writes lighting data in binary whatever the serialization mode of the project."""
 
 import json
 import os
@@ -24,12 +23,12 @@ from wlm.formats.reading import read_file
 
 _EXTRA = "unity"
 _BYTES = 1 << 28
-_SECONDS = 60.0  # on a busy machine; of computing it gets less
-_MOST_STEPS = 1 << 17  # values and arrays that are stepped over one by one: real files have some dozens
+_SECONDS = 60.0  # wall-clock limit of the process; its CPU time is limited further
+_MOST_STEPS = 1 << 17  # values and arrays that are skipped one by one; real files have some dozens
 _COEFFICIENTS, _CHANNELS = 9, 3
-_NO_LIGHTMAP = 65534  # from this number on the renderer has none
+_NO_LIGHTMAP = 65534  # indices from here on mean that the renderer has no lightmap
 _TEXT, _BUNDLE = b"%YAML", b"Unity"
-_ALIGNED = 0x4000  # flag of a value: what follows begins at a multiple of 4 bytes
+_ALIGNED = 0x4000  # flag of a value: the next one starts at a multiple of 4 bytes
 _NUMBERS = {
     "bool": "u1",
     "char": "u1",
@@ -58,11 +57,11 @@ _WANTED = {"LightProbes": {_POSITIONS, _LIGHT}, "LightingDataAsset": {_RENDERERS
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Where a renderer is in its lightmap.
+    """The rectangle of a renderer in its lightmap.
 
     Attributes:
-        lightmap: The number of the lightmap.
-        scale_offset: `lightmapScaleOffset`: UV times the first two, plus the last two, v up.
+        lightmap: Index of the lightmap.
+        scale_offset: `lightmapScaleOffset`: UVs are scaled by the first two numbers and offset by the last two, v up.
     """
 
     lightmap: int
@@ -71,12 +70,12 @@ class Rectangle:
 
 @dataclass(frozen=True, eq=False)
 class LightingData:
-    """What an asset holds.
+    """Content of an asset.
 
     Attributes:
-        position: float64 [N, 3], of the light probes, in Unity's axes.
-        values: float64 [N, 9, 3], numbers of `SphericalHarmonicsL2`.
-        rectangles: Of the renderers with a lightmap, in the file's order; it has no names of them.
+        position: float64 [N, 3], positions of the light probes in Unity's axes.
+        values: float64 [N, 9, 3], coefficients of `SphericalHarmonicsL2`.
+        rectangles: The rectangles of the renderers with a lightmap, in the order of the file, which has no names.
     """
 
     position: np.ndarray
@@ -88,7 +87,7 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     """Reads an asset.
 
     Raises:
-        WlmError: UnityPy is missing; or the file is, or is damaged, text, a bundle or of something else.
+        WlmError: UnityPy is missing; or the file is missing, damaged, text, a bundle or without lighting data.
     """
     need("UnityPy", _EXTRA)
     data = read_file(path, _BYTES, "the asset")
@@ -123,25 +122,25 @@ _NAMES = [f"sh[{i:2d}]" for i in range(_COEFFICIENTS * _CHANNELS)]
 
 
 def _damaged(path: str | os.PathLike[str], read: Callable[[], Any]) -> Any:
-    """Calls a function, and says in a line where it meets what it can't read."""
+    """Calls a function and turns the exceptions of damaged data into one-line errors."""
     try:
         return read()
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error) as error:
         reason = one_line(f"{type(error).__name__}: {error}", 120)
-        raise WlmError(f"{path}: the asset is damaged, or of a version that UnityPy can't read: {reason}") from error
+        raise WlmError(f"{path}: the asset is damaged, or UnityPy cannot read its version: {reason}") from error
 
 
 def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, Any, bytes, str]]:
-    """Of each object in a file its type, its layout, its bytes and their order; of types that aren't read the type.
+    """Lists the type, layout, bytes and byte order of each object in a file; only the type for types that are not read.
 
     Args:
         path: The file.
-        data: What is in it.
+        data: Content of the file.
 
     Raises:
-        ValueError: UnityPy can't read it.
+        ValueError: UnityPy cannot read the file.
     """
-    # With -P nothing beside the program is imported in place of a package.
+    # With -P, a module beside the program cannot replace a package.
     command = [sys.executable, "-P", unity_child.__file__, os.fspath(path), *_WANTED]
     try:
         run = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
@@ -159,9 +158,9 @@ def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, A
 
 
 class _Walk:
-    """Steps through an object by its layout up to the arrays that are wanted.
+    """Walks through an object by its layout up to the requested arrays.
 
-    No length that the file states is used to make room: it is first held against the bytes that are left.
+    A stated length is compared with the remaining bytes before anything is allocated.
     """
 
     def __init__(self, data: bytes, order: str, wanted: set[str]) -> None:
@@ -170,19 +169,19 @@ class _Walk:
         self._found: dict[str, np.ndarray] = {}
 
     def arrays(self, tree: Any) -> dict[str, np.ndarray]:
-        """The wanted arrays by their path, structured; ValueError where one is missing."""
+        """Returns the requested arrays by path; raises ValueError if one is missing."""
         if tree is None:
-            raise ValueError("the layout of its objects isn't in the file")
+            raise ValueError("the file does not contain the layout of its objects")
         for node in tree[3]:
             self._step(node, node[1])
-            if len(self._found) == len(self._wanted):  # what comes after them isn't needed
+            if len(self._found) == len(self._wanted):  # the rest of the object is not needed
                 return self._found
         raise ValueError(f"{min(self._wanted - self._found.keys())} is missing")
 
     def _step(self, node: Any, path: str) -> None:
         self._steps += 1
         if self._steps > _MOST_STEPS:
-            raise ValueError(f"more than {_MOST_STEPS:,} values before what is wanted")
+            raise ValueError(f"more than {_MOST_STEPS:,} values before the requested arrays")
         kind, _, flags, children = node
         if kind == "Array":
             self._array(children[1], path)
@@ -210,7 +209,7 @@ class _Walk:
             self._step(element, path)
 
     def _fixed(self, node: Any) -> np.dtype | None:
-        """The type of a value that always has the same bytes; None: it hasn't."""
+        """Returns the type of a value of fixed size, or None for one of variable size."""
         kind, _, flags, children = node
         if flags & _ALIGNED or kind in ("Array", "TypelessData"):
             return None
@@ -235,7 +234,7 @@ class _Walk:
 
 
 def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
-    """Fields of rows, float64 [N, fields]."""
+    """Returns fields of structured rows as float64 [N, fields]."""
     return np.stack([rows[name] for name in names], 1).astype(np.float64)
 
 

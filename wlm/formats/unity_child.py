@@ -1,6 +1,6 @@
-"""Lists the objects of a file of Unity's as JSON, by UnityPy: run as a program of its own, which may fail as it will.
+"""A program that lists the objects of a Unity file as JSON by UnityPy, in a process of its own.
 
-UnityPy's C code ends its process on some damaged files. Nothing of this package is imported here.
+UnityPy's C code ends its process on some damaged files. This program imports nothing of this package.
 """
 
 import contextlib
@@ -10,27 +10,27 @@ import sys
 from typing import Any
 
 MEMORY = 2 << 30
-"""Bytes that it may take, where the system can say so."""
+"""Limit of its memory, in bytes, on systems that can set one."""
 
 SECONDS = 4
-"""Of computing, likewise."""
+"""Limit of its CPU time, in seconds, likewise."""
 
 
 def main(path: str, kinds: list[str]) -> None:
-    """Prints for each object its type, and of those of some types the layout, where its bytes are, and their order."""
+    """Prints the type of each object, and for some types the layout, the location of the bytes and their order."""
     with contextlib.suppress(ImportError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    # Not `UnityPy.load`, which unpacks whatever a file claims to be packed by.
+    # `UnityPy.load` would decompress by any method that a file names.
     from UnityPy.files import SerializedFile
     from UnityPy.streams import EndianBinaryReader
 
     with open(path, "rb") as file:
         data = file.read()
-    # It prints what it can't read.
+    # UnityPy prints messages about data that it cannot read.
     with contextlib.redirect_stdout(io.StringIO()):
         asset = SerializedFile(EndianBinaryReader(data), name="asset")
         found = []
@@ -42,7 +42,7 @@ def main(path: str, kinds: list[str]) -> None:
 
 
 def _tree(node: Any) -> Any:
-    """A layout: type, name, flags, and what it has."""
+    """Returns a layout: type, name, flags and children."""
     return node and [node.m_Type, node.m_Name, node.m_MetaFlag, [_tree(each) for each in node.m_Children]]
 
 

@@ -1,10 +1,9 @@
-"""Reading OpenVDB's `.vdb` files: the grids of floats that Blender, Houdini and EmberGen write, as dense arrays.
+"""Reading of OpenVDB's `.vdb` files: the float grids that Blender, Houdini and EmberGen write, as dense arrays.
 
-No package of OpenVDB installs from an index, so this reads the format itself: its files from version 222 on (OpenVDB
-2.0, 2013), trees `float_5_4_3`, stored as floats or halves, whose leaves are stored whole or by their active voxels
-alone, as they are or packed by zlib or blosc. Grids of other types are passed over. The format has no description but
-OpenVDB's sources: `io/Archive.cc`, `io/Compression.h`, `tree/RootNode.h`, `InternalNode.h`, `LeafNode.h`.
-"""
+No package of OpenVDB can be installed from an index, so the format is read here: files from version 222 on (OpenVDB
+2.0, 2013) and trees `float_5_4_3`, stored as floats or halves, with whole leaves or only their active voxels,
+uncompressed or compressed by zlib or Blosc. Grids of other types are skipped. The only description of the format is
+OpenVDB's source code: `io/Archive.cc`, `io/Compression.h`, `tree/RootNode.h`, `InternalNode.h`, `LeafNode.h`."""
 
 import math
 import struct
@@ -21,12 +20,12 @@ _MAGIC, _OLDEST, _NEWEST = 0x56444220, 222, 224
 _HALF = "_HalfFloat"
 _FLOATS = ("Tree_float_5_4_3", "Tree_float_5_4_3" + _HALF)
 _ZIP, _ACTIVE_MASK, _BLOSC = 1, 2, 4
-# In the format's numbers: of values that aren't active one or two are stored, and a mask says which each has.
+# Codes of the format: one or two inactive values are stored, and a mask selects between them.
 _ONE_VALUE, _TWO_VALUES, _MASK, _ALL = (2, 4, 5), 5, (3, 4, 5), 6
 _LEAF, _LOWER, _UPPER = 8, 16, 32  # children along an edge of each kind of node
 _LOWER_EDGE, _UPPER_EDGE = _LEAF * _LOWER, _LEAF * _LOWER * _UPPER  # voxels
 _MASK_BYTES = _LEAF**3 // 8
-_FARTHEST = 1 << 30  # of coordinates, so that none overflows
+_FARTHEST = 1 << 30  # bound of coordinates, which prevents overflow
 _LONGEST_TEXT = 1 << 16
 _MOST_GRIDS = 4096
 
@@ -36,10 +35,10 @@ class VdbGrid:
     """A grid of a file.
 
     Attributes:
-        name: As the file has it.
-        matrix: float64 [4, 4], from the indices of voxel centres to the world.
-        low: The first voxel of the box.
-        values: float32 [X, Y, Z] over the box of the active voxels; where there are none, over voxel 0.
+        name: Name of the grid in the file.
+        matrix: float64 [4, 4], from the indices of voxel centres to world space.
+        low: The first voxel of the bounding box.
+        values: float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0 if none is active.
     """
 
     name: str
@@ -50,7 +49,7 @@ class VdbGrid:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A grid in the file's list: where it lies, and whose tree it shares."""
+    """An entry in the list of grids: its offset, and the grid whose tree it shares."""
 
     name: str
     type: str
@@ -62,19 +61,19 @@ class VdbFile:
     """A `.vdb` file in memory, of which only the list of grids has been read.
 
     Attributes:
-        names: Of the grids of floats, in the file's order.
-        others: The other grids, each with its type.
+        names: Names of the float grids, in the order of the file.
+        others: Names and types of the other grids.
     """
 
     def __init__(self, data: bytes, where: str) -> None:
         """Reads the list of grids.
 
         Args:
-            data: The file.
-            where: By which messages name it.
+            data: Content of the file.
+            where: Name of the file for messages.
 
         Raises:
-            WlmError: It is none, too old or too new, or damaged.
+            WlmError: The content is no OpenVDB file, is too old or too new, or is damaged.
         """
         self._where, self._data = where, data
         with _reading(where):
@@ -88,17 +87,17 @@ class VdbFile:
 
         Args:
             name: One of `names`.
-            most: Voxels that its box may have.
+            most: Most voxels of its bounding box.
 
         Raises:
-            WlmError: It is damaged, has a frustum for its box, or a box that is too large.
+            WlmError: The grid is damaged, is a frustum, or has a bounding box that is too large.
         """
         entry, where = self._entries[name], f"{self._where}: {name}"
         with _reading(where):
             matrix, cursor, flags = self._head(entry, where)
             if entry.parent:
                 if entry.parent not in self._entries or self._entries[entry.parent].parent:
-                    raise WlmError(f"{where}: expected the grid whose tree it shares, {entry.parent}, found none")
+                    raise WlmError(f"{where}: the grid {entry.parent}, whose tree it shares, is missing")
                 entry = self._entries[entry.parent]
                 _, cursor, flags = self._head(entry, where)
             tree = _Tree(cursor, flags, entry.type.endswith(_HALF), where)
@@ -114,40 +113,40 @@ class VdbFile:
             raise WlmError(
                 f"{self._where}: expected version {_OLDEST} to {_NEWEST} of OpenVDB's files, found {version}"
             )
-        cursor.unpack("<II")  # of the library
+        cursor.unpack("<II")  # the version of the library
         (offsets,) = cursor.unpack("<?")
         if not offsets:
-            raise WlmError(f"{self._where}: expected a file that says where its grids are, found a stream")
-        cursor.take(36)  # a number of this file's own
+            raise WlmError(f"{self._where}: expected a file with grid offsets, found a stream")
+        cursor.take(36)  # the UUID of the file
         cursor.metadata()
         (count,) = cursor.unpack("<I")
         if count > _MOST_GRIDS:
             raise WlmError(f"{self._where}: expected at most {_MOST_GRIDS} grids, found {count}")
         for _ in range(count):
-            # Grids of one name have a number behind it, apart by a character of its own.
+            # Grids of equal names have a number after a separator character.
             name, kind, parent = (cursor.text() for _ in range(3))
             at, _, end = cursor.unpack("<3q")
             yield _Entry(name.partition("\x1e")[0], kind, parent.partition("\x1e")[0], at)
             cursor.at = end
 
     def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "_Cursor", int]:
-        """The grid's map, a cursor before its tree, and how that is packed."""
+        """Returns the transform of a grid, a cursor before its tree, and its compression flags."""
         cursor = _Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
         if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
-            raise WlmError(f"{where}: expected values packed by zlib or blosc, found the flags {flags}")
+            raise WlmError(f"{where}: expected values compressed by zlib or Blosc, found the flags {flags}")
         cursor.metadata()
         return _matrix(cursor, where), cursor, flags
 
 
 class _Cursor:
-    """A place in bytes, which goes on as they are read."""
+    """A read position in bytes."""
 
     def __init__(self, data: bytes, at: int = 0) -> None:
         self.data, self.at = data, at
 
     def take(self, count: int) -> bytes:
-        """The next bytes."""
+        """Returns the next bytes."""
         end = self.at + count
         if not 0 <= self.at <= end <= len(self.data):
             raise ValueError(f"it ends before its byte {end}")
@@ -165,20 +164,20 @@ class _Cursor:
         return self.take(length).decode("utf-8", "replace")
 
     def metadata(self) -> None:
-        """Passes over values by name."""
+        """Skips metadata."""
         for _ in range(self.unpack("<I")[0]):
             self.text()
             self.text()
             self.take(self.unpack("<I")[0])
 
     def bits(self, count: int) -> np.ndarray:
-        """A mask, bool [count]."""
+        """Reads a mask, bool [count]."""
         packed = np.frombuffer(self.take(count // 8), np.uint8)
         return np.unpackbits(packed, bitorder="little").view(bool)
 
 
 class _reading:
-    """Turns whatever damaged bytes raise into one line."""
+    """Turns the exceptions of damaged bytes into one-line errors."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -192,12 +191,12 @@ class _reading:
 
 
 class _Tree:
-    """A grid's nodes: the topology, of which leaves have their masks alone, and then the leaves' values."""
+    """The nodes of a grid: first the topology, with only the masks of leaves, and then the values of the leaves."""
 
     def __init__(self, cursor: _Cursor, flags: int, half: bool, where: str) -> None:
         self._cursor, self._flags, self._half, self._where = cursor, flags, half, where
         self._tiles: list[_Tiles] = []
-        self._corners: list[np.ndarray] = []  # of leaves
+        self._corners: list[np.ndarray] = []  # the corners of leaves
         self._masks: list[bytes] = []
         if cursor.unpack("<I") != (1,):
             raise ValueError("expected a tree of one buffer")
@@ -211,7 +210,7 @@ class _Tree:
         self._check_places()
 
     def _node(self, corner: np.ndarray, side: int, edge: int) -> None:
-        """Reads an inner node of `side` children along an edge, each of `edge` voxels."""
+        """Reads an inner node with `side` children along each edge, each of `edge` voxels."""
         cursor, count = self._cursor, side**3
         children, active = cursor.bits(count), cursor.bits(count)
         values = self._values(active)
@@ -228,28 +227,28 @@ class _Tree:
                 self._node(place, _LOWER, _LEAF)
 
     def _check_places(self) -> None:
-        """No two nodes lie in one place, which would be twice the work for a byte, and again."""
+        """Raises an error if two nodes have the same place, which would multiply the work for a byte of the file."""
         leaves = np.concatenate([np.zeros((0, 3)), *self._corners])
         tiles = np.array([[*tiles.corner, tiles.edge] for tiles in self._tiles]).reshape(-1, 4)
         if any(len(np.unique(places, axis=0)) < len(places) for places in (leaves, tiles)):
-            raise ValueError("expected nodes apart, found two at one place")
+            raise ValueError("expected nodes at different places, found two at one")
 
     def dense(self, most: int) -> tuple[tuple[int, int, int], np.ndarray]:
-        """The first voxel of the box of the active ones, and the values in it, float32 [X, Y, Z]."""
+        """Returns the first voxel of the bounding box of the active voxels, and the values in it, float32 [X, Y, Z]."""
         corners = np.concatenate([np.zeros((0, 3), np.int64), *self._corners])
         masks = np.frombuffer(b"".join(self._masks), np.uint8).reshape(-1, _MASK_BYTES)
         low, high = self._box(corners, masks)
         if not (-_FARTHEST <= low.min() and high.max() <= _FARTHEST and math.prod((high - low).tolist()) <= most):
             box = [low.tolist(), (high - 1).tolist()]
             raise WlmError(f"{self._where}: expected a box of at most {most} voxels, found {box}")
-        # Whole leaves, so that none is cut.
+        # The array consists of whole leaves.
         first = low // _LEAF * _LEAF
         values = np.full(-(-(high - first) // _LEAF) * _LEAF, self._background, np.float32)
         for tiles in self._tiles:
             tiles.paste(values, first)
         inside = ((corners >= first) & (corners < first + values.shape)).all(1)
         for at, mask, kept in zip((corners - first).tolist(), masks, inside.tolist(), strict=True):
-            self._cursor.take(_MASK_BYTES)  # once more
+            self._cursor.take(_MASK_BYTES)  # the mask is repeated
             leaf = self._values(np.unpackbits(mask, bitorder="little").view(bool))
             if kept:
                 x, y, z = at
@@ -257,11 +256,11 @@ class _Tree:
         return tuple(low.tolist()), values[tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))]
 
     def _box(self, corners: np.ndarray, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The first active voxel along each axis, and the one behind the last."""
+        """Returns the first active voxel along each axis, and the voxel after the last."""
         lows, highs = [], []
         some = masks.any(1)
         corners, masks = corners[some], masks[some]
-        # Few leaves are at the border of the box of all.
+        # Only leaves at the border of the bounding box of all leaves matter, and these are few.
         ends = corners.min(0, initial=_FARTHEST), corners.max(0, initial=-_FARTHEST)
         outer = ((corners == ends[0]) | (corners == ends[1])).any(1)
         for corner, mask in zip(corners[outer], masks[outer], strict=True):
@@ -274,16 +273,16 @@ class _Tree:
                 lows.append(tiles.corner + tiles.edge * places.min(0))
                 highs.append(tiles.corner + tiles.edge * (places.max(0) + 1))
         if not lows:
-            # Smoke that hasn't begun.
+            # No voxel is active, for example before the smoke starts.
             return np.zeros(3, np.int64), np.ones(3, np.int64)
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def _values(self, active: np.ndarray) -> np.ndarray:
-        """The next values, of a mask's voxels or children, float32 [count]."""
+        """Reads the values of the voxels or children of a mask, float32 [count]."""
         cursor = self._cursor
         (kind,) = cursor.unpack("<B")
         if kind > _ALL:
-            raise ValueError(f"expected values stored in a way from 0 to {_ALL}, found {kind}")
+            raise ValueError(f"expected a storage code from 0 to {_ALL}, found {kind}")
         others = [self._background if kind == 0 else -self._background, self._background]
         if kind in _ONE_VALUE:
             others[0] = cursor.unpack("<f")[0]
@@ -303,7 +302,7 @@ class _Tree:
         return values
 
     def _numbers(self, count: int) -> np.ndarray:
-        """The next numbers, unpacked, float32 [count]."""
+        """Reads and decompresses the next numbers, float32 [count]."""
         cursor, size = self._cursor, count * (2 if self._half else 4)
         if not count and self._half:
             return np.zeros(0, np.float32)
@@ -323,13 +322,13 @@ class _Tree:
 
 @dataclass(frozen=True, eq=False)
 class _Tiles:
-    """Children of a node that have one value each.
+    """Children of a node with one constant value each (tiles).
 
     Attributes:
-        corner: Of the node's first voxel, [3].
-        edge: Voxels along a child's.
-        values, active: [N, N, N].
-        seen: Those that are no nodes, and differ from what is around them; None: all.
+        corner: The first voxel of the node, [3].
+        edge: Edge of a child, in voxels.
+        values, active: Value and active state of each child, [N, N, N].
+        seen: Whether each child is a tile that differs from the background; by default, all are.
     """
 
     corner: np.ndarray
@@ -339,13 +338,13 @@ class _Tiles:
     seen: np.ndarray = field(default_factory=lambda: np.ones((1, 1, 1), bool))
 
     def paste(self, values: np.ndarray, first: np.ndarray) -> None:
-        """Writes them into the values of a box whose first voxel is `first`."""
+        """Writes the tiles into the values of a box whose first voxel is `first`."""
         place = np.asarray(self.corner) - first
         begin = np.maximum(place, 0)
         end = np.minimum(place + self.edge * len(self.values), values.shape)
         if (begin >= end).any():
             return
-        # Of each voxel along each axis, the child that it is in.
+        # The child of each voxel along each axis.
         child = np.ix_(*(np.arange(b, e) for b, e in zip(begin - place, end - place, strict=True)))
         child = tuple(along // self.edge for along in child)
         part = values[tuple(slice(b, e) for b, e in zip(begin, end, strict=True))]
@@ -353,21 +352,21 @@ class _Tiles:
 
 
 def _matrix(cursor: _Cursor, where: str) -> np.ndarray:
-    """The next map, float64 [4, 4], from the indices of voxel centres to the world."""
+    """Reads a transform, float64 [4, 4], from the indices of voxel centres to world space."""
     kind = cursor.text()
     matrix = np.eye(4)
     if kind in ("AffineMap", "UnitaryMap"):
-        # Of rows that are multiplied from the left.
+        # The file stores the transpose, for row vectors.
         matrix = np.array(cursor.unpack("<16d")).reshape(4, 4).T
     elif kind in ("ScaleMap", "UniformScaleMap", "ScaleTranslateMap", "UniformScaleTranslateMap"):
         if kind.endswith("TranslateMap"):
             matrix[:3, 3] = cursor.unpack("<3d")
         matrix[:3, :3] = np.diag(cursor.unpack("<3d"))
-        cursor.take(4 * 24)  # what follows from the scale
+        cursor.take(4 * 24)  # values derived from the scale
     elif kind == "TranslationMap":
         matrix[:3, 3] = cursor.unpack("<3d")
     else:
-        raise WlmError(f"{where}: expected voxels along straight axes, found a {kind[:40]}")
+        raise WlmError(f"{where}: expected a linear transform, found a {kind[:40]}")
     if not np.isfinite(matrix).all():
-        raise ValueError("expected a map of finite numbers")
+        raise ValueError("expected a transform of finite numbers")
     return matrix

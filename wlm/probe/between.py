@@ -1,13 +1,11 @@
-"""Light where no probe was compressed: at probes that are held out of a fit, and half-way between probes.
+"""Scores of the light between probes: half-way to a neighbour, and at probes that are left out of a fit.
 
-An engine reads probes between them. There is no bake there to compare with, so two things are scored instead. Every
-fifth probe is left out of a fit of the others, and the light that is decoded at its place is compared with it; what the
-uncompressed others give there by the plain rules of engines is beside it. And half-way from each probe to its nearest
-the decoded light is compared with what the uncompressed probes give there by kriging.
+An engine reads light between probes, where no bake exists to compare with. Two scores stand in. Half-way from each
+probe to its nearest neighbour, the decoded light is compared with an interpolation of the uncompressed probes. And
+every fifth probe is left out of a second fit, whose light at that place is compared with the probe.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,32 +13,27 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays
-from wlm.probe.day import DayModel
+from wlm.probe.decode import Decoder
 from wlm.probe.fit import compress
-from wlm.probe.kriging import Kriging
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import Transform
 from wlm.system import OnProgress
 
 EVERY = 5
-"""One of so many live probes is held out."""
+"""One in this many live probes is left out."""
 
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well light is told where nothing was compressed, dB of all numbers of the probes held out.
-
-    The peak is the range of the live probes' numbers.
+    """Errors at the probes that were left out, in dB over all their numbers; the peak is the range of the live probes.
 
     Attributes:
-        probes: How many were held out.
-        bytes: Size of the file of the others.
-        psnr: Of what that file decodes to at their places.
-        nearest: Of the nearest of the others, uncompressed.
-        distance: Of the eight nearest of the others, uncompressed, weighted by the inverse square of their distance.
-        kriging: Of the others, uncompressed, by `wlm.probe.kriging`: what a transform gives without any loss.
+        probes: Number of probes that were left out.
+        bytes: File size of the fit to the others.
+        psnr: PSNR of that fit at the left-out probes.
+        nearest: PSNR of the nearest of the other probes, uncompressed.
+        distance: PSNR of the eight nearest others, uncompressed, weighted by the inverse square of their distance.
     """
 
     probes: int
@@ -48,58 +41,34 @@ class HeldOut:
     psnr: float
     nearest: float
     distance: float
-    kriging: float
 
 
 def held_out(
-    model: ProbeModel | Transform,
+    model: ProbeModel,
     probes: ProbeSet,
     *,
     seed: int = 0,
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> HeldOut:
-    """Fits four fifths of a set as a model was, and decodes the places of the rest.
+    """Fits four fifths of a set with a model's settings, and scores the light at the other probes.
 
     Args:
-        model: Of the whole set: Gaussians are fitted with its settings, a transform in four fifths of its bytes.
+        model: A model of the whole set.
         probes: The whole set.
         seed, device, progress: As for `wlm.probe.compress`.
 
     Raises:
-        WlmError: Fewer than two live probes, no such device, or a fit that failed.
+        WlmError: There are fewer than two live probes, the device does not exist, or the fit failed.
     """
-    if isinstance(model, DayModel):
-        raise WlmError(f"{model.name}: expected one hour to hold probes out of, found a file of {len(model.times)}")
     live = np.flatnonzero(probes.live)
     if len(live) < 2:
-        raise WlmError(f"{probes.name}: expected at least 2 live probes to hold one out, found {len(live)}")
+        raise WlmError(f"{probes.name}: expected at least 2 live probes to leave one out, found {len(live)}")
     out = np.arange(len(live)) % EVERY == min(EVERY, len(live)) - 1
     known, asked = live[~out], live[out]
     others = from_arrays(probes.position[known], probes.values[known], name=probes.name)
-    settings: dict[str, Any] = {}
-    if isinstance(model, Transform):
-        # The others' file has no positions.
-        settings["max_bytes"] = model.without_places().file_bytes() * (EVERY - 1) // EVERY
-    try:
-        fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, **settings)
-    except WlmError as error:
-        raise WlmError(f"{probes.name}: cannot fit {len(known)} probes to hold out {len(asked)}: {error}") from error
-    decoder = fitted.decoder(device)
-    decoder.decode_probes(others.position)
-    return score_held(decoder, others, probes, asked, fitted.file_bytes())
-
-
-def score_held(decoder: Any, others: ProbeSet, probes: ProbeSet, asked: np.ndarray, size: int) -> HeldOut:
-    """Scores the light where probes were left out of a fit.
-
-    Args:
-        decoder: Of the fit, which knows its places.
-        others: What was fitted.
-        probes: The whole set.
-        asked: int [M], which of them were left out and are live.
-        size: Bytes of the fit's file.
-    """
+    fitted = compress(others, model.profile, seed=seed, device=device, progress=progress, method=model.method)
+    decoder = fitted.decoder(device, position=others.position)
     position, expected = probes.position[asked], probes.values[asked].astype(np.float64)
     peak = float(np.ptp(probes.values[probes.live]))
 
@@ -108,49 +77,40 @@ def score_held(decoder: Any, others: ProbeSet, probes: ProbeSet, asked: np.ndarr
 
     return HeldOut(
         probes=len(asked),
-        bytes=size,
+        bytes=fitted.file_bytes(),
         psnr=score(decoder.decode(position)),
         nearest=score(by_distance(others, position, 1)),
         distance=score(by_distance(others, position, _NEAREST)),
-        kriging=score(by_kriging(others, position)),
     )
 
 
-def between_psnr(decoder: Any, probes: ProbeSet) -> float:
-    """The PSNR of decoded light half-way from each live probe to its nearest.
+def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
+    """Scores decoded light half-way from each live probe to its nearest neighbour.
 
     Args:
-        decoder: A decoder that knows its places.
+        decoder: A decoder that has the positions of its probes.
         probes: The input.
 
     Returns:
-        dB against the kriging of the live probes of the input, over the range of their numbers; NaN for fewer than two.
+        PSNR in dB against the eight nearest probes of the input, weighted by the inverse square of their distance; the
+        peak is the range of the live probes. NaN for fewer than two live probes.
     """
     place, values = probes.position[probes.live], probes.values[probes.live]
     if len(place) < 2:
         return float("nan")
     nearest = cKDTree(place).query(place, k=2)[1][:, 1]
     middle = 0.5 * (place + place[nearest])
-    error = decoder.decode(middle) - by_kriging(probes, middle)
+    error = decoder.decode(middle) - by_distance(probes, middle, _NEAREST)
     return psnr_from_mse(float(np.square(error).mean()), float(np.ptp(values)))
 
 
 def by_distance(probes: ProbeSet, position: np.ndarray, count: int) -> np.ndarray:
-    """Light at points [M, 3] from the nearest live probes, weighted by 1 / distance²; float64 [M, D]."""
+    """Interpolates the nearest live probes at points [M, 3] with weights 1 / distance^2; float64 [M, D]."""
     place, values = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
     count = min(count, len(place))
-    distance, index = cKDTree(place).query(position, k=count)
-    distance, index = distance.reshape(len(position), count), index.reshape(len(position), count)
+    distance, index = cKDTree(place).query(position, k=np.arange(1, count + 1))
     # A probe at the point itself takes all of the weight.
     least = np.maximum(distance[:, :1], np.finfo(np.float64).tiny)
     weight = np.square(least / np.maximum(distance, least * 1e-9))
     weight /= weight.sum(1, keepdims=True)
-    return (values[index] * weight[..., None]).sum(1)
-
-
-def by_kriging(probes: ProbeSet, position: np.ndarray) -> np.ndarray:
-    """Light at points [M, 3] from live probes by kriging; float64 [M, D]."""
-    place, values = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
-    low = place.min(0)
-    index, weight = Kriging(place - low).weights(np.clip(position - low, 0.0, np.ptp(place, axis=0)))
     return (values[index] * weight[..., None]).sum(1)

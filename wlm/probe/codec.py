@@ -1,167 +1,178 @@
-"""Probe models in files. Packed Gaussians are as `wlm.probe.gaussian_codec` has them, transforms as
-`wlm.probe.transform_codec`; here are those of Gaussians that are not packed, as in earlier files.
+"""Probe models in files.
 
-`gaussians` holds for every Gaussian three centres of 16 bits and 7 + L codes of b bits, packed without a gap, the
-lowest bit first; `frame` is origin, extent, size of the box and gain; `dead` is a bit for each probe, deflated.
+A file is a compact artifact (`wlm.formats.compact`), so that a handful of probes is not mostly header. Its body is
+
+=========  =======================================================================================================
+field      content
+=========  =======================================================================================================
+length     U16, length of the header in bytes
+header     JSON, see `_Header`
+parts      to the end: one zstd frame of all parts, in the order of their table (`_table`, then the method's); the
+           bytes of each part are split into planes, first the lowest byte of every number
+=========  =======================================================================================================
+
+Signed integers are stored as 2 n for n >= 0 and -2 n - 1 otherwise, so that small magnitudes have empty high planes.
 """
 
+import json
+import math
+import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from wlm.config import check_settings
+from wlm.formats import zstd
 from wlm.formats.artifact import Artifact
-from wlm.formats.bits import pack_bits, unpack_bits
-from wlm.formats.compact import HEAD
+from wlm.formats.compact import BODY
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
-from wlm.probe.day import DayModel
-from wlm.probe.day_codec import decode_day, encode_day
-from wlm.probe.fields import GAUSSIANS, HOURS, is_of, pack_dead, unpack_dead
-from wlm.probe.gaussian_codec import decode_gaussians, encode_gaussians
-from wlm.probe.model import LATENT, SCALE, ProbeModel, Profile, layer_shapes
-from wlm.probe.region_codec import decode_regions, encode_regions
-from wlm.probe.regions import RegionModel
-from wlm.probe.transform import Transform, TransformModel
-from wlm.probe.transform_codec import decode_transform, encode_transform, is_transform
+from wlm.probe.gaussian import codec as gaussian_codec
+from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.pca import codec as pca_codec
 from wlm.system import Header, Name
 
-_MOST, _MOST_LOG = 1e38, 40.0
+_METHODS = {"gaussians": gaussian_codec, "pca": pca_codec}
+"""The module that stores each method's content."""
+
+_LENGTH = struct.Struct("<H")
+_FARTHEST = 1e150
+_SOURCE = 8  # hexadecimal digits of the source
+# Most bytes of unpacked parts: a frame of zeros has next to no bytes of its own.
+_SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The settings of a file of Gaussians."""
+    """The header of a file: `count` is the number of Gaussians or of components, and `profile` names the method."""
 
-    name: Name
     probes: int = Field(ge=1, le=PROBES)
-    outputs: int = Field(ge=1, le=NUMBERS)
+    outputs: int = Field(27, ge=1, le=NUMBERS)
+    source: str = Field(pattern="^[0-9a-f]{8}$")
     profile: Profile
-    gaussians: int = Field(ge=1, le=PROBES)
-    dropped: int = Field(ge=0, le=PROBES)
+    count: int = Field(ge=1, le=PROBES)
+    dropped: int = Field(0, ge=0, le=PROBES)
+    live: int | None = Field(None, ge=1, le=PROBES)
+    positions: bool = False
 
 
-def _parts(header: _Header) -> dict[str, Part]:
-    """The table of parts."""
-    profile = header.profile
-    layers = layer_shapes(profile.latent, profile.hidden, header.outputs)
-    bits = header.gaussians * int(profile.code_bits().sum())
-    return {
-        "gaussians": Part(np.uint8, (-(-bits // 8),)),
-        "bounds": Part(np.float32, (2, LATENT.start + profile.latent), least=-_MOST, most=_MOST),
-        "net": Part(np.float16, (sum(rows * columns for rows, columns in layers),)),
-        "frame": Part(np.float64, (8,)),
-        "dead": Part(np.uint8, (None,), optional=True),
-        "positions": Part(np.uint16, (header.probes, 3), optional=True),
-    }
+class _NameHeader(Header):
+    name: Name = ""
 
 
-def encode(model: ProbeModel | Transform) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Settings, parts and source of a model's file."""
-    if isinstance(model, RegionModel):
-        return encode_regions(model)
-    if isinstance(model, DayModel):
-        return encode_day(model)
-    if isinstance(model, TransformModel):
-        return encode_transform(model)
-    if model.packed is not None:
-        return encode_gaussians(model)
-    settings = {
-        "name": model.name,
-        "probes": model.probes,
-        "outputs": model.outputs,
-        "gaussians": model.count,
-        "dropped": model.dropped,
-        "profile": model.profile.changes(),
-    }
-    parts = {
-        "gaussians": pack_bits(model.codes, model.profile.code_bits()),
-        "bounds": model.bounds.astype(np.float32),
-        "net": model.net,
-        "frame": np.array([*model.origin, model.extent, *model.size, model.gain], np.float64),
-        "dead": pack_dead(model.dead),
-        "positions": model.positions,
-    }
-    return settings, {name: part for name, part in parts.items() if part.size}, model.source
-
-
-def decode(artifact: Artifact) -> ProbeModel | Transform:
-    """Makes the model of a file; what `encode` gave comes back bit for bit.
+def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    """Returns settings, parts and source of a model's file, as `wlm.formats.artifact` takes them.
 
     Raises:
-        WlmError, ValueError: A setting or a part is missing or wrong, or they don't fit each other.
+        ValueError: The content has not been quantised.
     """
-    if HEAD in artifact.tensors:
-        return decode_regions(artifact)
-    if is_of(artifact, HOURS):
-        return decode_day(artifact)
-    if is_of(artifact, GAUSSIANS):
-        return _checked(decode_gaussians(artifact))
-    if is_transform(artifact):
-        return decode_transform(artifact)
-    header = check_settings(_Header, artifact.settings, "setting ")
-    parts = check_parts(artifact.tensors, _parts(header))
-    frame = parts["frame"]
-    codes = unpack_bits(parts["gaussians"], header.profile.code_bits(), header.gaussians)
-    model = ProbeModel(
-        name=header.name,
-        source=artifact.source,
+    method = _METHODS[model.method]
+    live = int(model.live.sum())
+    header: dict[str, Any] = {"probes": model.probes}
+    if model.outputs != _Header.model_fields["outputs"].default:
+        header["outputs"] = model.outputs
+    header |= {"source": model.source[:_SOURCE], "profile": model.profile.changes()}
+    header |= method.settings(model.content)
+    header |= {"live": live} if live < model.probes else {}
+    header |= {"positions": True} if model.has_positions else {}
+    parts = {"box": np.array([*model.origin, model.extent, *model.size])} | method.parts(model.content)
+    if live < model.probes:
+        parts["dead"] = np.packbits(model.dead)
+    if model.has_positions:
+        # Differences from probe to probe modulo 2^16: those of a lattice repeat.
+        parts["positions"] = np.diff(model.positions, axis=0, prepend=np.zeros((1, 3), np.uint16)).T
+    text = json.dumps(header, separators=(",", ":")).encode()
+    table = _table(_Header.model_validate(header))
+    frame = zstd.compress(b"".join(_planes(parts[name]) for name in table))
+    return {}, {BODY: np.frombuffer(_LENGTH.pack(len(text)) + text + frame, np.uint8)}, ""
+
+
+def decode(artifact: Artifact) -> ProbeModel:
+    """Builds the model of a file; everything that `encode` stored comes back bit for bit, except the end of the source.
+
+    Raises:
+        WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
+    """
+    name = check_settings(_NameHeader, artifact.settings, "setting ").name
+    body = artifact.tensors[BODY].tobytes()
+    start = _LENGTH.size + (_LENGTH.unpack_from(body)[0] if len(body) >= _LENGTH.size else len(body))
+    if start > len(body):
+        raise ValueError("expected a header and a frame of parts, found fewer bytes")
+    try:
+        settings = json.loads(body[_LENGTH.size : start])
+    except (ValueError, RecursionError) as error:
+        raise ValueError("expected a header in JSON") from error
+    header = check_settings(_Header, settings, "setting ")
+    if header.profile.method not in _METHODS:
+        raise ValueError(f"setting method: expected {' or '.join(_METHODS)}, found {header.profile.method}")
+    if header.live is not None and header.live >= header.probes:
+        raise ValueError(f"setting live: expected fewer than {header.probes}, found {header.live}")
+    table = _table(header)
+    stored = check_parts(_split(body[start:], table, len(body)), table)
+    box = stored["box"]
+    origin, extent, size = box[:3].copy(), float(box[3]), box[4:].copy()
+    if not (extent > 0 and (np.abs(box) <= _FARTHEST).all() and (size >= 0).all() and (size <= 1).all()):
+        raise ValueError("part box: expected a positive extent and a size within it")
+    dead = np.zeros(0, bool)
+    if "dead" in table:
+        dead = np.unpackbits(stored["dead"], count=header.probes).astype(bool)
+        if int((~dead).sum()) != header.live:
+            raise ValueError(f"part dead: expected {header.live} live probes, found {int((~dead).sum())}")
+    positions = np.zeros((0, 3), np.uint16)
+    if "positions" in table:
+        positions = np.cumsum(stored["positions"].T, axis=0, dtype=np.uint16)
+    return ProbeModel(
+        name=name,
+        source=header.source,
         profile=header.profile,
         probes=header.probes,
         outputs=header.outputs,
-        origin=frame[:3].copy(),
-        extent=float(frame[3]),
-        size=frame[4:7].copy(),
-        gain=float(frame[7]),
-        centre=codes[:, :3],
-        code=codes[:, 3:],
-        bounds=parts["bounds"],
-        net=parts["net"],
-        dead=unpack_dead(parts["dead"], header.probes),
-        positions=parts["positions"],
-        dropped=header.dropped,
+        origin=origin,
+        extent=extent,
+        size=size,
+        dead=dead,
+        positions=positions,
+        content=_METHODS[header.profile.method].content(header.profile, header.outputs, stored, header.dropped),
     )
-    return _checked(model)
 
 
-def _checked(model: ProbeModel) -> ProbeModel:
-    """The model, if all of its numbers can be used.
-
-    Raises:
-        ValueError: They can't.
-    """
-    _check_frame(model.origin, model.extent, model.size, model.gain)
-    _check_bounds(model.bounds)
-    _check_values(model)
-    return model
-
-
-def _check_frame(origin: np.ndarray, extent: float, size: np.ndarray, gain: float) -> None:
-    with np.errstate(over="ignore"):
-        reaches = np.isfinite(origin + extent * size).all()
-    if not (extent > 0 and reaches and (size >= 0).all() and (size <= 1).all()):
-        raise ValueError("part frame: expected a positive extent and a size within it")
-    if not 0 < gain <= np.finfo(np.float32).max:
-        raise ValueError(f"part frame: expected a positive gain that float32 holds, found {gain:g}")
+def _table(header: _Header) -> dict[str, Part]:
+    """Returns the table of parts of a file."""
+    live = header.probes if header.live is None else header.live
+    table = {"box": Part(np.float64, (7,))}
+    if header.live is not None:
+        table["dead"] = Part(np.uint8, (-(-header.probes // 8),))
+    if header.positions:
+        table["positions"] = Part(np.uint16, (3, header.probes))
+    if header.profile.method == "pca":
+        return table | pca_codec.table(live, header.outputs, header.count)
+    return table | gaussian_codec.table(header.profile, header.outputs, header.count)
 
 
-def _check_bounds(bounds: np.ndarray) -> None:
-    # The difference of any two is finite.
-    if not np.abs(bounds).max() <= _MOST:
-        raise ValueError(f"part bounds: expected numbers of at most {_MOST:g} either way")
-    if (bounds[0] > bounds[1]).any():
-        raise ValueError("part bounds: expected no lowest value above its highest")
-    # Scales are logarithms: their squares, and the squares' inverses, must be float32.
-    if np.abs(bounds[:, SCALE]).max() > _MOST_LOG:
-        raise ValueError(f"part bounds: expected logs of scales of at most {_MOST_LOG:g} either way")
+def _planes(part: np.ndarray) -> bytes:
+    """Returns the bytes of a part, plane by plane."""
+    if part.dtype == np.int32:
+        part = ((part << 1) ^ (part >> 31)).view(np.uint32)
+    little = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
+    return little.view(np.uint8).reshape(part.size, part.itemsize).T.tobytes()
 
 
-def _check_values(model: ProbeModel) -> None:
-    """Checks that no number on the way to a probe's values is beyond float32, wherever it is decoded."""
-    # The sum of what each output may become, of inputs in [-1, 1].
-    first, _, third = (np.abs(layer.astype(np.float64)) for layer in model.layers())
-    sums = model.count * np.abs(model.bounds[:, LATENT].astype(np.float64)).max(0)
-    first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
-    most = max(first.sum(0).max(), model.gain * third.sum(0).max())
-    if not most <= np.finfo(np.float32).max:
-        raise ValueError("parts net, bounds and frame: expected values that float32 holds")
+def _split(frame: bytes, table: Mapping[str, Part], size: int) -> dict[str, np.ndarray]:
+    """Unpacks the parts of a frame: undoes `_planes`."""
+    sizes = {name: math.prod(part.shape) * np.dtype(part.dtype).itemsize for name, part in table.items()}
+    total, most = sum(sizes.values()), _SURE + _PER_BYTE * size
+    if total > most:
+        raise ValueError(f"parts: expected at most {most} bytes for a file of {size}, found {total}")
+    data = np.frombuffer(zstd.decompress(frame, total, "parts"), np.uint8)
+    result, at = {}, 0
+    for name, part in table.items():
+        dtype = np.dtype(part.dtype)
+        planes = data[at : at + sizes[name]].reshape(dtype.itemsize, -1)
+        at += sizes[name]
+        numbers = np.ascontiguousarray(planes.T).reshape(-1)
+        if dtype == np.int32:
+            folded = numbers.view("<u4")
+            numbers = (folded >> 1).astype(np.int32) ^ -(folded & 1).astype(np.int32)
+        result[name] = numbers.view(dtype.newbyteorder("<")).reshape(part.shape)
+    return result

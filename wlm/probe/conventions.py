@@ -1,14 +1,14 @@
-"""Spherical harmonics as engines store them, and as this package does.
+"""Spherical harmonics in the conventions of engines and of this package.
 
 The canonical numbers, those of this package, are the radiance L projected onto the orthonormal real basis, c_lm =
 integral of L Y_lm (gaussian-probe-compression, eq. 1), all signs plus, in the order 1; y, z, x; xy, yz, 3z2-1, xz,
-x2-y2; and so on, m from -l to l in band l. Every engine here has that order, so what differs is one factor for each
+x2-y2; and so on, m from -l to l in band l. All engines here have that order and differ by one factor for each
 coefficient:
 
 =======  ==========================================  ========  ========================================
 name     type in the engine                          bands     engine's number / canonical number
 =======  ==========================================  ========  ========================================
-threejs  SphericalHarmonics3 (LightProbe)            any       1: it is the canonical one
+threejs  SphericalHarmonics3 (LightProbe)            any       1: this is the canonical convention
 godot    LightmapGIData.probe_data["sh"]             any       1 / pi
 unreal   FSHVector2, FSHVector3, FSHVectorRGB3       L0 to L2  (-1)^m, the Condon-Shortley phase
 unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
@@ -21,12 +21,12 @@ unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
   vectors of the engine's own maths, not the packed bricks of a volumetric lightmap.
 - Unity: `Evaluate` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
   K_lm (0.2821; 0.4886; 1.0925, 0.3154 for 3z2-1, 0.5463 for x2-y2) and the clamped cosine's A_l / pi = 1, 2/3, 1/4
-  (Ramamoorthi and Hanrahan 2001) are therefore in the numbers already, and are taken out here. C# indexes them
+  (Ramamoorthi and Hanrahan 2001) are therefore part of the numbers, and are removed here. C# indexes the numbers
   [channel, coefficient]; here, as everywhere in this package, the channel is last.
 
-Not converted: axes and units. In each engine probes' positions and directions share one frame (three.js and Godot
-right-handed with y up, Unity left-handed with y up, Unreal left-handed with z up, in centimetres), and whatever frame
-comes in goes out. Windowing against ringing and exposure, where a bake applied them, stay in the numbers.
+Axes and units are not converted. In each engine positions and directions share one frame (three.js and Godot
+right-handed with y up, Unity left-handed with y up, Unreal left-handed with z up, in centimetres), which is kept.
+Windowing against ringing and exposure, if a bake applied them, stay in the numbers.
 """
 
 import math
@@ -40,13 +40,13 @@ CANONICAL = "threejs"
 CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 
 THREE_GRID = "wlm-light-probe-grid"
-"""What a `.json` says its format is that is a grid for three.js, see `wlm.probe.three_grid`."""
+"""Field `format` of the index of a grid for three.js, see `wlm.probe.engines.three`."""
 
 UNREAL_LIGHT = "wlm-unreal-light"
-"""Likewise of volume textures for Unreal, see `wlm.probe.unreal`."""
+"""Field `format` of the index of volume textures for Unreal, see `wlm.probe.engines.unreal`."""
 
 UNITY_PROBES = "wlm-unity-probes"
-"""Likewise of probes for Unity, see `wlm.probe.unity`."""
+"""Field `format` of probes for Unity, see `wlm.probe.engines.unity`."""
 
 _LAST_BAND = {"unreal": 2, "unity": 2}
 
@@ -60,15 +60,15 @@ def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
     """Converts an engine's coefficients to canonical ones.
 
     Args:
-        values: [N, C, 3], C = 1, 4, 9 ... coefficients, RGB last. NaN and Inf stay what they are.
+        values: [N, C, 3], C = 1, 4, 9 ... coefficients, RGB last. NaN and Inf are kept.
         name: One of `CONVENTIONS`.
 
     Returns:
-        float64 [N, C, 3]; `from_canonical` leads back, without any rounding for "threejs" and "unreal".
+        float64 [N, C, 3]; `from_canonical` inverts it, without any rounding for "threejs" and "unreal".
 
     Raises:
-        WlmError: The name is unknown, C isn't a whole number of bands, or the engine has no such band.
-        ValueError: The shape is another.
+        WlmError: The name is unknown, C is not a whole number of bands, or the engine has no such band.
+        ValueError: The shape is different.
     """
     return _checked(values) / _factors(values.shape[1], name)[:, None]
 
@@ -85,7 +85,7 @@ def _checked(values: np.ndarray) -> np.ndarray:
 
 
 def _factors(coefficients: int, name: str) -> np.ndarray:
-    """The last column of the module's table, float64 [C]."""
+    """Returns the factors of the module's table, float64 [C]."""
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:

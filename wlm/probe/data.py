@@ -1,6 +1,6 @@
-"""What comes in: light probes at free positions, read from `.npz`, `.json` or Godot's `.lmbake` and checked.
+"""The input: light probes at free positions, read from `.npz`, `.json`, Godot's `.lmbake` or Unity's `.asset`.
 
-The stated behaviours. `ProbeSet.warnings` says what was repaired, in one line for each kind; probes count from 0.
+Behaviour in special cases. `ProbeSet.warnings` has a line for each kind of repair; probes are counted from 0.
 
 ====================================  ================================================================
 input                                 behaviour
@@ -8,31 +8,31 @@ input                                 behaviour
 a position NaN or infinite            error that names the probe
 positions far from the origin         kept in float64
 positions that span more than 1e150   error
-coincident positions                  fine; one warning with the count of those that repeat an earlier one:
-                                      Gaussians decode them to one value, whatever they held
-NaN, Inf in a probe                   the probe is not live and all its numbers become 0; warning with
-                                      the count and the first
-a probe that is all zero              not live, no warning: engines leave probes inside walls so
-a probe that `valid` has below 0.5    not live, and zero, no warning
-`valid` beyond 0 to 1, a `normal`     error that names the field and the probe
-that isn't finite
+coincident positions                  accepted; a warning with the number of probes that repeat an earlier
+                                      position: Gaussians decode them to one value
+NaN, Inf in a probe                   the probe is dead and all its numbers become 0; a warning with the
+                                      number of such probes and the first one
+a probe that is all zero              dead, without a warning: engines leave such probes inside walls
+a probe whose `valid` is below 0.5    dead and zero, without a warning
+`valid` outside 0 to 1, a `normal`    error that names the field and the probe
+that is not finite
 no live probe, no probe at all        error
-negative numbers                      fine: only the light in a direction is positive, and even that only
-                                      without ringing
-a number beyond +-1.8e19              error that names the probe: the loss is a mean of squares in float32,
-                                      where the square of anything larger is infinite
-float16, float64, integers            converted to float32; what is too small for it becomes 0
+negative numbers                      accepted: only the light in a direction is positive, and even that
+                                      only without ringing
+a number beyond +-1.8e19              error that names the probe: the loss is a mean of squares in
+                                      float32, where the square of a larger number is infinite
+float16, float64, integers            converted to float32; smaller numbers become 0
 other types, text, ragged lists       error that names the field
-one probe, one number per probe       fine
-more than 16,777,216 probes, or 4,096 error; on CUDA some 1,400 numbers, which is told when the fit begins
-numbers of a probe
+one probe, one number per probe       accepted
+more than 16,777,216 probes, or 4,096 error; the limit on CUDA is about 1,400 numbers, checked when a fit
+numbers of a probe                    starts
 several arrays named `sh...`          error that lists them, unless `key` names one
-a convention of an engine             error where the numbers are not 1, 4 or 9 RGB coefficients (any
-                                      square for Godot's)
+a convention of an engine             error if the numbers are not 1, 4 or 9 RGB coefficients (any square for
+                                      Godot's)
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 
-What a probe holds: gaussian-probe-compression, eq. 1 (there 3, 12 or 27 numbers; here any).
+A probe holds spherical harmonics (gaussian-probe-compression, eq. 1; 3, 12 or 27 numbers there), or any other numbers.
 """
 
 import hashlib
@@ -64,32 +64,31 @@ from wlm.probe.conventions import (
 )
 from wlm.probe.json_fields import fields_of, numbers_of, read_json, text_of
 from wlm.probe.sphere import sh_count
-from wlm.probe.surroundings import check_normal, check_valid
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
-"""The largest number whose square float32 still holds."""
+"""Largest number whose square fits float32."""
 
-_ROWS = 1 << 16  # probes at once, so that float64 copies stay at some tens of MB
-_FARTHEST = 1e150  # the squares of distances are float64's too
+_ROWS = 1 << 16  # probes per piece, so that float64 copies stay at some tens of MB
+_FARTHEST = 1e150  # squares of distances fit float64
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 _NORMAL, _VALID = _BESIDE = "normal", "valid"
 
 
 @dataclass(frozen=True, eq=False)
 class ProbeSet:
-    """Light probes, checked and repaired as the module's table says.
+    """Light probes, checked and repaired as described in the module's table.
 
     Attributes:
-        name: The set's name.
-        position: float64 [N, 3], in the input's unit and axes.
-        values: float32 [N, D], finite; zero where a probe is not live; above 1 GiB in a file without a name. For
-            spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance
+        name: Name of the set.
+        position: float64 [N, 3], in the unit and the axes of the input.
+        values: float32 [N, D], finite; zero where a probe is dead. Arrays above 1 GiB are mapped to a temporary file.
+            For spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance
             (`wlm.probe.conventions`), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
-        source: 16 hexadecimal digits of BLAKE2b over the positions, the values and which are live.
-        warnings: What was repaired, one line each.
-        normal: float64 [N, 3], of the surface that each probe lies on, 0 where it lies on none; None: none is known.
+        source: 16 hexadecimal digits of BLAKE2b over the positions, the values and `live`.
+        warnings: Repairs, one line each.
+        normal: float64 [N, 3], unit normal of each probe's surface, 0 for a probe on no surface; None if unknown.
     """
 
     name: str
@@ -103,23 +102,23 @@ class ProbeSet:
 
     @property
     def probes(self) -> int:
-        """N, live or not."""
+        """N, live and dead."""
         return self.values.shape[0]
 
     @property
     def outputs(self) -> int:
-        """D, numbers of a probe: 27 for L2 in RGB."""
+        """D, numbers per probe: 27 for L2 in RGB."""
         return self.values.shape[1]
 
     @property
     def float_bytes(self) -> int:
-        """Size of the values in float32, with which a compressed size is compared."""
+        """Bytes of the values in float32, with which compressed sizes are compared."""
         return self.probes * self.outputs * 4
 
 
 @dataclass(frozen=True)
 class _Raw:
-    """The content of a file, not yet checked; `key` names the array of values, `convention` is what it states."""
+    """The content of a file before it is checked; `key` is the name of `values`, `convention` as the file states it."""
 
     position: np.ndarray
     values: np.ndarray
@@ -131,28 +130,28 @@ class _Raw:
 def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
     """Reads light probes from a file.
 
-    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they aren't
-      canonical; where they are known `normal` (N, 3) and `valid` (N), as for `from_arrays`.
-    - `grid.json` beside `grid.ktx2`: what `wlm.probe.export_grid` writes for three.js.
-    - `light.json` beside its textures, `probes.json`: what `wlm.probe.export_unreal` and `export_unity` write.
+    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
+      canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
+    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.probe.export_grid`).
+    - `light.json` with its textures, `probes.json`: exports of `wlm.probe.export_unreal` and `export_unity`.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
-      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, and the others likewise.
+      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
     - `.lmbake`: a lightmap bake of Godot 4.
     - `.asset`: the lighting data or light probes of Unity's editor (extra `unity`).
 
     Args:
-        path: The file; its suffix tells the kind.
-        key: Name of the array of values, or that name without "sh_" in front of it ("12.00" for "sh_12.00"). None
-            takes the only one whose name begins with "sh".
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the file's numbers are. None takes what the
-            file states: "godot" for `.lmbake`, "unity" for `.asset`, "unreal" for its textures, else its `convention`,
-            else the canonical one.
+        path: The file; its suffix determines the kind.
+        key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"). None takes
+            the only array whose name begins with "sh".
+        convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
+            own: "godot" for `.lmbake`, "unity" for `.asset`, "unreal" for its textures, otherwise the field
+            `convention`, otherwise the canonical one.
 
     Returns:
-        The set, repaired as the module's table says.
+        The set, repaired as described in the module's table.
 
     Raises:
-        WlmError: One line that names the file and the field, for each error of the module's table.
+        WlmError: An error of the module's table, in one line that names the file and the field.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -164,17 +163,17 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads the positions of a probe file, whatever else is in it, or a list of points.
+    """Reads the positions of a probe file, or a list of points.
 
     Args:
-        path: A file as for `load`, of which `.npz` and `.json` need to hold no values, or JSON, `[[x, y, z], ...]`.
-            What ends otherwise than a file of probes is taken for JSON.
+        path: A file as for `load`; `.npz` and `.json` need no values. Or JSON, `[[x, y, z], ...]`: a file with any
+            other suffix is read as JSON.
 
     Returns:
         float64 [M, 3], finite, M at least 1.
 
     Raises:
-        WlmError: The file is missing, damaged, or holds something else.
+        WlmError: The file is missing, damaged, or has other content.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -204,19 +203,19 @@ def from_arrays(
     normal: np.ndarray | None = None,
     valid: np.ndarray | None = None,
 ) -> ProbeSet:
-    """Makes a checked set of arrays, under the same rules as `load`.
+    """Builds a checked set from arrays, under the same rules as `load`.
 
     Args:
         position: [N, 3] of numbers; copied.
         values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
-        name: The set's name, used in messages too.
-        key: What the values are called.
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, in which the values are.
-        normal: [N, 3], of the surface that each probe lies on, of any length, 0 where it lies on none; copied.
-        valid: [N], true or false, or from 0 to 1: below 0.5 a probe isn't live.
+        name: Name of the set, also used in messages.
+        key: Name of the values.
+        convention: Convention of the values, one of `wlm.probe.conventions.CONVENTIONS`.
+        normal: [N, 3], normal of each probe's surface, of any length, 0 for a probe on no surface; copied.
+        valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
 
     Returns:
-        The set, repaired as the module's table says.
+        The set, repaired as described in the module's table.
 
     Raises:
         WlmError: A shape is wrong, or an error of the module's table.
@@ -234,21 +233,20 @@ def save_probes(
     key: str = _SH,
     convention: str = CANONICAL,
 ) -> None:
-    """Writes probes as `.npz` or `.json`, whole or not at all, such that `load` reads them back.
+    """Writes probes atomically as `.npz` or `.json`, in a form that `load` reads.
 
-    Where D is that of RGB spherical harmonics, they are written as (N, C, 3), else as (N, D). The file states the
-    convention.
+    Spherical harmonics in RGB are written as (N, C, 3), other numbers as (N, D). The file states the convention.
 
     Args:
-        path: The file to write; its suffix tells the kind, its folder must exist.
+        path: The file to write; its suffix determines the kind, and its folder must exist.
         position: [N, 3].
         values: float32 [N, D], finite, canonical.
         key: Name of the array of values.
-        convention: One of `wlm.probe.conventions.CONVENTIONS`, to write the values in.
+        convention: Convention to write the values in, one of `wlm.probe.conventions.CONVENTIONS`.
 
     Raises:
-        ValueError: The shapes don't fit, or a number is NaN or infinite.
-        WlmError: Another suffix, a convention that doesn't fit, a key that means something else, or the file can't
+        ValueError: The shapes do not fit, or a number is NaN or infinite.
+        WlmError: The suffix is unknown, the convention does not fit, the key has another meaning, or the file cannot
             be written.
     """
     path = Path(path)
@@ -257,11 +255,11 @@ def save_probes(
         raise ValueError(f"expected positions [N, 3] and values [N, D], got {position.shape} and {values.shape}")
     if not (np.isfinite(position).all() and np.isfinite(values).all()):
         raise ValueError("expected finite positions and values")
-    # The last two are arguments of NumPy's writer.
+    # The last two are parameters of NumPy's writer.
     if key in (_POSITION, _CONVENTION, _PROBES, *_BESIDE, "file", "allow_pickle"):
         raise WlmError(f"{path}: expected another name for the values, {key!r} means something else")
     engine = _convert(str(path), values, convention, from_canonical)
-    if position.dtype != np.float32:  # half the bytes, where the caller has no more digits
+    if position.dtype != np.float32:  # float32 takes half the bytes, if the caller has no more digits
         position = position.astype(np.float64)
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -306,18 +304,18 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 
 
 def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """Positions, values and convention of what was exported for an engine; None of other content."""
+    """Returns positions, values and convention of an export for an engine; None for other content."""
     form = content.get("format") if isinstance(content, dict) else None
     if form == THREE_GRID:
-        from wlm.probe.three_grid import read_grid
+        from wlm.probe.engines.three import read_grid
 
         return *read_grid(path, content), CANONICAL
     if form == UNREAL_LIGHT:
-        from wlm.probe.unreal import read_unreal
+        from wlm.probe.engines.unreal import read_unreal
 
         return *read_unreal(path, content), "unreal"
     if form == UNITY_PROBES:
-        from wlm.probe.unity import read_unity
+        from wlm.probe.engines.unity import read_unity
 
         return *read_unity(path, content), "unity"
     return None
@@ -339,7 +337,7 @@ _READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".as
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
-    """Picks the array of values by its name, with or without "sh_", or the only one that begins with "sh"."""
+    """Finds the array of values by its name, with or without "sh_", or the only one that begins with "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
@@ -358,7 +356,7 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
 
 
 def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.ndarray, str], np.ndarray]) -> np.ndarray:
-    """Brings [N, C, 3] or [N, D] from or to a convention; the result is [N, C, 3] where D = 3 C, else [N, D]."""
+    """Converts [N, C, 3] or [N, D] from or to a convention; the result is [N, C, 3] where D = 3 C, else [N, D]."""
     if name not in CONVENTIONS:
         raise WlmError(f"{where}: {_CONVENTION}: expected {', '.join(CONVENTIONS)}, got {name!r}")
     coefficients = sh_count(int(np.prod(values.shape[1:])))
@@ -387,7 +385,7 @@ def _check(
     convention: str,
     beside: Mapping[str, np.ndarray],
 ) -> ProbeSet:
-    """Applies the module's table to what was read."""
+    """Checks and repairs the content of a file as described in the module's table."""
     position = _check_positions(where, position)
     count = len(position)
     if values.dtype.kind not in "iuf":
@@ -404,7 +402,7 @@ def _check(
     finite = np.empty(count, bool)
     for start in range(0, count, _ROWS):
         rows = slice(start, start + _ROWS)
-        # float64, so that what doesn't fit float32 is told from Inf; integers have no NaN to look for.
+        # float64 distinguishes numbers that do not fit float32 from Inf.
         wide = values[rows].astype(np.float64)
         finite[rows] = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
         wide = _convert(where, wide, convention, to_canonical).reshape(len(wide), -1)
@@ -417,11 +415,11 @@ def _check(
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
     if _VALID in beside:
-        checked[~check_valid(where, _VALID, beside[_VALID], count)] = 0.0
+        checked[~_check_valid(where, _VALID, beside[_VALID], count)] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
-    normal = check_normal(where, _NORMAL, beside[_NORMAL], count) if _NORMAL in beside else None
+    normal = _check_normal(where, _NORMAL, beside[_NORMAL], count) if _NORMAL in beside else None
 
     warnings = []
     broken = np.flatnonzero(~finite)
@@ -437,7 +435,7 @@ def _check(
 
 
 def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
-    """float64 [N, 3]."""
+    """Returns checked positions, float64 [N, 3]."""
     if position.dtype.kind not in "iuf":
         raise WlmError(f"{where}: {_POSITION}: expected numbers, got {position.dtype}")
     count = len(position) if position.ndim else 0
@@ -460,7 +458,7 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
 
 
 def _repeated(position: np.ndarray) -> int:
-    """Counts the probes whose position an earlier one has."""
+    """Counts the probes at the position of an earlier probe."""
     ordered = position[np.lexsort(position.T)]
     return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())
 
@@ -470,10 +468,41 @@ def _probes(count: int) -> str:
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
-    """Names the input by 16 hexadecimal digits, the same on every machine."""
+    """Returns 16 hexadecimal digits that identify the input, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(values.shape, "<i8").tobytes())
     digest.update(np.ascontiguousarray(position, "<f8"))
     digest.update(np.ascontiguousarray(values, "<f4"))
     digest.update(np.packbits(live).tobytes())
     return digest.hexdigest()
+
+
+def _check_valid(where: str, field: str, valid: np.ndarray, count: int) -> np.ndarray:
+    """Returns the valid ones of `count` probes, bool [N], for `valid` [N] of true or false or of 0 to 1."""
+    _check_field(where, field, valid, "biuf", (count,))
+    bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
+    if len(bad):
+        raise WlmError(f"{where}: {field}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
+    return valid >= 0.5
+
+
+def _check_normal(where: str, field: str, normal: np.ndarray, count: int) -> np.ndarray:
+    """Returns the unit normals of `count` probes, float64 [N, 3]; normals of length 0 stay 0."""
+    _check_field(where, field, normal, "iuf", (count, 3))
+    normal = normal.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(normal).all(1))
+    if len(bad):
+        raise WlmError(f"{where}: {field}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
+    # Divided by the largest number first, since squares of very long or short vectors do not fit float64.
+    normal = _divided(normal, np.abs(normal).max(1, keepdims=True))
+    return _divided(normal, np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _divided(normal: np.ndarray, length: np.ndarray) -> np.ndarray:
+    return normal / np.where(length > 0, length, 1.0)
+
+
+def _check_field(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> None:
+    if array.dtype.kind not in kinds or array.shape != shape:
+        expected = "numbers" if kinds == "iuf" else "numbers, or true and false,"
+        raise WlmError(f"{where}: {field}: expected {expected} {list(shape)}, got {array.dtype} {list(array.shape)}")

@@ -1,20 +1,20 @@
 """Scoring decoded probes against their input (gaussian-probe-compression, section 5.2).
 
-The paper scores pictures rendered in an engine. Here the coefficients themselves are scored, and the irradiance that
-a diffuse surface would get from them, which needs no scene and no camera.
+The paper scores pictures rendered in an engine. This module scores the coefficients themselves, and the irradiance of a
+diffuse surface under them, which needs neither a scene nor a camera; `wlm.probe.views` scores pictures.
 
-The stated behaviours:
+Behaviour in special cases:
 
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
-decoded exactly                       PSNR is 120 dB, the cap of `wlm.metrics`; its error is 0
-all coefficients equal (range 0)      PSNR is NaN, null in JSON: there is no scale to measure against
-irradiance the same everywhere        the same for its PSNR
-D is not 3 (l + 1)²                   no bands and no irradiance: None
+decoded exactly                       PSNR is 120 dB, the cap of `wlm.metrics`; the error is 0
+all coefficients equal (range 0)      PSNR is NaN, null in JSON: there is no scale to compare with
+constant irradiance                   the same for its PSNR
+D is not 3 (l + 1)²                   the scores of bands and irradiance are None
 no live probe                         `psnr_live` and `irradiance_psnr` are NaN
-one probe, one coefficient            fine
-NaN or Inf in what was decoded        error that names the first probe
+one probe, one coefficient            scored like any other
+NaN or Inf in a decoded probe         error that names the first such probe
 another number of probes or outputs   error
 ====================================  ================================================================
 """
@@ -30,45 +30,43 @@ from wlm.metrics import LostLight, psnr_from_mse
 from wlm.probe.between import HeldOut, between_psnr, held_out
 from wlm.probe.data import ProbeSet
 from wlm.probe.model import ProbeModel
-from wlm.probe.noise import noise_psnr
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
-from wlm.probe.transform import Transform
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
-# The mean square of any L2 irradiance over these is within 6% of that over the sphere: a score within 0.3 dB.
 NORMALS = 32
-_ROWS = 32768  # of probes in one piece, so that float64 copies stay at some tens of MB
+"""Number of normals: the mean square of any L2 irradiance over them is within 6% of that over the sphere, 0.3 dB."""
+
+_ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
 
 @dataclass(frozen=True)
 class Report(BaseReport):
     """Size and errors of compressed probes.
 
-    Every PSNR is `10 log10(peak² / mse)`. For coefficients the peak is one number, largest less smallest of all
-    coefficients of all probes of the input, so that the bands and the coefficients can be compared.
+    Every PSNR is `10 log10(peak² / mse)` in dB. The peak of coefficients is one number, the range of all coefficients
+    of all probes of the input, so that bands and coefficients can be compared.
 
     Attributes:
-        name: The set's name.
-        probes, live, outputs: N, how many of them are live, D.
+        name: Name of the set.
+        probes, live, outputs: N, number of live probes, D.
         bytes: Size of the file on disk.
-        bits_per_probe: `bytes * 8 / N`, of all probes; the paper's bpp.
+        bits_per_probe: `bytes * 8 / N`, over all probes; the paper's bpp.
         ratio: File bytes over those of the input as float32, `N * D * 4`.
+        gpu_bytes: Bytes of the buffers that a GPU holds; 0 if unknown.
         peak: Range of the input's coefficients.
-        psnr: dB, over all coefficients of all probes.
-        psnr_live: dB, of the live probes alone: the others decode to zero exactly.
-        mse, mean_abs_error, max_abs_error: Over all coefficients of all probes.
-        worst_probe: The probe of the largest mean squared error: `probe` (its number), `psnr` and
-            `position`; None where all are exact.
-        psnr_by_band: dB, for each SH band over all probes and RGB; None where D is not 3 (l + 1)².
-        psnr_by_coefficient: dB, float64 [D], over all probes.
-        irradiance_psnr: dB, over `NORMALS` fixed normals of every live probe in RGB; its peak is the range of the
-            input's irradiance there. None as `psnr_by_band`.
-        warnings: Light that was lost and that the means hide.
-        between_psnr: dB, half-way between probes, see `wlm.probe.between`; None where that isn't asked.
-        held_out: The score where nothing was compressed; None where that isn't asked.
-        noise_psnr: dB, of the input's own noise, see `wlm.probe.noise`: a `psnr` above it is spent on noise. None where
-            it can't be told, or isn't asked.
+        psnr: PSNR over all coefficients of all probes.
+        psnr_live: PSNR over the live probes; the others decode to zero exactly.
+        mse, mean_abs_error, max_abs_error: Errors over all coefficients of all probes.
+        worst_probe: The probe of the largest mean squared error: `probe` (its index), `psnr` and `position`; None if
+            all are exact.
+        psnr_by_band: PSNR of each SH band over all probes and RGB; None where D is not 3 (l + 1)².
+        psnr_by_coefficient: PSNR of each number, float64 [D], over all probes.
+        irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
+            range of the input's irradiance there. None as for `psnr_by_band`.
+        warnings: Lost light that the means hide.
+        between_psnr: PSNR half-way between probes, see `wlm.probe.between`; None if it was not computed.
+        held_out: Score at probes that a second fit left out; None if it was not computed.
     """
 
     name: str
@@ -91,11 +89,11 @@ class Report(BaseReport):
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
     held_out: HeldOut | None = None
-    noise_psnr: float | None = None
+    gpu_bytes: int = 0
 
 
 def evaluate(
-    model: ProbeModel | Transform,
+    model: ProbeModel,
     probes: ProbeSet,
     *,
     device: str = "cpu",
@@ -103,25 +101,27 @@ def evaluate(
     file_bytes: int | None = None,
     hold_out: bool = False,
 ) -> Report:
-    """Decodes a model at its probes and compares them with the input.
+    """Decodes a model at its probes and compares the result with the input.
 
     Args:
         model: The model.
         probes: The input, in the order of the fit.
-        device: Where it is decoded.
+        device: Where the model is decoded.
         progress: Called after the decode and at the end.
-        file_bytes: Size of the model's file; None: of the one that `model.save` writes.
-        hold_out: Whether four fifths of the probes are fitted once more, to score the light at the others' places.
+        file_bytes: Size of the model's file; None: the size that `model.save` would write.
+        hold_out: Whether to fit four fifths of the probes once more and score the light at the others.
 
     Returns:
         The report.
 
     Raises:
-        WlmError: No such device, or as `score`.
+        WlmError: The device does not exist, or as for `score`.
     """
     meter = Meter(progress, "evaluate", 2)
-    decoder = model.decoder(device)
-    decoded = decoder.decode_probes(probes.position)
+    if len(probes.position) != model.probes:
+        raise WlmError(f"{probes.name}: has {probes.probes} probes, but {model.probes} were compressed")
+    decoder = model.decoder(device, position=probes.position)
+    decoded = decoder.decode_probes()
     meter.report(1)
     report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
     lost = LostLight()
@@ -131,17 +131,17 @@ def evaluate(
         warnings=lost.warnings(probes.name, "probe", "the set"),
         between_psnr=between_psnr(decoder, probes),
         held_out=held_out(model, probes, device=device, progress=progress) if hold_out else None,
-        noise_psnr=noise_psnr(probes),
+        gpu_bytes=model.content.nbytes,
     )
     meter.report(2, PSNR_dB=report.psnr)
     return report
 
 
 def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
-    """Compares probes that any decoder gave with their input.
+    """Compares the output of any decoder with the input.
 
     Args:
-        decoded: float32 [N, D], in the input's order.
+        decoded: float32 [N, D], in the order of the input.
         probes: The input.
         file_bytes: Size of the compressed file.
 
@@ -149,7 +149,7 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         The report.
 
     Raises:
-        WlmError: The probes or their numbers are not as many as the input's, or one decodes to NaN or infinity.
+        WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.
         ValueError: `file_bytes` is not positive, or `decoded` is no matrix.
     """
     if file_bytes <= 0:
@@ -218,7 +218,7 @@ def _worst(by_probe: np.ndarray, position: np.ndarray, peak: float) -> dict[str,
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:
-    """Of live probes [L, D]; NaN if there are none."""
+    """Returns the PSNR of the irradiance of live probes [V, D]; NaN if there are none."""
     if len(values) == 0:
         return math.nan
     normals = fibonacci_sphere(NORMALS)

@@ -1,11 +1,10 @@
-"""Fitting a probe set: from checked input to a compressed model (gaussian-probe-compression, section 3.2 and 3.3).
-
-A profile of the method "transform" is fitted in `wlm.probe.transform_fit`, within seconds.
-"""
+"""Compressing a probe set: from checked input to a model."""
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,21 +14,21 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.model import ProbeModel, Profile, check_outputs
-from wlm.probe.packing import pack_model
-from wlm.probe.trainer import Trainer
-from wlm.probe.transform import Transform
-from wlm.probe.transform_fit import compress_transform
+from wlm.probe.gaussian.decode import GaussianDecoder
+from wlm.probe.gaussian.model import check_outputs, predicted_bytes
+from wlm.probe.gaussian.packing import pack_model
+from wlm.probe.gaussian.trainer import Trainer
+from wlm.probe.model import CODES, ProbeModel, Profile, box_of
+from wlm.probe.pca.model import ENOUGH, fit_components
 from wlm.system import Meter, OnProgress
 
-_OF_TRANSFORMS = ("target_psnr", "max_bytes", "region")
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
 
 
 def open_checkpoint(
     output: str | os.PathLike[str],
     probes: ProbeSet,
-    profile: str | os.PathLike[str] | Profile = "transform",
+    profile: str | os.PathLike[str] | Profile = "standard",
     *,
     seed: int = 0,
     device: str = "cpu",
@@ -40,13 +39,13 @@ def open_checkpoint(
 
     Args:
         output: The file that the fit is for.
-        probes, profile, seed: As for `compress`: what the fit depends on.
-        device: Only its kind matters: a fit may go on on another GPU.
-        resume: Whether to go on from the file, if there is one.
+        probes, profile, seed: As for `compress`; the checkpoint is only valid for these.
+        device: Only its kind matters: a fit can continue on another GPU.
+        resume: Whether to continue from the file, if it exists.
         every: Seconds between two saves of a running fit; 0: after every few steps.
 
     Raises:
-        WlmError: With `resume`: the file is damaged, or of another fit; the line names what differs.
+        WlmError: With `resume`: the file is damaged or of another fit; the line names the difference.
     """
     fit = {
         "input": probes.source,
@@ -59,7 +58,7 @@ def open_checkpoint(
 
 def compress(
     probes: ProbeSet,
-    profile: str | os.PathLike[str] | Profile = "transform",
+    profile: str | os.PathLike[str] | Profile = "standard",
     *,
     seed: int = 0,
     device: str = "cpu",
@@ -67,116 +66,129 @@ def compress(
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
     **overrides: Any,
-) -> ProbeModel | Transform:
+) -> ProbeModel:
     """Compresses a probe set.
 
-    Dead probes take no part: the model has a bit for each, if there are any.
+    A profile of the method "auto", as all shipped Gaussian profiles are, yields Gaussians unless principal components
+    have less error in no more GPU memory, which is so for a few hundred probes; `ProbeModel.choice` says why. Dead
+    probes take no part in the fit: the model has a bit for each probe if any is dead.
 
     Args:
         probes: The set.
         profile: The settings: a name, a YAML file, or a `Profile`.
-        seed: One seed gives one result on one device; a transform has nothing random.
-        device: "cpu" or "cuda:0"; a transform is made on the CPU.
-        progress: Called about twice a second, with the PSNR of all numbers of all probes.
-        checkpoint: From `open_checkpoint` for the same settings, or None: where a running fit is kept, and an
-            interrupted one resumed. A transform is made anew.
-        positions: Whether the model carries the probes' positions, 16 bits an axis; an engine has them anyway.
-        overrides: Settings that replace the profile's: `steps=500`, or of a transform `target_psnr=45`,
-            `max_bytes=20000` and `region=65536`.
+        seed: Seed of the fit; the same seed gives the same result on one kind of device.
+        device: "cpu" or "cuda:N".
+        progress: Called about twice a second, with the PSNR over all numbers of all probes.
+        checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
+            interrupted one is resumed from there.
+        positions: Whether the model stores the probes' positions, 16 bits per axis; an engine has them anyway.
+        overrides: Settings that replace the profile's, such as `steps=500`.
 
     Returns:
         The model.
 
     Raises:
-        WlmError: A profile, a setting or a device that isn't there, too many probes or numbers of a probe, a checkpoint
-            that isn't of this fit, or a fit that diverged.
+        WlmError: The profile, a setting or the device does not exist, there are too many numbers per probe, the
+            checkpoint is of another fit, or the fit diverged.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
-    check_method(profile, overrides)
     device = interop.check_device(device)
-    if profile.method == "transform":
-        return compress_transform(probes, profile, positions=positions, progress=progress)
-    check_outputs(probes.name, profile, probes.outputs, device)
-    origin, extent, size = _frame(probes.position)
-    x = ((probes.position - origin) / extent).astype(np.float32)
+    box = box_of(probes.position)
+    stored = np.zeros((0, 3), np.uint16)
+    if positions:
+        size = box["extent"] * np.where(box["size"] > 0, box["size"], 1.0)
+        stored = np.clip(np.rint((probes.position - box["origin"]) / size * CODES), 0, CODES).astype(np.uint16)
+
+    make = partial(
+        ProbeModel,
+        name=probes.name,
+        source=probes.source,
+        probes=probes.probes,
+        outputs=probes.outputs,
+        dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
+        positions=stored,
+        **box,
+    )
+    values = probes.values[probes.live]
+    pca = Profile(name=profile.name, method="pca")
+    if profile.method == "pca":
+        return make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
+    if profile.method == "auto":
+        budget = predicted_bytes(profile, *values.shape)
+        components, error = fit_components(values, budget)
+        if error <= ENOUGH and components.nbytes <= budget:
+            took = (
+                f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
+            )
+            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
+    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, device)
+    gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
+    if profile.method == "gaussians":
+        return gaussians
+    return _better(gaussians, partial(make, profile=pca), probes, device)
+
+
+def _fit_gaussians(
+    make: Callable[..., ProbeModel],
+    probes: ProbeSet,
+    profile: Profile,
+    seed: int,
+    device: str,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | None,
+) -> ProbeModel:
+    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
+    box = box_of(probes.position)
+    x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
     trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)
     try:
         if checkpoint is not None:
             checkpoint.restore(0, trainer.load)
-        _run(trainer, probes, profile, device, progress, checkpoint)
+        _train(trainer, probes, progress, checkpoint)
         trainer.finish()
         mse = trainer.mse()
-        parts = trainer.quantised()
+        content = trainer.quantised()
     finally:
         trainer.close()
-    if not (math.isfinite(mse) and all(np.isfinite(part).all() for part in parts.values())):
+    if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
         raise WlmError(f"{probes.name}: the fit diverged; expected smaller rates than those of {profile.name}")
-    stored = np.zeros((0, 3), np.uint16)
-    if positions:
-        stored = np.rint((probes.position - origin) / extent / np.where(size > 0, size, 1.0) * 65535.0)
-        stored = np.clip(stored, 0, 65535).astype(np.uint16)
-    model = ProbeModel(
-        name=probes.name,
-        source=probes.source,
-        profile=profile,
-        probes=probes.probes,
-        outputs=probes.outputs,
-        origin=origin,
-        extent=extent,
-        size=size,
-        dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
-        positions=stored,
-        dropped=int((~trainer.needed).sum()),
-        **parts,
+    fitted = make(
+        profile=profile.model_copy(update={"method": "gaussians"}),
+        content=content,
+        choice="Gaussians, as the profile asks",
     )
-    return pack_model(model, probes.position[probes.live], probes.values[probes.live], device)
+    return pack_model(fitted, probes.position[probes.live], probes.values[probes.live], device)
 
 
-def check_method(profile: Profile, overrides: Mapping[str, Any], prefix: str = "") -> None:
-    """Checks that settings which replace a profile's mean something to its method.
+def _better(gaussians: ProbeModel, make: Callable[..., ProbeModel], probes: ProbeSet, device: str) -> ProbeModel:
+    """Returns Gaussians, or principal components where they have less error in no more GPU memory."""
+    values, most = probes.values[probes.live], gaussians.content.nbytes
+    peak = float(np.ptp(probes.values))
 
-    Args:
-        profile: The profile.
-        overrides: By name; None leaves a setting as it is.
-        prefix: As for `Profile.override`.
+    def psnr(decoded: np.ndarray) -> float:
+        return psnr_from_mse(float(np.square(decoded.astype(np.float64) - values).mean()), peak)
 
-    Raises:
-        WlmError: One doesn't.
-    """
-    transform = profile.method == "transform"
-    for name, value in overrides.items():
-        if value is not None and name not in ("name", "method") and (name in _OF_TRANSFORMS) != transform:
-            method = "gaussians" if transform else "transform"
-            shown = prefix + (name.replace("_", "-") if prefix else name)
-            raise WlmError(f"{shown}: expected a profile of the method {method}, found {profile.name}")
-
-
-def _frame(position: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Origin, extent and normalised size of the probes' box."""
-    low, high = position.min(0), position.max(0)
-    extent = float((high - low).max())
-    if not extent > 0:
-        # One probe, or all at one place: any unit will do.
-        extent = 1.0
-    return low, extent, np.minimum((high - low) / extent, 1.0)
+    reached = psnr(GaussianDecoder(gaussians, device).decode(probes.position[probes.live]))
+    told = f"Gaussians reach {reached:.1f} dB in {most:,} bytes of GPU memory"
+    components, _ = fit_components(values, most)
+    if components.nbytes > most:
+        return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
+    rival = make(content=components)
+    possible = psnr(rival.decoder(device).decode_probes()[probes.live])
+    if possible > reached:
+        return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1f} dB, {told}")
+    return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1f} dB")
 
 
-def _run(
-    trainer: Trainer,
-    probes: ProbeSet,
-    profile: Profile,
-    device: str,
-    progress: OnProgress | None,
-    checkpoint: Checkpoint | None,
-) -> None:
-    meter = Meter(progress, "fit", profile.steps)
-    peak = float(probes.values.max()) - float(probes.values.min())
-    # Dead probes decode exactly, and count.
-    live = probes.live.mean()
+def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None) -> None:
+    steps, kind = trainer.profile.steps, "cpu" if trainer.device == "cpu" else "cuda"
+    meter = Meter(progress, "fit", steps)
+    peak = float(np.ptp(probes.values))
+    live = probes.live.mean()  # dead probes decode exactly, and count
     step = trainer.step
-    while step < profile.steps:
-        count = min(_CHUNK["cpu" if device == "cpu" else "cuda"], profile.steps - step)
+    while step < steps:
+        count = min(_CHUNK[kind], steps - step)
         trainer.run(count)
         step += count
         if meter.due(step):

@@ -1,4 +1,4 @@
-"""Probes in JSON: fields of all of them, or a list of probes with fields each."""
+"""Probes in JSON: an object of lists, or a list of objects, one for each probe."""
 
 import json
 from collections.abc import Callable
@@ -12,23 +12,23 @@ from wlm.formats.limits import JSON_BYTES
 from wlm.formats.reading import read_json_file
 
 _PROBES = "probes"
-_FLAGS = ("valid",)  # fields that may be true or false
+_FLAGS = ("valid",)  # fields that may be booleans
 
 
 def read_json(path: Path) -> Any:
     """Reads a file.
 
     Raises:
-        WlmError: It is missing, too long or no JSON.
+        WlmError: The file is missing, too long or not JSON.
     """
     return read_json_file(path, "the probes", JSON_BYTES)
 
 
 def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
-    """Names of the probes' fields in either form of JSON, and a function that reads one as an array.
+    """Returns the names of the probes' fields in either form, and a function that reads one of them as an array.
 
     Raises:
-        WlmError: It has neither form; of the function, a field isn't there, or is no array of numbers.
+        WlmError: The content has neither form. The function raises it if a field is missing or is not numeric.
     """
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
@@ -49,7 +49,7 @@ def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.n
 
 
 def text_of(path: Path, field: str, value: object) -> str:
-    """A text, or a `WlmError`."""
+    """Returns a value that must be text, or raises `WlmError`."""
     if not isinstance(value, str):
         raise WlmError(f"{path}: {field}: expected a name, got {_kind(value)}")
     return value
@@ -62,10 +62,10 @@ def _rows(path: Path, holder: dict, field: str) -> list:
 
 
 def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
-    """Turns nested lists of one shape into an array, of true and false where the field is one of these.
+    """Converts nested lists of one shape to an array, of booleans only for fields that allow them.
 
     Raises:
-        WlmError: They have several shapes, or something that is no number.
+        WlmError: The lists have several shapes, or an element is not a number.
     """
     kinds = "biuf" if field in _FLAGS else "iuf"
     array = _array(rows, kinds)
@@ -77,7 +77,7 @@ def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
 
 
 def _array(value: object, kinds: str) -> np.ndarray | None:
-    """An array of some of NumPy's kinds; None for text, nothing, and ragged lists."""
+    """Converts a value to an array of the given NumPy kinds; None for text, null and ragged lists."""
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError):
@@ -86,7 +86,7 @@ def _array(value: object, kinds: str) -> np.ndarray | None:
 
 
 def _kind(value: object) -> str:
-    """A short name of a JSON value."""
+    """Describes a JSON value briefly."""
     if isinstance(value, dict):
         return "an object"
     text = json.dumps(value)

@@ -1,26 +1,25 @@
-"""Light over the sphere of directions from spherical harmonics (SH): the basis, radiance and irradiance.
+"""Spherical harmonics (SH) on the sphere of directions: the basis, radiance and irradiance.
 
-The convention of this package: orthonormal real SH, band by band, in a band from m = -l to l, all signs plus (no
-Condon-Shortley phase), so 1, y, z, x, xy, yz, 3z²-1, xz, x²-y², ... times positive constants. A probe's coefficients
-are those of the radiance that arrives from each direction (gaussian-probe-compression, eq. 1). The axes are those of
-the scene, whichever of them is up.
+The convention of this package is the orthonormal real basis, band by band, within a band from m = -l to l, all signs
+plus (no Condon-Shortley phase): 1, y, z, x, xy, yz, 3z²-1, xz, x²-y², ... times positive constants. A probe's
+coefficients are those of the incoming radiance (gaussian-probe-compression, eq. 1), in the axes of the scene.
 """
 
 import math
 
 import numpy as np
 
-_UNIT_TOLERANCE = 1e-3  # of a direction's length; float16 normals are within 6e-4
+_UNIT_TOLERANCE = 1e-3  # for a direction's length; float16 normals are within 6e-4
 
 
 def sh_count(outputs: int) -> int | None:
-    """Coefficients C of a probe of `outputs` numbers, if it holds whole bands in RGB (3, 12, 27, 48, ...)."""
+    """Returns the coefficients C of a probe of `outputs` numbers, or None if they are not whole bands in RGB."""
     count = outputs // 3
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
 
 def coefficient_bands(coefficients: int) -> np.ndarray:
-    """Band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
+    """Returns the band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
 
     Raises:
         ValueError: C is not the square of a positive number.
@@ -32,10 +31,10 @@ def coefficient_bands(coefficients: int) -> np.ndarray:
 
 
 def cosine_factor(band: int) -> float:
-    """What convolving with a clamped cosine multiplies a band by: pi, 2 pi/3, pi/4, 0, -pi/24, 0, ...
+    """Returns the factor of a band under convolution with a clamped cosine: pi, 2 pi/3, pi/4, 0, -pi/24, 0, ...
 
     Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment Maps, 2001, eq. 8. Odd bands
-    above the first can't be seen on a diffuse surface.
+    above the first do not contribute to diffuse surfaces.
     """
     if band == 1:
         return 2.0 * math.pi / 3.0
@@ -46,18 +45,18 @@ def cosine_factor(band: int) -> float:
 
 
 def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
-    """The SH basis in some directions.
+    """Evaluates the SH basis in some directions.
 
     Args:
         directions: [M, 3], of unit length.
         coefficients: C, the square of the number of bands.
 
     Returns:
-        float64 [M, C]. Any number of bands is exact to rounding: each column is a polynomial in x, y, z from the
+        float64 [M, C], exact to rounding for any number of bands: each column is a polynomial in x, y, z from the
         three-term recurrence of the normalised Legendre functions.
 
     Raises:
-        ValueError: A shape, a length that isn't 1, or C that isn't a square.
+        ValueError: The shape is different, a length is not 1, or C is not a square.
     """
     directions = np.asarray(directions, np.float64)
     if directions.ndim != 2 or directions.shape[1] != 3:
@@ -68,7 +67,7 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
     z = directions[:, 2]
     turned = np.ones(len(z), np.complex128)  # (x + iy)^m: sin^m theta with the cosine and the sine of m phi
     result = np.empty((len(z), coefficients))
-    start = math.sqrt(0.25 / math.pi)  # of band m = order m
+    start = math.sqrt(0.25 / math.pi)  # value of band m, order m
     for m in range(order):
         if m > 0:
             turned = turned * (directions[:, 0] + 1j * directions[:, 1])
@@ -89,34 +88,34 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
 
 
 def radiance(values: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """The radiance that arrives from some directions; it may dip below zero, as a series that ends does.
+    """Computes the radiance from some directions; a truncated series can be negative.
 
     Args:
         values: [..., C, 3].
-        directions: [M, 3], of unit length, from the probe towards the light.
+        directions: [M, 3], of unit length, from the probe towards the light source.
 
     Returns:
         float64 [..., M, 3].
 
     Raises:
-        ValueError: As `basis`.
+        ValueError: As for `basis`.
     """
     values = _checked(values)
     return basis(directions, values.shape[-2]) @ values
 
 
 def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """The irradiance of surfaces at the probe; divided by pi, what a white diffuse surface shows.
+    """Computes the irradiance of surfaces at the probe; divided by pi, it is the radiance of a white diffuse surface.
 
     Args:
         values: [..., C, 3].
         normals: [M, 3], of unit length.
 
     Returns:
-        float64 [..., M, 3], pi times the radiance where that is the same from everywhere.
+        float64 [..., M, 3], pi times the radiance if that is constant.
 
     Raises:
-        ValueError: As `basis`.
+        ValueError: As for `basis`.
     """
     values = _checked(values)
     factors = [cosine_factor(band) for band in coefficient_bands(values.shape[-2]).tolist()]
@@ -124,7 +123,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Directions spread evenly over the sphere, float64 [count, 3]: a spiral with the golden angle about z."""
+    """Returns evenly spaced directions, float64 [count, 3]: a spiral with the golden angle around z."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     phi = np.arange(count) * (math.pi * (3.0 - math.sqrt(5.0)))
     radius = np.sqrt(1.0 - z * z)

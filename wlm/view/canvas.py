@@ -1,4 +1,4 @@
-"""What scenes draw with: meshes, lines and volumes in the panels of a window, known by name and brought up to date."""
+"""Drawing of meshes, lines and volumes in the panels of a window; each has a name, by which it is updated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-_LEVELS = 256  # of the opacity of smoke
-_STEP = 0.5  # voxels between two samples of smoke: whole ones show as stripes, and small ones round the colour away
+_LEVELS = 256  # of the opacity table of smoke
+_STEP = 0.5  # voxels between two samples of smoke; 1 shows stripes, and much smaller steps lose colour to rounding
 
 
 @dataclass(frozen=True)
 class Hit:
-    """What lies under the cursor.
+    """The point of a mesh under the cursor.
 
     Attributes:
-        panel: Number of the panel.
-        name: That the scene gave the mesh.
-        cell: Number of the mesh's cell.
-        weights: Of a triangle's corners at the point, float64 [3].
+        panel: Index of the panel.
+        name: Name of the mesh.
+        cell: Index of the triangle.
+        weights: float64 [3], barycentric weights of the triangle's corners at the point.
     """
 
     panel: int
@@ -29,15 +29,15 @@ class Hit:
 
 
 class Canvas:
-    """The panels of a plotter. A mesh is known by its panel and its name; drawing it again replaces what changed."""
+    """The panels of a plotter. A mesh is identified by panel and name; drawing it again updates what changed."""
 
     def __init__(self, pyvista: ModuleType, plotter: Any, panels: int) -> None:
-        """Takes the first panels of a plotter.
+        """Uses the first renderers of a plotter as panels.
 
         Args:
             pyvista: The package.
             plotter: Its plotter.
-            panels: How many; they are the plotter's first renderers.
+            panels: Number of panels.
         """
         self._pyvista, self._plotter = pyvista, plotter
         self.renderers = plotter.renderers[:panels]
@@ -56,17 +56,17 @@ class Canvas:
         nearest: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles under a picture; later calls change the picture alone.
+        """Draws triangles with a texture; later calls only change the texture.
 
         Args:
-            panel: Number of the panel.
-            name: Of the mesh.
+            panel: Index of the panel.
+            name: Name of the mesh.
             position: [V, 3].
             triangle: int [F, 3].
-            uv: [V, 2], u right, v down.
+            uv: [V, 2], with v down.
             picture: uint8 [H, W, 3].
-            nearest: Whether texels show as squares.
-            one_sided: Whether triangles that face away, clockwise as seen, are left out.
+            nearest: Whether the texture is read without a filter.
+            one_sided: Whether triangles that face away from the camera are hidden.
         """
         drawn = self._drawn.get((panel, name))
         if drawn is None:
@@ -90,16 +90,16 @@ class Canvas:
         shape: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles of one colour a vertex.
+        """Draws triangles with vertex colours.
 
         Args:
-            panel: Number of the panel.
-            name: Of the mesh.
+            panel: Index of the panel.
+            name: Name of the mesh.
             position: [V, 3].
             triangle: int [F, 3].
             colours: uint8 [V, 3].
-            shape: Whether a lamp at the camera shows the shape, which the colours don't.
-            one_sided: As for `textured`.
+            shape: Whether a light at the camera shades the mesh, to show its shape.
+            one_sided: As of `textured`.
         """
         drawn = self._drawn.get((panel, name))
         if drawn is not None and len(drawn[1].points) == len(position) and drawn[1].n_cells == len(triangle):
@@ -136,13 +136,13 @@ class Canvas:
         """Draws a volume.
 
         Args:
-            panel: Number of the panel.
-            name: Of the volume.
+            panel: Index of the panel.
+            name: Name of the volume.
             colour: uint8 [X, Y, Z, 3].
             density: float [X, Y, Z] in [0, 1].
-            depth: Optical depth of a voxel's edge at density 1.
-            voxel: Its length.
-            origin: [3], the corner of the first voxel.
+            depth: Optical depth along a voxel's edge at density 1.
+            voxel: Length of a voxel's edge.
+            origin: [3], corner of the first voxel.
         """
         codes = np.concatenate([colour, (density[..., None] * 255.0 + 0.5).astype(np.uint8)], -1)
         codes = np.ascontiguousarray(codes.transpose(2, 1, 0, 3).reshape(-1, 4))
@@ -152,8 +152,8 @@ class Canvas:
         grid.point_data["smoke"] = codes
         self._plotter.subplot(0, panel)
         options = {"name": f"{panel} {name}", "render": False, "reset_camera": False, "show_scalar_bar": False}
-        # Made anew, since this mapper doesn't see that voxels changed. On GPUs VTK 9.7 takes the opacities of coloured
-        # voxels for much less, and ignores their unit of length.
+        # The volume is made anew, since this mapper does not notice changed voxels. The GPU mapper of VTK 9.7 reads the
+        # opacities of coloured voxels as much smaller, and ignores their unit of length.
         actor = self._plotter.add_volume(grid, scalars="smoke", mapper="fixed_point", **options)
         actor.mapper.SetAutoAdjustSampleDistances(False)
         actor.mapper.SetSampleDistance(_STEP * voxel)
@@ -166,20 +166,20 @@ class Canvas:
         self._drawn[panel, name] = actor, grid
 
     def hide(self, panel: int, *names: str) -> None:
-        """Hides meshes; those that were never drawn don't matter."""
+        """Hides meshes; names that were never drawn are ignored."""
         for name in names:
             if (panel, name) in self._drawn:
                 self._drawn[panel, name][0].visibility = False
 
     def hit(self, x: int, y: int) -> Hit | None:
-        """The triangle of a mesh at a pixel of the window, counted from the lower left."""
+        """Finds the triangle at a pixel of the window, counted from the lower left."""
         from vtkmodules.vtkRenderingCore import vtkCellPicker
 
         for panel, renderer in enumerate(self.renderers):
             if not renderer.IsInViewport(x, y):
                 continue
             here = {name: drawn for (where, name), drawn in self._drawn.items() if where == panel}
-            # The picker sees the backs that are left out, so what is one-sided is looked for without it.
+            # The picker also hits hidden back faces, so one-sided meshes are intersected without it.
             walls = {name for name in here if (panel, name) in self._one_sided and here[name][0].visibility}
             for name, (actor, _) in here.items():
                 actor.pickable = name not in walls
@@ -202,7 +202,7 @@ class Canvas:
         return None
 
     def _leave_out(self, panel: int, name: str, one_sided: bool) -> None:
-        """Draws a mesh without its backs, or with them."""
+        """Hides or shows the back faces of a mesh."""
         self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
         (self._one_sided.add if one_sided else self._one_sided.discard)((panel, name))
 
@@ -219,7 +219,7 @@ class Canvas:
 
 
 def _world(renderer: Any, x: int, y: int, depth: float) -> np.ndarray:
-    """The point float64 [3] at a pixel, between the near plane, 0, and the far one, 1."""
+    """Returns the point float64 [3] at a pixel and a depth between the near plane, 0, and the far plane, 1."""
     renderer.SetDisplayPoint(x, y, depth)
     renderer.DisplayToWorld()
     *point, share = renderer.GetWorldPoint()
@@ -227,7 +227,7 @@ def _world(renderer: Any, x: int, y: int, depth: float) -> np.ndarray:
 
 
 def _front_hits(mesh: Any, origin: np.ndarray, direction: np.ndarray) -> list[tuple[float, int, np.ndarray]]:
-    """The nearest triangle that a ray meets from its front, if any: distance, number and the point's weights.
+    """Finds the nearest triangle whose front face a ray hits: distance, index and barycentric weights; or nothing.
 
     Distances are in lengths of `direction` (Möller and Trumbore 1997).
     """
@@ -235,7 +235,7 @@ def _front_hits(mesh: Any, origin: np.ndarray, direction: np.ndarray) -> list[tu
     across, along = b - a, c - a
     turned = np.cross(direction, along)
     scale = np.einsum("fk,fk->f", across, turned)
-    front = np.flatnonzero(scale > 0.0)  # the others face away, or are seen from their edge
+    front = np.flatnonzero(scale > 0.0)  # the others face away or are edge-on
     scale, turned, across, along = scale[front], turned[front], across[front], along[front]
     away = origin - a[front]
     r = np.einsum("fk,fk->f", away, turned) / scale

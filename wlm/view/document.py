@@ -1,4 +1,4 @@
-"""Scores as a page: tables, plots by hour, tile or frame, and pictures of what is worst. One HTML file, no script."""
+"""HTML reports: tables, plots and pictures in one file without a script."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ figcaption { font-size: 13px; opacity: 0.75; }
 
 @dataclass
 class Document:
-    """A page that is filled from its top.
+    """An HTML report, to which parts are added in order.
 
     Attributes:
-        title: Its heading.
+        title: The heading.
     """
 
     title: str
@@ -49,22 +49,22 @@ class Document:
         self._parts.append(f"<p{' class=warning' if warning else ''}>{html.escape(words)}</p>")
 
     def table(self, heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Adds a table of words and numbers."""
+        """Adds a table."""
         head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
         lines = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
         body = "".join(f"<tr>{line}</tr>" for line in lines)
         self._add(heading, f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>')
 
     def lines(self, heading: str, unit: str, places: np.ndarray, series: Mapping[str, np.ndarray]) -> None:
-        """Adds a plot of numbers over times or other places [N]; NaN leaves a gap."""
+        """Adds a line plot over times or other positions [N]; NaN leaves a gap."""
         self._plot(heading, unit, places, series, "-")
 
     def points(self, heading: str, unit: str, names: Sequence[str], series: Mapping[str, Sequence[float]]) -> None:
-        """Adds a plot of a number for each name; NaN leaves a gap."""
+        """Adds a plot of one point for each name; NaN leaves a gap."""
         self._plot(heading, unit, names, series, "none")
 
     def grid(self, heading: str, unit: str, values: np.ndarray) -> None:
-        """Adds a map of numbers [rows, columns], one a tile; NaN stays empty."""
+        """Adds a colour map of numbers [rows, columns]; NaN stays empty."""
         rows, columns = values.shape
         height = min(max(_WIDTH * 0.8 * rows / columns, 1.2), 3.5)
         figure = Figure(figsize=(_WIDTH, height), layout="constrained")
@@ -81,7 +81,7 @@ class Document:
         self._add(heading, _png_of(figure))
 
     def histogram(self, heading: str, unit: str, values: np.ndarray) -> None:
-        """Adds how often numbers of each size are; those that aren't finite are left out."""
+        """Adds a histogram of the finite numbers."""
         figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
         axes = figure.add_subplot()
         axes.hist(values[np.isfinite(values)], bins=60, color=_LOOKS[1][0])
@@ -89,7 +89,7 @@ class Document:
         self._add(heading, _png_of(figure))
 
     def pictures(self, heading: str, pictures: Mapping[str, np.ndarray], width: int | None = None) -> None:
-        """Adds pictures uint8 [H, W, 3] under their captions, texels as squares; `width` in the page's pixels."""
+        """Adds pictures uint8 [H, W, 3] with captions, pixels as squares; `width` is in CSS pixels."""
         size = "" if width is None else f' style="width: {width}px"'
         parts = [
             f"<figure>{_image(pixels, size)}<figcaption>{html.escape(caption)}</figcaption></figure>"
@@ -98,10 +98,10 @@ class Document:
         self._add(heading, f'<div class="pixels">{"".join(parts)}</div>')
 
     def write(self, path: str | os.PathLike[str]) -> int:
-        """Writes the page, whole or not at all; returns its bytes.
+        """Writes the page atomically; returns its size in bytes.
 
         Raises:
-            WlmError: The file can't be written.
+            WlmError: The file cannot be written.
         """
         title = html.escape(self.title)
         meta = '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.probe.data import ProbeSet
-from wlm.probe.light import Light, StoredLight
-from wlm.probe.model import CENTRE, ROTATION, SCALE, ProbeModel
+from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
+from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
 from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
-from wlm.probe.transform import Transform
-from wlm.probe.volume import Volume
-from wlm.probe.walk import camera_path, settle
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import Light, StoredLight
+from wlm.probe.volume.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State, frame_slider
@@ -63,7 +63,7 @@ class Probes:
     @classmethod
     def of_model(
         cls,
-        model: ProbeModel | Transform,
+        model: ProbeModel,
         position: np.ndarray,
         original: np.ndarray | None,
         live: np.ndarray,
@@ -75,12 +75,12 @@ class Probes:
             WlmError: A probe's numbers are no spherical harmonics.
         """
         count = _coefficients(model.outputs, title)
-        decoder, places = model.decoder(), position[live]
-        values = {"decoded": decoder.decode_probes(position)[live].reshape(-1, count, 3)}
+        decoder, places = model.decoder(position=position), position[live]
+        values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
         if original is not None:
             values["original"] = original[live].reshape(-1, count, 3)
-        shapes = model if isinstance(model, ProbeModel) else None
-        gaussians = "" if shapes is None else f"{shapes.count:,} Gaussians, "
+        shapes = model if isinstance(model.content, Gaussians) else None
+        gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
         note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
         light = StoredLight(values["decoded"])
         return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, shapes, note)
@@ -221,7 +221,7 @@ class _ProbeScene(Scene):
 
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
-        rows = model.rows().astype(np.float64)
+        rows = model.content.rows().astype(np.float64)
         shape = _rotations(rows[:, ROTATION]) * np.exp(rows[:, SCALE])[:, None, :]
         centre = model.origin + model.extent * rows[:, CENTRE]
         ball, faces = _icosphere(1)

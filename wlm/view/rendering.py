@@ -1,4 +1,4 @@
-"""VTK by way of pyvista, an optional package, with errors of one line where it is missing or can't render."""
+"""Access to VTK through the optional package pyvista; one-line errors if it is missing or cannot render."""
 
 import functools
 import subprocess
@@ -20,13 +20,13 @@ _TRIAL_SECONDS = 60.0
 
 
 def import_pyvista(what: str) -> ModuleType:
-    """The package.
+    """Imports pyvista.
 
     Args:
-        what: What needs it, for the error.
+        what: Name of the feature that needs it, for the error.
 
     Raises:
-        WlmError: It isn't installed.
+        WlmError: It is not installed.
     """
     try:
         import pyvista
@@ -37,13 +37,13 @@ def import_pyvista(what: str) -> ModuleType:
 
 @functools.cache
 def require_opengl(what: str) -> None:
-    """Lets a child process render first: where VTK finds no OpenGL that works, it ends its process with a crash.
+    """Renders in a child process first, since VTK crashes its process if no OpenGL works.
 
     Args:
-        what: What needs it, for the error.
+        what: Name of the feature that needs it, for the error.
 
     Raises:
-        WlmError: The child failed.
+        WlmError: The child process failed.
     """
     try:
         trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, timeout=_TRIAL_SECONDS)

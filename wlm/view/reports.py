@@ -21,7 +21,6 @@ from wlm.metrics.error import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import Report as ProbeReport
 from wlm.probe.model import ProbeModel
-from wlm.probe.transform import Transform
 from wlm.smoke.camera import Camera
 from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
 from wlm.smoke.model import SmokeModel, parameter_count
@@ -165,7 +164,7 @@ def atlas_report(
 
 
 def probe_report(
-    path: str | os.PathLike[str], model: ProbeModel | Transform, probes: ProbeSet, report: ProbeReport
+    path: str | os.PathLike[str], model: ProbeModel, probes: ProbeSet, report: ProbeReport
 ) -> int:
     """Writes a probe report: the summary, errors by band and by probe, and the worst probes.
 

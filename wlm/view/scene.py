@@ -1,4 +1,4 @@
-"""What a window shows: panels, sliders and views, made by one class for each kind of file."""
+"""Base class of the scenes that a window shows: panels, sliders and views; one subclass for each kind of file."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from wlm.view.display import TONES, Display
 
 @dataclass(frozen=True)
 class Slider:
-    """A number that a user moves.
+    """A slider.
 
     Attributes:
-        name: Shown beside it, and that of the command's option.
-        low, high: Its ends.
-        value: Where it begins.
-        step: What a key moves it by.
-        form: Of its value in text.
-        unit: Behind its value in text.
-        whole: Whether it has only whole values.
-        wraps: Whether its end is its beginning again, as midnight is.
-        clock: Whether it is in hours of a day, which its text also has as a clock shows them.
-        views: The views in which it does something; empty: all.
+        name: Name, shown as a label; also the name of the command's option.
+        low, high: Range of values.
+        value: Initial value.
+        step: Change by one key press.
+        form: Format of the value in the label.
+        unit: Text after the value in the label.
+        whole: Whether only integers are allowed.
+        wraps: Whether `high` is the same as `low`, as for hours of a day.
+        clock: Whether the value is an hour of a day, which the label also shows as a clock time.
+        views: Views in which it has an effect; empty for all.
     """
 
     name: str
@@ -39,13 +39,13 @@ class Slider:
     views: tuple[str, ...] = ()
 
     def text(self, value: float) -> str:
-        """Its name and a value of it."""
+        """Label for a value."""
         shown = f"{self.name} {value:{self.form}}{self.unit}"
         minutes = round(value * 60.0) % 1440
         return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown
 
     def fit(self, value: float) -> float:
-        """The nearest value that it may have."""
+        """Nearest allowed value."""
         if self.wraps and not self.low <= value <= self.high:
             value = self.low + (value - self.low) % (self.high - self.low)
         value = min(max(value, self.low), self.high)
@@ -53,7 +53,7 @@ class Slider:
 
 
 def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
-    """A slider of so many frames, which users count from 1; none for one frame."""
+    """A slider of frame numbers from 1 to `count`; no slider for a single frame."""
     if count < 2:
         return ()
     return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)
@@ -61,13 +61,13 @@ def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
 
 @dataclass
 class State:
-    """What a user has chosen.
+    """The user's choices.
 
     Attributes:
-        values: Of the sliders, by name.
+        values: Values of the sliders by name.
         view: One of the scene's views.
         tone: One of `wlm.view.display.TONES`.
-        outside: Whether the walls of a room are drawn from outside too, where they hide it.
+        outside: Whether the walls of a room are also drawn when seen from outside.
     """
 
     values: dict[str, float]
@@ -77,27 +77,27 @@ class State:
 
     @property
     def frame(self) -> int:
-        """The index of the frame; users count them from 1."""
+        """Index of the current frame, from 0."""
         return int(self.values.get("frame", 1)) - 1
 
     def display(self, exposure: float) -> Display:
-        """How light is shown; `exposure` is that of 0 EV."""
+        """Display settings; `exposure` is the exposure at 0 EV."""
         return Display(exposure * 2.0 ** self.values.get("exposure", 0.0), self.tone, self.values.get("error", 1.0))
 
 
 @dataclass
 class Scene(ABC):
-    """One file, as a window shows it.
+    """The content of one file in a window.
 
     Attributes:
-        title: Of the window.
-        panels: A title for each picture, from left to right.
-        views: What the first of them can show besides; the first view is the usual one.
-        sliders: Its own; the window adds those of the exposure and of the error.
-        plays: The slider that runs when the scene is played; None, or in views without it: the camera turns.
-        flat: Whether it lies in a plane, which isn't turned.
-        up: 0 to 2, the axis that points up.
-        room: Whether its mesh is a room that hides what is lit unless one looks through its walls from outside.
+        title: Title of the window.
+        panels: Titles of the panels from left to right.
+        views: Views of the first panel; the first view is the default.
+        sliders: Sliders of the scene; the window adds those of exposure and error.
+        plays: Name of the slider that playing moves; if it is None or has no effect in the view, the camera turns.
+        flat: Whether the scene lies in a plane and the camera does not turn.
+        up: Index of the upward axis, 0 to 2.
+        room: Whether the mesh is a room, whose walls are hidden when seen from outside.
     """
 
     title: str
@@ -111,16 +111,16 @@ class Scene(ABC):
 
     @abstractmethod
     def draw(self, canvas: Canvas, state: State) -> None:
-        """Brings what the panels show up to date; the first call fills them."""
+        """Draws or updates the content of the panels."""
 
     @abstractmethod
     def caption(self, state: State) -> str:
-        """A line on what is shown."""
+        """One line about the content."""
 
     def box(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """The lowest and highest corner of what the camera shall see at first; None: of all that is drawn."""
+        """Lowest and highest corner of the region that the first camera shows; None for everything that is drawn."""
         return None
 
     def describe(self, hit: Hit, state: State) -> str:
-        """A line on what lies under the cursor; empty: nothing to tell."""
+        """One line about the point under the cursor; may be empty."""
         return ""

@@ -1,4 +1,4 @@
-"""A lightmap on its mesh, or as a flat picture: what lightmaps over the day and atlases have in common."""
+"""Scenes of a lightmap on its mesh or as a flat picture: lightmaps over time and lightmaps of meshes."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from wlm.formats.geometry import Geometry
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.scene import Scene, State
 
-_NO_CHART = 77  # of 255, as on the pages for a browser
-_SHARE = 0.6  # of a tile's colour over the light
+_NO_CHART = 77  # grey level, as on the HTML pages
+_SHARE = 0.6  # opacity of a tile's colour over the light
 _MESH = "mesh"
 
 
 def flat_geometry(height: int, width: int) -> Geometry:
-    """Two triangles that show a whole lightmap, its longer side 1."""
+    """Makes two triangles that show a whole lightmap; its longer side is 1."""
     x, y = np.array([width, height]) / (2.0 * max(width, height))
     position = np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]], np.float32)
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
@@ -23,7 +23,7 @@ def flat_geometry(height: int, width: int) -> Geometry:
 
 
 def compared(decoded: bool, original: bool) -> tuple[str, ...]:
-    """The titles of panels for what there is."""
+    """Titles of the panels."""
     if decoded and original:
         return ("decoded", "original", "error")
     return ("decoded",) if decoded else ("original",)
@@ -34,10 +34,10 @@ class SurfaceScene(Scene):
     """A scene of one lightmap.
 
     Attributes:
-        geometry: Where it lies, with lightmap UVs.
+        geometry: The mesh, with lightmap UVs.
         brightness: Exposure at 0 EV.
-        height, width: Texels.
-        mask: bool [H, W], the texels that belong to a chart; None: nobody knows.
+        height, width: Size of the lightmap in texels.
+        mask: bool [H, W], texels inside charts; None if unknown.
     """
 
     geometry: Geometry
@@ -48,15 +48,15 @@ class SurfaceScene(Scene):
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
-        """The light of "decoded" and "original", as there are, float32 [H, W, 3], gaps between charts filled."""
+        """Light float32 [H, W, 3] by name, "decoded" or "original" or both, with the gaps between charts filled."""
 
     @abstractmethod
     def tell_texel(self, row: int, column: int, state: State) -> str:
-        """A line on a texel, less its place and its light."""
+        """Further facts about a texel, besides its position and light."""
 
     @abstractmethod
     def tile_colours(self) -> np.ndarray:
-        """A colour for each texel, of its tile, [H, W, 3] in [0, 1]; asked for in the view "tiles" alone."""
+        """Colours [H, W, 3] in [0, 1] of the texels' tiles, for the view "tiles"."""
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display, lights = state.display(self.brightness), self.lights(state)
@@ -64,7 +64,7 @@ class SurfaceScene(Scene):
             if name == "error":
                 picture = display.error(lights["decoded"], lights["original"])
                 if self.flat and self.mask is not None:
-                    # Never seen on the mesh, and no score has them.
+                    # These texels are not visible on the mesh, and are in no score.
                     picture[~self.mask] = _NO_CHART
             else:
                 picture = display.picture(lights[name])

@@ -1,4 +1,4 @@
-"""A window on a scene: panels side by side, sliders below them, keys; on a screen, as a picture or as a movie."""
+"""A window that shows a scene: panels side by side, sliders below them, keys; on screen, as a picture or a movie."""
 
 import os
 import time
@@ -18,19 +18,19 @@ from wlm.view.rendering import import_pyvista, require_opengl
 from wlm.view.scene import Scene, Slider, State
 
 MOVIES = {".gif": "GIF", ".webp": "WEBP"}
-"""Kinds of movies, by the name's end."""
+"""Formats of movies by file suffix."""
 
 STRIP = 108
-"""Height of the sliders' strip at the bottom, pixels; at most half of the window's."""
+"""Height in pixels of the strip with the sliders at the bottom; at most half of the window's height."""
 
-_HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK takes where it finds no display
+_HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # windows that VTK opens if there is no display
 _BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
 _TITLE_PIXELS, _FONT, _TITLE_FONT = 26, 9, 10
-# Places in the strip, as shares of its height and of the width.
+# Positions in the strip, as fractions of its height and width.
 _LABELS, _BARS, _CAPTION, _TOLD, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
-_EYE = (1.0, 0.8, 1.0)  # from where a scene is first seen, y up
+_EYE = (1.0, 0.8, 1.0)  # direction of the first camera, with y up
 _MARGIN = 1.06
-_SWEEP = 12.0  # seconds in which a slider without whole values is played
+_SWEEP = 12.0  # seconds to play a slider of real values once
 _TICK = 30  # milliseconds
 _FRAMES = 48  # of a movie
 _EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
@@ -38,13 +38,13 @@ _ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
 
 
 class Window:
-    """A scene on a plotter.
+    """A window of a scene.
 
     Attributes:
         scene: The scene.
-        state: What the user has chosen; change it by `set`, `choose` and `tone`.
-        playing: Whether it runs.
-        sliders: By name.
+        state: The user's choices; change them with `set`, `choose` and `tone`.
+        playing: Whether the scene is played.
+        sliders: The sliders by name.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class Window:
         Args:
             scene: The scene.
             size: Width and height, pixels.
-            rate: Frames a second of a played scene that has frames.
-            off_screen: Whether it is never shown.
+            rate: Frames a second of scenes with frames.
+            off_screen: Whether the window stays hidden.
 
         Raises:
-            WlmError: pyvista is missing, VTK finds no OpenGL, there is no display, or the scene can't be drawn.
+            WlmError: pyvista is missing, VTK finds no OpenGL, there is no display, or the scene cannot be drawn.
         """
         pyvista = import_pyvista("view")
         require_opengl("view")
@@ -69,7 +69,7 @@ class Window:
         self.state = State({name: slider.value for name, slider in self.sliders.items()}, scene.views[0])
         count, self._share = len(scene.panels), min(STRIP / size[1], 0.5)
         layout = {"shape": (2, count), "groups": [(1, slice(None))], "row_weights": [1.0 - self._share, self._share]}
-        # Messages about a missing display would alarm for nothing where rendering is off screen.
+        # Off-screen rendering works without a display, so VTK's messages about it are suppressed.
         with pyvista.vtk_verbosity("off"):
             self._plotter = pyvista.Plotter(
                 **layout, off_screen=off_screen, border=False, window_size=size, title=scene.title
@@ -85,10 +85,10 @@ class Window:
         self.look()
 
     def set(self, name: str, value: float) -> None:
-        """Moves a slider; what lies beyond its ends is taken for them.
+        """Moves a slider; values outside its range are clamped.
 
         Raises:
-            WlmError: The scene has no such slider, or the value isn't finite.
+            WlmError: The scene has no such slider, or the value is not finite.
         """
         if name not in self.sliders:
             raise WlmError(f"{self.scene.title}: --{name} means nothing to this file")
@@ -112,7 +112,7 @@ class Window:
         """Changes the tone mapping.
 
         Raises:
-            WlmError: There is no such one.
+            WlmError: Unknown tone mapping.
         """
         if name not in TONES:
             raise WlmError(f"--tone: expected {' or '.join(TONES)}, got {name}")
@@ -120,10 +120,10 @@ class Window:
         self.draw()
 
     def outside(self, seen: bool) -> None:
-        """Draws the walls of a room from outside too, or leaves them out there.
+        """Shows or hides the walls of a room when seen from outside.
 
         Raises:
-            WlmError: The scene is no room.
+            WlmError: The scene is not a room.
         """
         if not self.scene.room:
             raise WlmError(f"{self.scene.title}: --outside: expected the mesh of a room, whose walls face its middle")
@@ -134,7 +134,7 @@ class Window:
         """Turns the camera about the scene's upward axis.
 
         Raises:
-            WlmError: The angle isn't finite.
+            WlmError: The angle is not finite.
         """
         if not np.isfinite(degrees):
             raise WlmError(f"--turn: expected a finite number, got {degrees}")
@@ -145,7 +145,7 @@ class Window:
         self._clip()
 
     def advance(self, seconds: float) -> None:
-        """Plays the scene by some time."""
+        """Advances the playing scene by some seconds."""
         name = self._player()
         if name is None:
             self.turn(360.0 * seconds / _SWEEP)
@@ -159,7 +159,7 @@ class Window:
         self._played = value
 
     def draw(self) -> None:
-        """Brings all up to date with the state."""
+        """Redraws everything for the current state."""
         self.scene.draw(self.canvas, self.state)
         self._played = self.state.values.get(self.scene.plays, 0.0)
         self._lay_out()
@@ -170,21 +170,21 @@ class Window:
         self._tell()
 
     def tell(self, x: int, y: int) -> str:
-        """Says, also in the window, what lies at a pixel, counted from the lower left."""
+        """Describes the point at a pixel, counted from the lower left, and shows the text in the window."""
         self._hit = self.canvas.hit(x, y)
         return self._tell()
 
     def picture(self) -> np.ndarray:
-        """What the window shows, uint8 [H, W, 3]."""
+        """Renders the window, uint8 [H, W, 3]."""
         self._clip()
         self._plotter.render()
         return np.array(self._plotter.screenshot(return_img=True)[..., :3])
 
     def screenshot(self, path: str | os.PathLike[str]) -> None:
-        """Writes what the window shows as a PNG, whole or not at all.
+        """Writes the content of the window as a PNG, atomically.
 
         Raises:
-            WlmError: It can't be written.
+            WlmError: The file cannot be written.
         """
         with atomic_path(path) as temporary:
             Image.fromarray(self.picture()).save(temporary, format="PNG")
@@ -192,18 +192,18 @@ class Window:
     def movie(
         self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None
     ) -> int:
-        """Writes the scene, played once, as a GIF or WebP that begins again for ever.
+        """Plays the scene once and writes it as a GIF or WebP that loops.
 
         Args:
-            path: Ends in one of `MOVIES`.
-            frames: Pictures; None: 48, or all frames where frames are played.
+            path: A path with a suffix in `MOVIES`.
+            frames: Number of pictures; None for 48, or for all frames if frames are played.
             progress: Called about twice a second.
 
         Returns:
             The number of pictures.
 
         Raises:
-            WlmError: It can't be written, or no picture is asked for.
+            WlmError: The file cannot be written, or the number of pictures is not at least 1.
         """
         suffix = Path(path).suffix.lower()
         if suffix not in MOVIES:
@@ -222,7 +222,7 @@ class Window:
         return len(pictures)
 
     def show(self) -> None:
-        """Opens the window until the user closes it."""
+        """Shows the window until the user closes it."""
         interactor = self._plotter.iren
         interactor.initialize()
         if self.scene.flat:
@@ -233,17 +233,17 @@ class Window:
         self._plotter.show(auto_close=True)
 
     def close(self) -> None:
-        """Gives the window back."""
+        """Closes the window."""
         self._plotter.close()
 
     def press(self, key: str) -> None:
-        """Does what a key does, by VTK's name of it."""
+        """Runs the action of a key, given by VTK's name."""
         if key in self._keys:
             self._keys[key]()
             self._plotter.render()
 
     def _furnish(self) -> None:
-        """Titles, sliders, texts and keys."""
+        """Adds titles, sliders, texts and keys."""
         plotter = self._plotter
         for number, title in enumerate(self.scene.panels):
             plotter.subplot(0, number)
@@ -264,7 +264,7 @@ class Window:
             widget = plotter.add_slider_widget(
                 None, rng=(slider.low, slider.high), value=slider.value, interaction_event="always"
             )
-            # The plotter's own callback would also be called now, and turn errors into warnings.
+            # The plotter's own callback would also run now, and turn errors into warnings.
             moved = lambda widget, _, name=name: self.set(name, widget.GetRepresentation().GetValue())  # noqa: E731
             widget.AddObserver("InteractionEvent", moved)
             shape = widget.GetRepresentation()
@@ -291,7 +291,7 @@ class Window:
             self._keys["b"] = lambda: self.outside(not self.state.outside)
         for number, view in enumerate(self.scene.views, 1):
             self._keys[str(number)] = lambda view=view: self.choose(view)
-        # The plotter's and VTK's own keys would turn stereo and wires on.
+        # The default keys of the plotter and VTK would switch to stereo and wireframe.
         plotter.iren.clear_key_event_callbacks()
         plotter.iren.interactor.RemoveObservers("CharEvent")
         plotter.add_key_event("q", plotter.iren.terminate_app)
@@ -299,23 +299,23 @@ class Window:
             plotter.add_key_event(key, lambda key=key: self.press(key))
 
     def _shows(self, name: str) -> bool:
-        """Whether a slider does something in this view."""
+        """Whether a slider has an effect in the current view."""
         views = self.sliders[name].views
         return not views or self.state.view in views
 
     def _player(self) -> str | None:
-        """The slider that playing moves in this view; None: the camera turns."""
+        """Name of the slider that playing moves in this view; None if the camera turns."""
         name = self.scene.plays
         return name if name is not None and self._shows(name) else None
 
     def _tell(self) -> str:
         told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
-        # A picture or a movie has no keys.
+        # Keys have no effect in a picture or a movie.
         self._texts["told"].SetInput(told or ("" if self._plotter.off_screen else self.help()))
         return told
 
     def help(self) -> str:
-        """A line on the keys that do something in this view."""
+        """One line about the keys that have an effect in this view."""
         moved, views = self._main(), len(self.scene.views)
         does = {
             "space": "turns" if self._player() is None else "plays",
@@ -331,7 +331,7 @@ class Window:
         return "keys:   " + "   ".join(f"{key} {what}" for key, what in does.items() if what)
 
     def _lay_out(self) -> None:
-        """Shows the sliders of the view side by side, with their values."""
+        """Places the sliders of the view side by side, with their values."""
         shown = [name for name in self.sliders if self._shows(name)]
         cell = 1.0 / max(len(shown), _LEAST_CELLS)
         for name, slider in self.sliders.items():
@@ -346,7 +346,7 @@ class Window:
                 text.SetPosition(left + _INDENT, _LABELS)
                 for point, x in ((shape.GetPoint1Coordinate(), 0.0), (shape.GetPoint2Coordinate(), cell - 0.02)):
                     point.SetValue(left + _INDENT + x, _BARS * self._share)
-            # It doesn't see that its ends moved.
+            # The widget does not notice that its ends moved.
             shape.Modified()
 
     def _move(self, name: str | None, steps: int) -> None:
@@ -354,7 +354,7 @@ class Window:
             self.set(name, self.state.values[name] + steps * self.sliders[name].step)
 
     def _main(self) -> str | None:
-        """The slider of the arrow keys: the first of the scene's own in this view."""
+        """Name of the slider of the arrow keys: the first one of the scene in this view."""
         return next((slider.name for slider in self.scene.sliders if self._shows(slider.name)), None)
 
     def _toggle(self) -> None:
@@ -373,7 +373,7 @@ class Window:
             self._plotter.render()
 
     def _count(self, frames: int | None) -> int:
-        """Pictures of a movie."""
+        """Number of pictures of a movie."""
         name = self._player()
         slider = None if name is None else self.sliders[name]
         return frames or (round(slider.high - slider.low) + 1 if slider is not None and slider.whole else _FRAMES)
@@ -392,7 +392,7 @@ class Window:
             yield self.picture()
 
     def look(self) -> None:
-        """Puts the camera where it sees all of the scene."""
+        """Places the camera so that it sees the whole scene."""
         first = self.canvas.renderers[0]
         camera = first.camera
         low, high = self.scene.box() or np.array(first.ComputeVisiblePropBounds()).reshape(3, 2).T
@@ -408,7 +408,7 @@ class Window:
         corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) - middle
         across, rise, near = axes @ corners.T
         width, height = first.GetSize()
-        # The titles' strip stays free, above and, since the scene is in the middle, below.
+        # The strip of titles stays free above, and below as well, since the scene is centred.
         free = max(height - 2 * _TITLE_PIXELS, 1) if len(self.scene.panels) > 1 else height
         reach = _MARGIN * np.maximum(np.abs(rise) * height / free, np.abs(across) * height / width)
         away = float((reach / np.tan(np.radians(camera.view_angle) / 2) + near).max())
@@ -425,7 +425,7 @@ class Window:
 
 
 def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    """A vector turned about an axis of length 1 (Rodrigues)."""
+    """Rotates a vector about a unit axis (Rodrigues)."""
     return (
         vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1.0 - np.cos(angle))
     )

@@ -52,7 +52,7 @@ Views = wp.types.matrix(shape=(LEVELS, 4), dtype=float)
 
 @wp.struct
 class Index:
-    """Probes by cell, and the blocks that have one near; see `wlm.probe.index`.
+    """Probes by cell, and the blocks that have one near; see `wlm.probe.volume.index`.
 
     Attributes:
         key: [N], rising.

@@ -18,7 +18,7 @@ from benchmarks.rivals.probe import (
     window_pca,
 )
 from wlm.errors import WlmError
-from wlm.probe.unreal import pack_unreal, unpack_unreal
+from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
 
 HALF = 2.0**-11  # relative error of a half float
 SIGNAL = functools.partial(clustered_pca, signal=True)

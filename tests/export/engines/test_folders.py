@@ -23,6 +23,7 @@ from wlm.atlas.mips import make_tail
 from wlm.export import ENGINES, export
 from wlm.formats.light import read_light
 from wlm.inspection import inspect
+from wlm.lightmap.bundle import sheet_bundle
 
 ALL = (4, 3, 2, 1, 4, 0)
 
@@ -89,9 +90,8 @@ def test_sheets_of_light_have_a_folder_each(tmp_path):
         shared = [path.relative_to(out).as_posix() for path in paths if path.suffix == ".cs"]
         assert shared == (["WlmLightmap.cs"] if engine == "unity" else [])
         for part in index["parts"]:
-            light = next(
-                own for sheet, own in model.sheets.items() if sheet.atlas == atlases[part] and not sheet.linear
-            )
+            sheet = next(each for each in model.sheets if each.atlas == atlases[part] and not each.linear)
+            light = sheet_bundle(sheet, model.sheets[sheet], model.name, model.source)
             alone = {path.name: path for path in export(light, tmp_path / f"alone-{engine}", engine)}
             same = [name for name in alone if Path(name).suffix in (".bytes", ".dds", ".bin", ".tga", ".exr")]
             for name in same:

@@ -77,7 +77,7 @@ def test_frames_of_the_original_are_spread_over_the_day(tmp_path):
     page = make_page([tmp_path / "city.wlm"], original=folder, hours=3, progress=reports.append)
     assert page.manifest["reference"]["times"] == [lightmaps.times[i] for i in (0, 2, 4)]
     assert page.manifest["time"] == lightmaps.times[2] and reports[-1].done == reports[-1].total == 3
-    assert ((page.arrays["mask"] > 0) == lightmaps.mask).all()
+    assert ((page.arrays["mask"] > 0) == lightmaps.light.mask).all()
     assert sorted(name for name in page.arrays if name.startswith("original")) == [f"original_{i}" for i in range(3)]
     with pytest.raises(WlmError, match="--hours"):
         make_page([tmp_path / "city.wlm"], original=folder, hours=0)
@@ -118,7 +118,7 @@ def test_the_scores_of_a_page_are_those_of_evaluate(tmp_path):
     model.save(tmp_path / "city.wlm")
     small_sets.write_set(tmp_path / "set", lightmaps)
     page = make_page([tmp_path / "city.wlm"], original=tmp_path / "set", hours=3)
-    expected = wlm.lightmap.evaluate(model, lightmaps, metrics=("psnr",)).psnr_by_time[[0, 2, 4]]
+    expected = wlm.lightmap.evaluate(model, lightmaps, metrics=("psnr",)).light.psnr_by_time[[0, 2, 4]]
     np.testing.assert_allclose(page.manifest["reference"]["psnr"], expected)
     probes = probe_models.random_model(positions=True)
     probes.save(tmp_path / "probe.wlm")
@@ -134,7 +134,7 @@ def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):
     lightmaps = small_sets.moving_light(hours=(0.0, 6.0))
     model = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile())
     model.save(tmp_path / "city.wlm")
-    lightmaps.frames[1] = 0.0
+    lightmaps.light.frames[1] = 0.0
     small_sets.write_set(tmp_path / "set", lightmaps)
     write_page(tmp_path / "page.html", [tmp_path / "city.wlm"], original=tmp_path / "set")
     scores = parts(tmp_path / "page.html")[0]["reference"]["psnr"]

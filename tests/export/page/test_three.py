@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders.probe_models import random_model
 
-from wlm.probe import export_grid
+from wlm.export import export
 from wlm.probe.sphere import irradiance
 
 _SIZE = 64
@@ -58,7 +58,7 @@ def site(tmp_path, serve):
     """The grid of a model and three.js."""
     model = random_model(seed=3)
     model.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
-    export_grid(model, tmp_path, cells=8)
+    export(model, tmp_path, "three", cells=8)
     (tmp_path / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
     return model, json.loads((tmp_path / "grid.json").read_text()), f"{serve(tmp_path)}/index.html"
 

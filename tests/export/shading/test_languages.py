@@ -1,6 +1,5 @@
 """Every shader that we export, in every language that runs here, beside what Python decodes."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +11,7 @@ import torch
 from builders.atlas_meshes import charts
 from builders.atlas_models import KINDS, MIXED, WIDE
 from builders.atlas_models import random_model as random_atlas
+from builders.exported import read_export
 from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
@@ -28,13 +28,13 @@ from wlm.atlas.exact import decode64
 from wlm.atlas.model import AtlasModel, Profile, SheetPlace, pack_tiles
 from wlm.atlas.shader import glsl as atlas_glsl
 from wlm.errors import WlmError
+from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
 from wlm.lightmap.decode import Decoder as LightmapDecoder
-from wlm.probe.light import StoredLight
-from wlm.probe.shader import probe_glsl
-from wlm.probe.volume import Volume
-from wlm.probe.volume_export import export_volume
-from wlm.probe.volume_shader import volume_glsl
+from wlm.probe.volume.bundle import volume_bundle
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.shader import volume_glsl
 
 
 def lightmap(kinds, folder, **settings) -> Subject:
@@ -176,9 +176,9 @@ def volume(folder) -> Subject:
     made = Volume(position, StoredLight(random.normal(size=(400, 27))), side=8, budget=40)
     for _ in range(6):
         made.update([4000.3, -29.0, 0.2])
-    export_volume(made, folder)
-    reference, document = (json.loads((folder / f"{name}.json").read_text()) for name in ("reference", "volume"))
-    points = np.array(reference["position"])
+    export(volume_bundle(made), folder)
+    document, arrays = read_export(folder)
+    points = arrays["position"]
     normals = random.normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = made.read(points, normals)
@@ -226,37 +226,35 @@ SH = (
 
 def probes(folder) -> Subject:
     model = random_probes(seed=3)
-    probe.export(model, folder)
-    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
+    made = model.bundle()
+    position = made.reference["position"]
     expected = model.decoder().decode(position)[:, [0, 13, 26]]
     bound = {"u_points": points_of(position)}
-    bound |= {f"wlm_probe_{name}": np.fromfile(folder / f"{name}.bin", "<u4") for name in ("gaussians", "network")}
+    bound |= {f"wlm_probe_{name}": made.buffers[name] for name in ("gaussians", "network")}
     scale = float(np.abs(expected).max())
-    return Subject(probe_glsl(model), SH, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
+    return Subject(made.shader, SH, expected[None], bound, "", 1e-4 * scale, as_textures=PROBES, version=430)
 
 
-def transformed_probes(folder) -> Subject:
+def component_probes(folder) -> Subject:
     random = np.random.default_rng(5)
     place = random.uniform(0.0, 4.0, (90, 3))
     light = 1.0 + np.sin(place @ random.normal(size=(3, 27)))
-    model = probe.compress(probe.from_arrays(place, light), target_psnr=60, positions=True)
-    probe.export(model, folder)
-    position = np.array(json.loads((folder / "reference.json").read_text())["position"])
-    expected = model.decoder().decode(position)[:, [0, 13, 26]]
-    bound = {"u_points": points_of(position), "wlm_probe_light": np.fromfile(folder / "light.bin", "<u4")}
-    # Half floats.
-    tolerance = 2e-3 * float(np.abs(expected).max())
-    text = (folder / "probe.glsl").read_text()
-    return Subject(text, SH, expected[None], bound, "", tolerance, as_textures=PROBES, version=430)
+    made = probe.compress(probe.from_arrays(place, light), "pca").bundle()
+    expected = made.reference["values"][:, [0, 13, 26]]
+    # A live probe's index is the x of its point.
+    points = np.pad(made.reference["live"][:, None].astype(np.float64), ((0, 0), (0, 2)))
+    bound = {"u_points": points_of(points), "wlm_probe_probes": made.buffers["probes"]}
+    main = SH.replace("(texelFetch(u_points, pixel, 0).xyz, sh)", "(int(texelFetch(u_points, pixel, 0).x + 0.5), sh)")
+    scale = float(np.abs(expected).max())
+    return Subject(made.shader, main, expected[None], bound, "", 1e-5 * scale, as_textures=PROBES, version=430)
 
 
 PROBES = "".join(
     f"uniform usampler2D u_{name};\n#define WLM_PROBE_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, "
     f"(i) >> 10), 0).r\n"
-    for name in ("gaussians", "network", "light")
+    for name in ("gaussians", "network", "probes")
 )
 
-LONG = "probes of a transform"
 SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of video": lambda folder: lightmap((5, 3, 6, 0), folder, gelu="exact", period=None, hidden=10),
@@ -270,7 +268,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     **smoke_subjects(),
     "volume": volume,
     "probes": probes,
-    LONG: transformed_probes,
+    "components": component_probes,
 }
 
 
@@ -304,12 +302,7 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("name", "language"),
-    [
-        # Its GLSL is run by the tests of its export, too.
-        pytest.param(name, language, marks=[pytest.mark.slow] * (name == LONG and language in HEADS))
-        for name in SUBJECTS
-        for language in (*HEADS, "hlsl", "wgsl")
-    ],
+    [(name, language) for name in SUBJECTS for language in (*HEADS, "hlsl", "wgsl")],
 )
 def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     subject = SUBJECTS[name](tmp_path)
@@ -335,7 +328,7 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
         "smoke billboard",
         "volume",
         "probes",
-        "probes of a transform",
+        "components",
     ],
 )
 def test_metal_as_the_cpp_that_it_is(name, tmp_path):

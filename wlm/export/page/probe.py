@@ -11,23 +11,55 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import read_geometry
+from wlm.probe.bundle import bundle
 from wlm.probe.data import load
-from wlm.probe.day import DayModel
-from wlm.probe.decode import Decoder
 from wlm.probe.evaluation import evaluate
-from wlm.probe.exporter import gaussian_bytes, network_bytes
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
-from wlm.probe.shader import probe_glsl
 from wlm.probe.sphere import sh_count
-from wlm.probe.transform import Transform
-from wlm.probe.transform_export import light_bytes, transform_glsl
 
 _BANDS = 9  # coefficients that diffuse light needs
+_BUFFERS = ("gaussians", "network", "probes")
+
+_BETWEEN = """
+// Light between principal components: of the probes within four times the distance of the nearest one, weighted by
+// 1 / distance^4. WLM_PROBE_OWN(i) reads the positions of the live probes.
+vec3 wlm_probe_own(int probe)
+{
+    return uintBitsToFloat(
+        uvec3(WLM_PROBE_OWN(3 * probe), WLM_PROBE_OWN(3 * probe + 1), WLM_PROBE_OWN(3 * probe + 2)));
+}
+
+void wlm_probe_sh(vec3 position, out vec3 sh[COUNT])
+{
+    float nearest = 1e30;
+    for (int i = 0; i < wlm_probe_count(); ++i) {
+        vec3 away = position - wlm_probe_own(i);
+        nearest = min(nearest, dot(away, away));
+    }
+    float total = 0.0;
+    for (int c = 0; c < COUNT; ++c)
+        sh[c] = vec3(0.0);
+    for (int i = 0; i < wlm_probe_count(); ++i) {
+        vec3 away = position - wlm_probe_own(i);
+        float square = dot(away, away);
+        if (square > 16.0 * nearest)
+            continue;
+        float weight = 1.0 / max(square * square, 1e-30);
+        vec3 here[COUNT];
+        wlm_probe_sh(i, here);
+        for (int c = 0; c < COUNT; ++c)
+            sh[c] += weight * here[c];
+        total += weight;
+    }
+    for (int c = 0; c < COUNT; ++c)
+        sh[c] /= total;
+}
+"""
 
 
 def probe_page(
-    model: ProbeModel | Transform,
+    model: ProbeModel,
     file_bytes: int,
     *,
     mesh: str | os.PathLike[str] | None = None,
@@ -42,7 +74,7 @@ def probe_page(
         file_bytes: Size of its file.
         mesh, original, key, up: As for `wlm.export.page.pages.make_page`.
 
-    Of Gaussians the page carries codes and network as they are, of a transform the unpacked light of its probes.
+    The page holds the buffers of the model's bundle.
 
     Raises:
         WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
@@ -53,15 +85,13 @@ def probe_page(
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
     position, values, live, _ = probes_of(model, original, key)
     places = position[live].astype(np.float32)
-    if isinstance(model, Transform):
-        decoded = model.decoder(position=None if original is None else position).decode_probes()[live]
-        content = {"light": light_bytes(model, position[live], decoded)[0]}
-        shader, fact = transform_glsl(len(places), model.outputs), _fact(model)
-    else:
-        decoded = Decoder(model).decode(position[live])
-        content = {"gaussians": gaussian_bytes(model), "network": network_bytes(model)}
-        shader, fact = probe_glsl(model), ("Gaussians", f"{model.count:,}")
-    arrays = {name: np.frombuffer(_whole(part), "<u4") for name, part in content.items()}
+    decoded = model.decoder(position=position).decode_probes()[live]
+    made = bundle(model)
+    shader = made.shader
+    arrays = {name: made.buffers[name] for name in _BUFFERS if name in made.buffers}
+    if "probes" in arrays:
+        arrays["own"] = places.reshape(-1).view("<u4")
+        shader += _BETWEEN.replace("COUNT", str(coefficients))
     arrays["places"] = places
     radius = ball_radius(places)
     light = decoded if values is None else values[live]
@@ -90,22 +120,10 @@ def probe_page(
         ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
         ("size", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f}% of float32"),
         ("live probes", f"{len(places):,} of {model.probes:,}"),
-        fact,
+        *((name, str(value)) for name, value in model.content.facts().items()),
         ("profile", model.profile.name),
     ]
     if original is not None:
         score = evaluate(model, load(original, key=key), file_bytes=file_bytes).psnr
         figures.append(("PSNR of coefficients", "–" if math.isnan(score) else f"{score:.2f} dB"))
     return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)
-
-
-def _fact(model: Transform) -> tuple[str, str]:
-    """What is said of a transform: its step, or which of its hours it shows."""
-    if isinstance(model, DayModel):
-        return "hour", f"{model.time:g}, of {', '.join(f'{time:g}' for time in model.times)}"
-    return "step", f"{model.head.step:.3g}"
-
-
-def _whole(content: bytes) -> bytes:
-    """Filled up to whole words of 32 bits."""
-    return content + bytes(-len(content) % 4)

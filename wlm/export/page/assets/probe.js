@@ -3,8 +3,8 @@
 const WIDTH = 256;  // places a row of the table of coefficients
 const ROW = 32;     // places that are decoded before the browser is asked whether it has time
 
-// Arrays that the exported shaders read: of Gaussians two, of a transform's probes one.
-const BUFFERS = ['gaussians', 'network', 'light'];
+// Arrays that the exported shaders read: two for Gaussians, two for principal components.
+const BUFFERS = ['gaussians', 'network', 'probes', 'own'];
 const declare = (name) => `
 uniform highp usampler2D u_${name};
 #define WLM_PROBE_${name.toUpperCase()}(i) texelFetch(u_${name}, ivec2((i) & 1023, (i) >> 10), 0).r

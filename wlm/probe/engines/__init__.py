@@ -1,0 +1,1 @@
+"""Light probes as the files of three.js, Godot, Unity and Unreal."""

@@ -1,0 +1,131 @@
+"""The light of a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.probe.data import load_positions
+from wlm.probe.decode import Decoder
+from wlm.probe.model import ProbeModel
+
+CELLS = 24
+"""Default number of cells along the longest side of the box."""
+
+NUMBERS = 27
+"""Numbers of a probe with L2 spherical harmonics in RGB."""
+
+_ROWS = 65536  # points decoded at a time
+_FARTHEST = 1e100
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A lattice of cells over a model's probes.
+
+    Attributes:
+        decoder: Decoder of the model.
+        low: float64 [3], lowest corner.
+        size: Side of a cell.
+        count: int [3], cells along x, y and z.
+    """
+
+    decoder: Decoder
+    low: np.ndarray
+    size: float
+    count: np.ndarray
+
+    def centres(self) -> np.ndarray:
+        """Returns the centres of the cells, float64 [nz ny nx, 3], x fastest."""
+        return self._places(self.count, 0.5)
+
+    def corners(self) -> np.ndarray:
+        """Returns the corners of the cells, float64 [(nz + 1) (ny + 1) (nx + 1), 3], x fastest."""
+        return self._places(self.count + 1, 0.0)
+
+    def light(self, place: np.ndarray) -> np.ndarray:
+        """Returns the light at points [M, 3], float32 [M, 27]."""
+        return np.concatenate([self.decoder.decode(place[i : i + _ROWS]) for i in range(0, len(place), _ROWS)])
+
+    def _places(self, count: np.ndarray, shift: float) -> np.ndarray:
+        axes = [low + self.size * (np.arange(n) + shift) for low, n in zip(self.low, count, strict=True)]
+        z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+        return np.stack([x, y, z], -1).reshape(-1, 3)
+
+
+def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
+    """Returns the positions of a model's probes in another file, float64 [N, 3]; None without a file.
+
+    Raises:
+        WlmError: The file cannot be read or has other probes.
+    """
+    if original is None:
+        return None
+    position = load_positions(original)
+    if not model.has_probes_at(position):
+        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
+    return position
+
+
+def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | None, device: str) -> Lattice:
+    """Fills the box of a model's probes with cells, centred where they do not fit it exactly.
+
+    Args:
+        model: A model of L2 in RGB.
+        cells: Cells along the longest side of the box, 1 to `most`.
+        most: Limit of the engine's format.
+        position: [N, 3], of the model's own probes, if the method needs them and the file stores none.
+        device: Where the light is decoded.
+
+    Raises:
+        WlmError: The number of coefficients differs, the cells are out of range, the device does not exist, or the
+            method needs positions and none are known.
+    """
+    if model.outputs != NUMBERS:
+        raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers per probe, got {model.outputs}")
+    if not 1 <= cells <= most:
+        raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
+    span = model.extent * model.size
+    size = float(span.max()) / cells or 1.0  # one cell if all probes coincide
+    count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
+    return Lattice(model.decoder(device, position=position), model.origin + span / 2 - count * size / 2, size, count)
+
+
+def read_cells(path: Path, document: dict[str, Any], most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the lattice of an export: `box`, its two corners, and `resolution`, the cells along x, y and z.
+
+    Args:
+        path: Path of the document, for messages.
+        document: Its content.
+        most: Largest number of cells along an axis.
+
+    Returns:
+        float64 [2, 3] and int [3].
+
+    Raises:
+        WlmError: A field is missing or wrong.
+    """
+    try:
+        box, cells = np.array(document.get("box"), np.float64), np.array(document.get("resolution"))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WlmError(f"{path}: box, resolution: expected numbers, got others") from error
+    if box.shape != (2, 3) or not (np.abs(box) < _FARTHEST).all() or not (box[1] > box[0]).all():
+        raise WlmError(f"{path}: box: expected two corners, the lower first")
+    if cells.shape != (3,) or cells.dtype.kind != "i" or not ((cells >= 1) & (cells <= most)).all():
+        raise WlmError(f"{path}: resolution: expected three numbers of 1 to {most}")
+    return box, cells
+
+
+def grid_places(box: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Returns the centres of cells, float64 [nz * ny * nx, 3], x fastest.
+
+    Args:
+        box: [2, 3], lowest and highest corner.
+        count: [3], cells along x, y and z.
+    """
+    axes = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(*box, count, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([x, y, z], -1).reshape(-1, 3)

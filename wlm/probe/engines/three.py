@@ -1,0 +1,157 @@
+"""Light for three.js: a `LightProbeGrid`, a texture of spherical harmonics over a box.
+
+The layout follows examples/jsm/lighting/LightProbeGridWebGL.js of r187: one 3D texture in RGBA of nx x ny x 7 (nz + 2)
+texels. A probe's 27 numbers (coefficient after coefficient, each red, green and blue) and one 0 are split into 7
+texels; volume t of them has slices t (nz + 2) to (t + 1) (nz + 2) - 1, of which the first and the last are copies of
+their neighbours. The coefficients are those of this package: radiance on the orthonormal real basis, all signs plus.
+Since r187 a probe is at the centre of its cell of the box; up to r186 the outermost probes were on its faces. The
+export has both boxes, and its loader takes the one of the three.js that it runs in.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.bundle import Bundle
+from wlm.errors import WlmError
+from wlm.formats.folder import write_index
+from wlm.formats.ktx2 import read_half_volume, write_ktx2
+from wlm.formats.reading import named_file
+from wlm.probe.conventions import THREE_GRID as FORMAT
+from wlm.probe.engines.lattice import CELLS, NUMBERS, grid_places, lattice_of, positions_of, read_cells
+
+_VERSION = 1
+INFO_FILE = "grid.json"
+TEXTURE_FILE = "grid.ktx2"
+LOADER_FILE = "grid.js"
+_PARTS = 7
+_MOST_CELLS = 256
+_ABOUT = (
+    "Light for three.js: grid.js loads grid.ktx2 with its KTX2Loader into its LightProbeGrid. box spans the cells, "
+    "with a probe at the centre of each (r187 and later); corners spans the probes themselves (up to r186). Positions "
+    "are in the axes and units of the scene."
+)
+
+_LOADER = """\
+// Loads the light beside this file into a LightProbeGrid, for scene.add().
+//
+//     import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
+//     import { LightProbeGridWebGL } from 'three/addons/lighting/LightProbeGridWebGL.js';
+//     scene.add(await loadLightProbeGrid(new URL('grid.json', import.meta.url), renderer, THREE, KTX2Loader,
+//                                        LightProbeGridWebGL));
+//
+// With WebGPURenderer, and up to r185, the class is LightProbeGrid.
+export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
+{
+    const info = await (await fetch(url)).json();
+    const loader = new KTX2Loader().detectSupport(renderer);
+    const texture = await loader.loadAsync(new URL(info.texture, new URL(url, document.baseURI)).href);
+    loader.dispose();
+    texture.minFilter = texture.magFilter = THREE.LinearFilter;
+    texture.generateMipmaps = false;
+    texture.colorSpace = THREE.NoColorSpace;
+    texture.needsUpdate = true;
+    const [low, high] = parseInt(THREE.REVISION) >= 187 ? info.box : info.corners;
+    const grid = new Grid(high[0] - low[0], high[1] - low[1], high[2] - low[2], ...info.resolution);
+    grid.position.set((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2);
+    grid.texture = texture;
+    grid.updateBoundingBox();
+    return grid;
+}
+"""
+
+
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
+    *,
+    cells: int = CELLS,
+    original: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
+
+    The grid's probes are at the centres of cubic cells that fill the probes' box, with the decoded light there in half
+    floats.
+
+    Args:
+        bundle: The bundle of a model of L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
+        cells: Cells along the longest side of the box, 1 to 256.
+        original: The file that was compressed, if the method needs positions and the model stores none.
+        device: Where the light is decoded.
+
+    Returns:
+        The entry "about" of the index.
+
+    Raises:
+        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the
+            device does not exist.
+    """
+    model = bundle.model
+    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
+    low, size, count = lattice.low, lattice.size, lattice.count
+    box = np.stack([low, low + count * size])
+    values = lattice.light(lattice.centres())
+    if not np.abs(values).max() <= np.finfo(np.float16).max:
+        raise WlmError(f"{model.name}: expected light within half floats, got {np.abs(values).max():.3g}")
+    texels = pack(values, count)
+    document = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "about": _ABOUT,
+        "name": model.name,
+        "texture": TEXTURE_FILE,
+        "resolution": count.tolist(),
+        "box": box.tolist(),
+        "corners": [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()],
+    }
+    depth, height, width, _ = texels.shape
+    write_ktx2(folder / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
+    (folder / LOADER_FILE).write_text(_LOADER, encoding="utf-8")
+    write_index(folder / INFO_FILE, document)
+    return {"about": _ABOUT}
+
+
+def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads a grid that `write_kit` wrote.
+
+    Args:
+        path: Path of `grid.json`.
+        document: Its content.
+
+    Returns:
+        float64 [N, 3], positions; float32 [N, 9, 3], values.
+
+    Raises:
+        WlmError: A field is missing or wrong, or the texture cannot be read or has another size.
+    """
+    name = document.get("texture")
+    corners, cells = read_cells(path, document, _MOST_CELLS)
+    if not isinstance(name, str):
+        raise WlmError(f"{path}: texture: expected the name of a file")
+    texels = read_half_volume(named_file(path, name, f"{path}: texture"))
+    expected = (_PARTS * (int(cells[2]) + 2), int(cells[1]), int(cells[0]))
+    if texels.shape[:3] != expected:
+        raise WlmError(f"{path}: texture: expected {expected} slices, rows and texels, got {texels.shape[:3]}")
+    return grid_places(corners, cells), unpack(texels).reshape(-1, 9, 3)
+
+
+def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Packs probes [nz * ny * nx, 27] in the order of `grid_places` as a texture, float16 [7 (nz + 2), ny, nx, 4]."""
+    nx, ny, nz = (int(n) for n in count)
+    padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
+    padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)
+    parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
+    return np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1).reshape(-1, ny, nx, 4)
+
+
+def unpack(texels: np.ndarray) -> np.ndarray:
+    """Returns the probes, float32 [nz * ny * nx, 27], of a texture that `pack` made."""
+    _, ny, nx, _ = texels.shape
+    parts = texels.reshape(_PARTS, -1, ny, nx, 4)[:, 1:-1]
+    return np.moveaxis(parts, 0, 3).reshape(-1, 4 * _PARTS)[:, :NUMBERS].astype(np.float32)

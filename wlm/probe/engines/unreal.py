@@ -1,0 +1,243 @@
+"""Light for Unreal, packed like the bricks of its volumetric lightmap: 28 bytes per probe of L2.
+
+A texel of a brick has the ambient colour, the coefficient L00, as R11G11B10F, and each other coefficient in 8 bits, as
+a ratio to the ambient colour and to the range that light can have: coefficients 1 to 4 and 5 to 8 of red, green and
+blue in six RGBA textures (VolumetricLightmapShared.ush, without sky occlusion and shadowing). Unreal only has bricks in
+maps that it builds itself, so light is written as seven volume textures over a lattice, with functions for materials
+that read them.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlm.bundle import Bundle
+from wlm.errors import WlmError
+from wlm.formats.dds import read_word_volume, write_dds
+from wlm.formats.folder import write_index
+from wlm.formats.reading import named_file
+from wlm.probe.conventions import UNREAL_LIGHT as FORMAT
+from wlm.probe.conventions import from_canonical
+from wlm.probe.engines.lattice import CELLS, grid_places, lattice_of, positions_of, read_cells
+
+_VERSION = 1
+INFO_FILE = "light.json"
+AMBIENT_FILE = "ambient.dds"
+SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
+SHADER_FILE = "WlmProbes.usf"
+_MOST_CELLS = 128
+_BANDS = 3
+_ROWS = 65536  # probes unpacked at a time
+_AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
+
+# Ranges of coefficients 1 to 8 over the ambient one, as in the engine: sqrt(3) for L1, the bound for non-negative
+# light, and twice the bound for L2.
+_RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
+# Largest finite numbers with 6, 6 and 5 bits of mantissa and half float's exponent.
+_PACKED_MAX = np.array([65024.0, 65024.0, 64512.0])
+# Low bits of a half float's mantissa that R11G11B10F drops.
+_DROPPED = np.array([4, 4, 5], np.uint32)
+_SHIFT = np.array([0, 11, 22], np.uint32)
+
+_ABOUT = (
+    "ambient.dds and sh0.dds to sh5.dds are volume textures of one size, with a probe at the centre of each texel, x "
+    "along rows, then y, then z. ambient has the first coefficient of radiance; the others are ratios to it and to "
+    "their ranges, 1 to 4 and 5 to 8 of red, of green and of blue, with Unreal's signs, in the axes and the unit of "
+    "the scene. WlmProbes.usf explains how to read them; box has the two corners of the lattice."
+)
+
+_SHADER = """\
+// Light of probes for Unreal, in the packing of its volumetric lightmaps.
+//
+// 1. Import ambient.dds and sh0.dds to sh5.dds as volume textures: sRGB off, no compression (ambient as half floats),
+//    no mips, clamped, bilinear filter.
+// 2. Put this file into a folder of shaders that the project maps (AddShaderSourceDirectoryMapping("/Wlm", ...)), and
+//    "/Wlm/WlmProbes.usf" under Include File Paths of a material's Custom node, with the inputs Ambient, Sh0 to Sh5
+//    (texture objects), Position and Normal, and this code:
+//
+//        return WlmProbeDiffuse(Ambient, Sh0, Sh1, Sh2, Sh3, Sh4, Sh5, AmbientSampler, Position, Normal);
+//
+// Position and Normal are in the axes and the unit of the probes. In a scene that came in as glTF, with y up and in
+// metres, they are Absolute World Position's xzy / 100 and the world normal's xzy.
+
+static const float3 WlmCorner = float3(@CORNER@);
+static const float3 WlmSize = float3(@SIZE@);
+
+// Coefficients of radiance, orthonormal, in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2 and with the signs of
+// FSHVector3: y, x, yz and xz have a minus.
+void WlmProbeSh(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
+                Texture3D sh5, SamplerState state, float3 position, out float3 sh[9])
+{
+    float3 uvw = (position - WlmCorner) / WlmSize;
+    float4 low = float4(1.7320508, 1.7320508, 1.7320508, 3.8729833);
+    float4 high = float4(3.8729833, 4.4721360, 3.8729833, 3.8729833);
+    float3 mean = ambient.SampleLevel(state, uvw, 0).xyz;
+    float4 r0 = (sh0.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.x;
+    float4 r1 = (sh1.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.x;
+    float4 g0 = (sh2.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.y;
+    float4 g1 = (sh3.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.y;
+    float4 b0 = (sh4.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.z;
+    float4 b1 = (sh5.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.z;
+    sh[0] = mean;
+    sh[1] = float3(r0.x, g0.x, b0.x);
+    sh[2] = float3(r0.y, g0.y, b0.y);
+    sh[3] = float3(r0.z, g0.z, b0.z);
+    sh[4] = float3(r0.w, g0.w, b0.w);
+    sh[5] = float3(r1.x, g1.x, b1.x);
+    sh[6] = float3(r1.y, g1.y, b1.y);
+    sh[7] = float3(r1.z, g1.z, b1.z);
+    sh[8] = float3(r1.w, g1.w, b1.w);
+}
+
+// The radiance of a white diffuse surface with a unit normal: irradiance over pi.
+float3 WlmProbeDiffuse(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
+                       Texture3D sh5, SamplerState state, float3 position, float3 normal)
+{
+    float3 sh[9];
+    WlmProbeSh(ambient, sh0, sh1, sh2, sh3, sh4, sh5, state, position, sh);
+    float x = normal.x;
+    float y = normal.y;
+    float z = normal.z;
+    float3 light = sh[0] * 0.2820948;
+    light += (sh[2] * z - sh[1] * y - sh[3] * x) * 0.3257350;
+    light += (sh[4] * (x * y) - sh[5] * (y * z) - sh[7] * (x * z)) * 0.2731371;
+    light += sh[6] * (0.0788479 * (3.0 * z * z - 1.0)) + sh[8] * (0.1365686 * (x * x - y * y));
+    return max(light, float3(0.0, 0.0, 0.0));
+}
+"""
+
+
+def write_kit(
+    bundle: Bundle,
+    folder: Path,
+    engine: str,
+    *,
+    cells: int = CELLS,
+    original: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Writes a model's light as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
+
+    Probes are at the centres of cubic cells that fill the probes' box. A coefficient beyond the bound of non-negative
+    light is clamped, and a negative ambient colour becomes 0.
+
+    Args:
+        bundle: The bundle of a model of L2 in RGB.
+        folder: The folder; it must exist.
+        engine: Not used.
+        cells: Cells along the longest side of the box, 1 to 128.
+        original: The file that was compressed, if the method needs positions and the model stores none.
+        device: Where the light is decoded.
+
+    Returns:
+        The entry "about" of the index.
+
+    Raises:
+        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds 11-bit floats, or
+            the device does not exist.
+    """
+    model = bundle.model
+    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
+    corner, size = lattice.low, lattice.count * lattice.size
+    sh = from_canonical(lattice.light(lattice.centres()).reshape(-1, 9, 3).astype(np.float64), "unreal")
+    if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
+        raise WlmError(f"{model.name}: expected light within {_PACKED_MAX.min():g}, got {np.abs(sh[:, 0]).max():.3g}")
+    width, height, depth = (int(count) for count in lattice.count)
+    ambient, level = _packed(sh, _BANDS)
+    textures = {AMBIENT_FILE: (_AMBIENT, ambient)}
+    textures |= {
+        name: (_RATIOS, np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
+        for number, name in enumerate(SH_FILES)
+    }
+    text = _SHADER
+    for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
+        text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
+    document = {
+        "format": FORMAT,
+        "version": _VERSION,
+        "about": _ABOUT,
+        "name": model.name,
+        "box": [corner.tolist(), (corner + size).tolist()],
+        "resolution": lattice.count.tolist(),
+    }
+    for name, (fmt, texels) in textures.items():
+        write_dds(folder / name, texels.tobytes(), width, height, depth, fmt, volume=True)
+    (folder / SHADER_FILE).write_text(text, encoding="utf-8")
+    write_index(folder / INFO_FILE, document)
+    return {"about": _ABOUT}
+
+
+def read_unreal(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the textures that `write_kit` wrote, as probes at the centres of the cells.
+
+    Args:
+        path: Path of `light.json`.
+        document: Its content.
+
+    Returns:
+        float64 [N, 3], positions; float32 [N, 9, 3], values with Unreal's signs.
+
+    Raises:
+        WlmError: A field is missing or wrong, or a texture cannot be read or has another format or size.
+    """
+    box, cells = read_cells(path, document, _MOST_CELLS)
+    size = tuple(int(count) for count in cells)
+    ambient, *ratios = (
+        read_word_volume(named_file(path, name, f"{path}: {name}"), fmt, size).ravel()
+        for name, fmt in ((AMBIENT_FILE, _AMBIENT), *((name, _RATIOS) for name in SH_FILES))
+    )
+    values = np.empty((len(ambient), _BANDS**2, 3), np.float32)
+    for start in range(0, len(ambient), _ROWS):
+        rows = slice(start, start + _ROWS)
+        level = np.stack([ratio[rows] for ratio in ratios], 1).view(np.uint8).reshape(-1, 3, _BANDS**2 - 1)
+        values[rows] = _unpacked(ambient[rows], level)
+    return grid_places(box, cells), values
+
+
+def pack_unreal(values: np.ndarray, bands: int) -> bytes:
+    """Packs probes as the engine does: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios.
+
+    Args:
+        values: [N, D], coefficients from L00, each red, green and blue.
+        bands: Number of bands to keep, 1 to 3.
+    """
+    ambient, level = _packed(np.asarray(values, np.float64).reshape(len(values), -1, 3), bands)
+    return ambient.tobytes() + level.tobytes()
+
+
+def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
+    """Unpacks the result of `pack_unreal`, float32 [N, D] with D = `width`; zero beyond the stored bands."""
+    probes = len(payload) // (4 + 3 * (bands**2 - 1))
+    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
+    sh = np.zeros((probes, width // 3, 3), np.float32)
+    sh[:, : bands**2] = _unpacked(np.frombuffer(payload, "<u4", probes), level)
+    return sh.reshape(probes, width)
+
+
+def _packed(sh: np.ndarray, bands: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns uint32 [N] and uint8 [N, 3, bands² - 1] for coefficients [N, C, 3]."""
+    colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
+    step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
+    code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
+    ambient = np.bitwise_or.reduce(code << _SHIFT, axis=1).astype("<u4")
+    others = sh[:, 1 : bands**2].transpose(0, 2, 1)
+    # Ratios to the decoded ambient colour are more exact, at no cost.
+    unit = _ambient(ambient)[:, :, None] * _RANGE[: bands**2 - 1]
+    ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
+    return ambient, np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
+
+
+def _unpacked(ambient: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Returns coefficients float64 [N, C, 3] from ambient colours uint32 [N] and ratios uint8 [N, 3, C - 1]."""
+    colour = _ambient(ambient)
+    with np.errstate(invalid="ignore"):  # a file may contain infinity
+        others = (level / 127.5 - 1.0) * colour[:, :, None] * _RANGE[: level.shape[2]]
+    return np.concatenate([colour[:, :, None], others], 2).transpose(0, 2, 1)
+
+
+def _ambient(code: np.ndarray) -> np.ndarray:
+    """Converts R11G11B10F to float64 [N, 3]."""
+    part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
+    return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)

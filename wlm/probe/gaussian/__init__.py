@@ -1,0 +1,1 @@
+"""Light as 3D Gaussians with short latents and one small network (gaussian-probe-compression)."""

@@ -1,0 +1,137 @@
+"""Gaussians as GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
+
+A runtime stores Gaussians and network with 16 bits per number (gaussian-probe-compression, section 5.3.2 and table 3).
+The paper's numbers are half floats. Here those of the Gaussians are the fit's own codes: they take as many bytes and
+decode to exactly what was trained, whereas a half float can move a centre by a 4096th of the box.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from wlm.bundle import Bundle
+from wlm.errors import WlmError
+from wlm.formats.folder import rounded
+from wlm.probe.conventions import CANONICAL
+from wlm.probe.decode import Decoder
+from wlm.probe.gaussian.model import CENTRE, CUT, SCALE, Gaussians
+from wlm.probe.gaussian.shader import HEAD_WORDS, gaussian_words, probe_glsl
+from wlm.probe.model import ProbeModel
+from wlm.probe.sphere import sh_count
+
+_REFERENCES = 64  # positions of the reference, and one outside the box
+_FOUR = 4
+
+_ABOUT = {
+    "position": "x = (position - origin) / extent, then each coordinate of x is clamped to 0 ... size. The Gaussians "
+    "and the network take x.",
+    "gaussian": "A number is low + code * step. A Gaussian has 10 + latent numbers: centre, logarithm of the scale s, "
+    "quaternion q = w x y z of any length (length zero is no rotation), latent. u = R(q)^T (x - centre) / s; the "
+    "weight at x is exp(-|u|^2 / 2). The support is |u| < cut, or |x - centre| < cut * max(s) for the support "
+    "'sphere'. F is the sum of weight * latent over the Gaussians whose support contains x.",
+    "network": "h1 = sigmoid(W1 [F, x] + b1), h2 = sigmoid(W2 h1 + b2), values = gain * (W3 h2 + b3).",
+    "lists": "To skip Gaussians that do not reach x, build lists of them at loading time: cut the box 0 ... size into "
+    "cubes, 4 to 16 along its longest side, and list a Gaussian with each cube that meets centre +- reach, where reach "
+    "along axis a is cut * sqrt(sum over b of (R_ab s_b)^2), or cut * max(s) for the support 'sphere'. Widen the cubes "
+    "by a millionth for rounding. The list of the cube that contains x has all Gaussians that reach x; the shader "
+    "tests each of them again.",
+    "values": "A probe has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
+    "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
+    "dead": "Probes that are zero, by index from 0 in the order of compression: engines leave them inside walls. The "
+    "Gaussians and the network do not know them.",
+    "positions": "If the buffer positions exists: 3 unsigned 16-bit codes per probe, position = origin + extent * size "
+    "* code / 65535.",
+    "reference": "position: points of the scene, the last one outside the box; values: the light there.",
+    "precision": "The shader computes in floats. For Gaussians far longer than thin the reference uses doubles in "
+    "some places: slenderness is the largest ratio of a Gaussian's scales, and about 1e-7 times it is the error of u.",
+}
+
+
+def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
+    """Returns what a GPU holds of a model of Gaussians.
+
+    Args:
+        model: The model.
+        decoder: Its decoder, for the reference.
+
+    Raises:
+        WlmError: The probes' box does not fit floats, or the light is not finite.
+    """
+    content = model.content
+    position = _reference_positions(model, content)
+    values = decoder.decode(position)
+    if not np.isfinite(values).all():
+        raise WlmError(f"{model.name}: cannot export: the model decodes to NaN or infinity")
+    buffers = {"gaussians": _gaussian_words(model, content), "network": _network_words(content)}
+    if model.has_positions:
+        buffers["positions"] = np.ascontiguousarray(model.positions, "<u2")
+    return Bundle(
+        system=ProbeModel.SYSTEM,
+        name=model.name,
+        shader=probe_glsl(content),
+        document=_document(model, content),
+        buffers=buffers,
+        reference={"position": position, "values": values},
+    )
+
+
+def _gaussian_words(model: ProbeModel, content: Gaussians) -> np.ndarray:
+    """Returns the buffer `gaussians`, uint32; its layout is at the head of the shader."""
+    words = gaussian_words(content.latent)
+    codes = np.zeros((content.count, 2 * words), "<u2")
+    codes[:, : content.code.shape[1]] = content.code
+    with np.errstate(over="ignore"):
+        head = np.array([*model.origin, model.extent, *model.size, content.gain, CUT], "<f4")
+    if not (np.isfinite(head).all() and head[3] > 0):
+        raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for floats")
+    numbers = np.concatenate([content.bounds[0], content.steps]).astype("<f4")
+    count = np.array([content.count], "<u4")
+    return np.concatenate([head.view("<u4"), count, numbers.view("<u4"), codes.reshape(-1).view("<u4")])
+
+
+def _network_words(content: Gaussians) -> np.ndarray:
+    """Returns the buffer `network`, uint32: the network in 4 x 4 blocks of half floats, as the shader reads them."""
+    pieces = []
+    for layer in content.layers():
+        inputs, outputs = len(layer) - 1, layer.shape[1]
+        # The biases first, then a row for each input.
+        padded = np.zeros((1 + -(-inputs // _FOUR) * _FOUR, -(-outputs // _FOUR) * _FOUR), "<f2")
+        padded[0, :outputs], padded[1 : inputs + 1, :outputs] = layer[-1], layer[:-1]
+        # [1 + I, O / 4, 4] to [O / 4, 1 + I, 4].
+        pieces.append(padded.reshape(len(padded), -1, _FOUR).swapaxes(0, 1).reshape(-1))
+    return np.concatenate(pieces).view("<u4")
+
+
+def _reference_positions(model: ProbeModel, content: Gaussians) -> np.ndarray:
+    """Returns centres of Gaussians, evenly spaced by index, and a point outside the box; float64 [M, 3]."""
+    chosen = np.unique(np.linspace(0, content.count - 1, min(content.count, _REFERENCES)).astype(int))
+    inside = content.rows()[chosen, CENTRE].astype(np.float64)
+    return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])
+
+
+def _document(model: ProbeModel, content: Gaussians) -> dict[str, Any]:
+    scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)
+    return {
+        "about": _ABOUT,
+        "source": model.source,
+        "method": model.method,
+        "probes": model.probes,
+        "outputs": model.outputs,
+        "coefficients": sh_count(model.outputs),
+        "convention": CANONICAL,
+        "gaussians": content.count,
+        "latent": content.latent,
+        "hidden": content.hidden,
+        "support": content.support,
+        "cut": CUT,
+        "origin": model.origin.tolist(),
+        "extent": model.extent,
+        "size": model.size.tolist(),
+        "gain": content.gain,
+        "low": rounded(content.bounds[0]),
+        "step": rounded(content.steps),
+        "first_gaussian_word": HEAD_WORDS + 2 * content.bounds.shape[1],
+        "words_per_gaussian": gaussian_words(content.latent),
+        "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
+        "dead": np.flatnonzero(model.dead).tolist(),
+    }

@@ -1,0 +1,157 @@
+"""Decoding Gaussians on a device (gaussian-probe-compression, eq. 5 to 7 and section 5.3.2)."""
+
+from typing import Literal
+
+import numpy as np
+import warp as wp
+
+from wlm.probe.decode import Decoder
+from wlm.probe.gaussian.model import CUT, Gaussians, check_outputs
+from wlm.probe.model import ProbeModel, check_points
+from wlm.probe.morton import morton_order
+from wlm_kernels.probe import cubes as probe_cubes
+from wlm_kernels.probe import gaussian_sum
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe import volume_frame as frame_kernels
+from wlm_kernels.probe.decode import decode_kernels
+
+Culling = Literal["box", "sphere", "exact", "none"]
+CULLINGS = ("exact", "box", "sphere", "none")
+"""Ways to build a cube's list of Gaussians; see `GaussianDecoder`."""
+
+
+class Points:
+    """Points on a device, in the order in which decoding them is fastest.
+
+    Attributes:
+        x: vec3 [M], normalised, along a Z-curve.
+        order: int [M], index of each point in the input.
+        out: float [M, D], written by `GaussianDecoder.run`.
+    """
+
+    def __init__(self, position: np.ndarray, model: ProbeModel, device: str) -> None:
+        x = model.normalise(position)
+        self.order = morton_order(x)
+        self.x = wp.array(x[self.order], dtype=wp.vec3, device=device)
+        self.out = wp.zeros((len(x), model.outputs), dtype=float, device=device)
+
+    def values(self) -> np.ndarray:
+        """Returns the decoded light, float32 [M, D], in the order of the input."""
+        result = np.empty(self.out.shape, np.float32)
+        result[self.order] = self.out.numpy()
+        return result
+
+
+class GaussianDecoder(Decoder):
+    """A model of Gaussians on a device.
+
+    Lists of Gaussians by cube are built once, here. All ways to build them give the same values up to rounding, since
+    a Gaussian's support is tested again at each point; they differ in the number of Gaussians listed in vain.
+
+    Attributes:
+        pairs: Number of entries in all lists.
+    """
+
+    def __init__(
+        self,
+        model: ProbeModel,
+        device: str = "cpu",
+        *,
+        position: np.ndarray | None = None,
+        culling: Culling = "exact",
+        cut: float = CUT,
+        cube: float | None = None,
+    ) -> None:
+        """Loads a model.
+
+        Args:
+            model: The model, whose content is Gaussians.
+            device: "cpu" or "cuda:N".
+            position: As for `wlm.probe.decode.Decoder`.
+            culling: Condition for a cube to list a Gaussian: the cube meets its ellipsoid ("exact"), the ellipsoid's
+                bounding box ("box"), or the sphere of its longest axis ("sphere", as in the paper); "none" makes one
+                list of all.
+            cut: Radius of a Gaussian's support in standard deviations; less than that of the fit costs accuracy.
+            cube: Side of a cube, normalised; None: chosen from the Gaussians' sizes.
+
+        Raises:
+            WlmError: The device does not exist, or the positions are not those of the model's probes.
+        """
+        super().__init__(model, device, position=position)
+        content = model.content
+        assert isinstance(content, Gaussians)
+        check_outputs(model.name, content.latent, content.hidden, model.outputs, self.device)
+        self._cut, self._gain = cut, content.gain
+        sphere = content.support == "sphere"
+        if sphere and culling != "none":
+            # The support is the sphere itself; its ellipsoid would lose a part of it.
+            culling = "sphere"
+        self._rows = wp.array(content.rows(), dtype=float, device=self.device)
+        self._shapes = gaussian_sum.shapes(self._rows, self._cut, "sphere" if sphere else "ellipsoid")
+        low, high = np.zeros(3, np.float32), model.size.astype(np.float32)
+        if culling == "none":
+            self._cubes = probe_cubes.everything(content.count, self.device)
+        else:
+            self._cubes = probe_cubes.build(self._shapes, low, high, cube, test=culling)
+        self.pairs = self._cubes.item.shape[0]
+        first, second, third = (layer.astype(np.float32) for layer in content.layers())
+        third = np.pad(third, ((0, 0), (0, probe_network.padded(model.outputs) - model.outputs)))
+        net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
+        self._net = wp.array(net, dtype=float, device=self.device)
+        kind = "cpu" if self.device == "cpu" else "cuda"
+        self._kernels = decode_kernels(content.latent, content.hidden, model.outputs, kind)
+
+    @property
+    def device_bytes(self) -> int:
+        arrays = (self._rows, self._shapes, self._net, self._cubes.start, self._cubes.item)
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+    def points(self, position: np.ndarray) -> Points:
+        """Uploads points that are to be decoded often; arguments and errors as for `decode`."""
+        return Points(check_points(position), self.model, self.device)
+
+    def run(self, points: Points) -> None:
+        """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
+        if points.x.shape[0]:
+            self._kernels.launch(
+                self._rows, self._shapes, self._cubes, self._cut, self._net, self._gain, points.x, points.out
+            )
+
+    def decode(self, position: np.ndarray) -> np.ndarray:
+        points = self.points(position)
+        self.run(points)
+        return points.values()
+
+    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
+        if position is not None:
+            self.check_own(position)
+        values = self.decode(self.own_positions() if position is None else position)
+        values[~self.model.live] = 0.0
+        return values
+
+    def light(self, position: np.ndarray) -> "GaussianLight":
+        return GaussianLight(self, check_points(position, "N"))
+
+
+class GaussianLight:
+    """Light of probes that is decoded where and when a volume asks for it; a `wlm.probe.volume.light.Light`."""
+
+    def __init__(self, decoder: GaussianDecoder, position: np.ndarray) -> None:
+        self._decoder = decoder
+        self.device, self.channels, self.count = decoder.device, decoder.model.outputs, len(position)
+        self._x = wp.array(decoder.model.normalise(position), dtype=wp.vec3, device=self.device)
+
+    def reader(self, count: int) -> "_GaussianReader":
+        return _GaussianReader(self._decoder, self._x, count)
+
+
+class _GaussianReader:
+    def __init__(self, decoder: GaussianDecoder, x: wp.array, count: int) -> None:
+        self._decoder, self._x = decoder, x
+        self._points = decoder.points(np.zeros((count, 3)))
+        self.numbers = wp.zeros(count, dtype=int, device=decoder.device)
+        self.values = self._points.out
+
+    def run(self) -> None:
+        frame_kernels.take_points(self._x, self.numbers, self._points.x)
+        self._decoder.run(self._points)

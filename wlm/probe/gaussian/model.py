@@ -1,0 +1,231 @@
+"""Gaussians and a network: the numbers that a file stores, and the codes that a GPU holds.
+
+The light at a position p follows from the sum of the Gaussians' latents at p and from p itself
+(gaussian-probe-compression, eq. 2 to 7):
+
+    x = (p - origin) / extent                        in [0, 1]^3
+    F(x) = sum_j F_j exp(-d_j^2 / 2),  d_j = |S_j^-1 R_j^T (x - mu_j)|,  over the Gaussians j that reach x
+    sh(p) = gain * MLP([F(x), x])
+
+A file stores whole numbers, each with a step (`WholeNumbers`). A GPU holds a 16-bit code for every number of a Gaussian
+and half floats for the network; both follow from the whole numbers.
+
+A rotation is stored as three numbers, the modified Rodrigues parameters p of one of the 24 rotations that give the same
+ellipsoid with its axes in another order. The rotation with the smallest angle is taken, |p| < 0.28. Its quaternion is
+
+    q = (1 - |p|^2, 2 p) / (1 + |p|^2)          w, x, y, z
+
+(Shuster, A Survey of Attitude Representations, 1993).
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from wlm.bundle import Bundle
+from wlm.errors import WlmError
+from wlm.probe.decode import Decoder
+from wlm.probe.model import CODES, Content, ProbeModel, Profile
+from wlm_kernels.probe.network import most_outputs
+
+# Channels of a Gaussian as a GPU holds it: centre, logarithm of the scale, quaternion, latent.
+CENTRE, SCALE, ROTATION, LATENT = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, None)
+
+# Channels of a Gaussian in whole numbers: the rotation takes three.
+STORED_CENTRE, STORED_SCALE, STORED_ROTATION, STORED_LATENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, None)
+
+CUT = 3.0
+"""Radius of a Gaussian's support in standard deviations."""
+
+LARGEST = (1 << 24) - 1
+"""Largest magnitude of a whole number of the network."""
+
+_FARTHEST = 3e38  # bounds beyond this are clamped, and refused when a file is read
+_SHORTEST = 1e-12  # length of a quaternion that has a direction
+_SAME = 1e-12  # difference of two angles that only rounding separates
+
+
+@dataclass(frozen=True, eq=False)
+class WholeNumbers:
+    """Gaussians and network as integers; each integer times its step is the number that it stands for.
+
+    Attributes:
+        gaussians: int64 [K, 9 + L]: centre 3, logarithm of the scale 3, rotation 3, latent L.
+        step: float64 [9 + L].
+        net: The three layers, int64 [I + 1, O] each, as `layer_shapes` describes them.
+        net_step: float64 [L + 6], for each row of the first layer, for the second layer and for the third.
+    """
+
+    gaussians: np.ndarray
+    step: np.ndarray
+    net: tuple[np.ndarray, np.ndarray, np.ndarray]
+    net_step: np.ndarray
+
+    def layers(self) -> list[np.ndarray]:
+        """Returns the layers as float16."""
+        most = float(np.finfo(np.float16).max)
+        steps = self.net_step[:-2, None], self.net_step[-2], self.net_step[-1]
+        return [
+            np.clip(layer * step, -most, most).astype(np.float16) for layer, step in zip(self.net, steps, strict=True)
+        ]
+
+    def codes(self) -> dict[str, np.ndarray]:
+        """Returns `code`, `levels`, `bounds` and `net` of `Gaussians`.
+
+        Raises:
+            ValueError: A number does not fit 16 bits, or a rotation exceeds half a turn.
+        """
+        low, high = self.gaussians.min(0), self.gaussians.max(0)
+        turn = self.gaussians[:, STORED_ROTATION] * self.step[STORED_ROTATION]
+        square = np.square(turn).sum(1, keepdims=True)
+        if (high - low).max() > CODES or not (square <= 1.0).all():
+            raise ValueError("part gaussians: expected 16-bit ranges and rotations of at most half a turn")
+        code = self.gaussians - low
+        quaternion = np.concatenate([1.0 - square, 2.0 * turn], 1) / (1.0 + square)
+        turned = np.rint((quaternion + 1.0) * (0.5 * CODES))
+        start = STORED_ROTATION.start
+        bounds = np.stack([low, high]) * self.step
+        bounds = np.concatenate([bounds[:, :start], [[-1.0] * 4, [1.0] * 4], bounds[:, STORED_LATENT]], 1)
+        spread = high - low
+        return {
+            "code": np.concatenate([code[:, :start], turned, code[:, STORED_LATENT]], 1).astype(np.uint16),
+            "levels": np.concatenate([spread[:start], np.full(4, CODES), spread[STORED_LATENT]]),
+            "bounds": np.clip(bounds, -_FARTHEST, _FARTHEST).astype(np.float32),
+            "net": np.concatenate([layer.ravel() for layer in self.layers()]),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians(Content):
+    """K Gaussians with latents of length L, and a network of P weights.
+
+    Attributes:
+        latent: L.
+        hidden: Width of both hidden layers.
+        outputs: D.
+        support: Support of a Gaussian, "ellipsoid" or "sphere".
+        gain: Factor of the network's outputs.
+        code: uint16 [K, 10 + L], codes of centre, logarithm of the scale, quaternion and latent.
+        levels: int64 [10 + L], largest code of each channel.
+        bounds: float32 [2, 10 + L], lowest and highest value of each channel.
+        net: float16 [P]: for each layer a row of weights for every input, then the biases.
+        dropped: Number of Gaussians that the fit dropped, since no probe needed them.
+        whole: The integers that the arrays follow from; None while a fit has not been quantised for its file.
+    """
+
+    METHOD: ClassVar[str] = "gaussians"
+
+    latent: int
+    hidden: int
+    outputs: int
+    support: str
+    gain: float
+    code: np.ndarray
+    levels: np.ndarray
+    bounds: np.ndarray
+    net: np.ndarray
+    dropped: int
+    whole: WholeNumbers | None = None
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return len(self.code)
+
+    @property
+    def nbytes(self) -> int:
+        return gaussian_bytes(self.count, self.latent, self.hidden, self.outputs)
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Value of one unit of each channel's code, float32 [10 + L]."""
+        low, high = self.bounds
+        return (high - low) / np.maximum(self.levels, 1).astype(np.float32)
+
+    def rows(self) -> np.ndarray:
+        """Restores the Gaussians from their codes (eq. 14), float32 [K, 10 + L].
+
+        Scales are logarithms. Quaternions w, x, y, z have any length; a quaternion of length zero is no rotation.
+        """
+        return self.bounds[0] + self.code.astype(np.float32) * self.steps
+
+    def layers(self) -> list[np.ndarray]:
+        """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
+        shapes = layer_shapes(self.latent, self.hidden, self.outputs)
+        parts = np.split(self.net, np.cumsum([rows * columns for rows, columns in shapes])[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
+        from wlm.probe.gaussian.decode import GaussianDecoder
+
+        return GaussianDecoder(model, device, **options)
+
+    def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
+        from wlm.probe.gaussian.bundle import gaussian_bundle
+
+        return gaussian_bundle(model, decoder)
+
+    def facts(self) -> dict[str, Any]:
+        return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
+
+
+def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
+    """Returns the bytes of the GPU buffers of `count` Gaussians and their network; see `wlm.probe.gaussian.bundle`."""
+    channels = LATENT.start + latent
+    padded = [
+        (1 + -(-(rows - 1) // 4) * 4, -(-columns // 4) * 4) for rows, columns in layer_shapes(latent, hidden, outputs)
+    ]
+    gaussians = 4 * (10 + 2 * channels + count * ((channels + 1) // 2))
+    return gaussians + 2 * sum(rows * columns for rows, columns in padded)
+
+
+def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:
+    """Returns the layers' shapes: a row of weights for each input, then a row of biases; a column for each output."""
+    return [(latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, outputs)]
+
+
+def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str) -> None:
+    """Checks that kernels can be built for `outputs` numbers per probe; the CPU has no limit.
+
+    Raises:
+        WlmError: There are too many for CUDA.
+    """
+    most = most_outputs(latent, hidden)
+    if device != "cpu" and outputs > most:
+        raise WlmError(
+            f"{name}: expected at most {most} numbers a probe on CUDA with latent {latent} and hidden "
+            f"{hidden}, found {outputs}; the CPU takes more"
+        )
+
+
+def predicted_bytes(profile: Profile, live: int, outputs: int) -> int:
+    """Returns the GPU bytes of a fit with this profile to `live` probes, if it drops no Gaussian."""
+    count = max(1, round(profile.ratio * live))
+    return gaussian_bytes(count, profile.latent, profile.hidden, outputs)
+
+
+def least_turned(rows: np.ndarray) -> np.ndarray:
+    """Expresses each Gaussian with the rotation of the smallest angle.
+
+    Args:
+        rows: [K, 10 + L], as `Gaussians.rows` returns them.
+
+    Returns:
+        float64 [K, 9 + L], channels as in `WholeNumbers`.
+    """
+    rows = rows.astype(np.float64)
+    quaternion = rows[:, ROTATION]
+    none = np.linalg.norm(quaternion, axis=1, keepdims=True) < _SHORTEST
+    turn = Rotation.from_quat(np.where(none, [1.0, 0.0, 0.0, 0.0], quaternion)[:, [1, 2, 3, 0]])
+    least = np.full(len(rows), np.inf)
+    scale, parameters = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    for axes in Rotation.create_group("O"):
+        turned = turn * axes
+        angle = turned.magnitude()
+        better = angle < least - _SAME
+        least[better] = angle[better]
+        scale[better] = (rows[:, SCALE] @ np.abs(np.rint(axes.as_matrix())))[better]
+        parameters[better] = turned.as_mrp()[better]
+    return np.concatenate([rows[:, CENTRE], scale, parameters, rows[:, LATENT]], 1)

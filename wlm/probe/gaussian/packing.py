@@ -1,0 +1,300 @@
+"""Quantising a fit for its file: integers as coarse as cost next to nothing.
+
+The rounding of one number is compensated by those that are rounded after it. The latents are fitted anew to the rounded
+Gaussians, so that the sums of the latents stay; each layer of the network is fitted to what entered the next layer, the
+last one to the probes. Within a matrix, rows are rounded one by one, and the rest of each row is subtracted from the
+rows that follow (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained Transformers, 2023). The steps
+of the groups of numbers are such that a bit is worth about as much in each group.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import linalg
+from scipy.spatial.transform import Rotation
+
+from wlm.probe.gaussian.decode import GaussianDecoder
+from wlm.probe.gaussian.model import (
+    CUT,
+    LARGEST,
+    STORED_CENTRE,
+    STORED_LATENT,
+    STORED_ROTATION,
+    STORED_SCALE,
+    Gaussians,
+    WholeNumbers,
+    least_turned,
+)
+from wlm.probe.model import CODES, ProbeModel
+from wlm.probe.morton import morton_keys
+
+DROP = 0.05
+"""PSNR in dB that quantising may cost at the probes."""
+
+_MANY = 20_000  # most probes that numbers are fitted to; fitting to few probes would favour them over the rest
+_TOGETHER = 1024  # most Gaussians whose latents are fitted together: the matrix has as many rows and columns
+_PIECE = 1 << 22  # probes times Gaussians per piece
+_FAINT = 1e-10  # share of the squared range below which an error is rounding
+# Shares of the natural steps of each group with which a bit is worth as much in all; measured within a third of each
+# other on the sets `livingroom` and `city`.
+_SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
+_NEAR = 0.85  # share of the allowed growth that ends the search
+_TRIES = 8
+_FINEST = 1 / 64  # of the natural steps, where no tried step is fine enough
+_AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth where the other probes lost more
+_OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share of the mean square
+
+
+def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> ProbeModel:
+    """Quantises a fitted model.
+
+    Args:
+        model: The fit, whose Gaussians have no whole numbers yet.
+        position: float64 [N, 3], of the live probes.
+        values: float32 [N, D].
+        device: Where results are compared with the fit.
+
+    Returns:
+        The coarsest model found that loses at most `DROP`, or a model with fine steps if there is none.
+    """
+    many = slice(None, None, -(-len(position) // _MANY))
+    faint = _FAINT * max(float(np.ptp(values)), float(np.abs(values).max())) ** 2
+    search = _Search(model, position[many], values[many], faint, device)
+    growth = 10.0 ** (DROP / 10.0) - 1.0
+    most = (1.0 + growth) * (_error(model, position, values, device) + faint)
+    for _ in range(_AGAIN):
+        whole = search.within(growth)
+        if whole is None:
+            break
+        found = _with_numbers(model, whole)
+        if _error(found, position, values, device) <= most:
+            return found
+        growth *= _LESS
+    return _with_numbers(model, search.finest())
+
+
+def _with_numbers(model: ProbeModel, whole: WholeNumbers) -> ProbeModel:
+    return replace(model, content=replace(model.content, whole=whole, **whole.codes()))
+
+
+def _error(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> float:
+    return float(np.square(GaussianDecoder(model, device).decode(position).astype(np.float64) - values).mean())
+
+
+class _Steps(NamedTuple):
+    """Steps of each group of numbers.
+
+    Attributes:
+        centre, scale, rotation: Steps of a Gaussian's numbers.
+        latent: Step of the latents, times the norm of their weights in the first layer.
+        first: Step of the first layer's weights of latents, times the norm of the latents.
+        position: Step of the first layer's weights of positions, and of its biases.
+        second, third: Steps of these layers.
+    """
+
+    centre: float
+    scale: float
+    rotation: float
+    latent: float
+    first: float
+    position: float
+    second: float
+    third: float
+
+
+class _Sums(NamedTuple):
+    """Weights of Gaussians at the probes.
+
+    Attributes:
+        rows: float64 [K, 9], the Gaussians without their latents.
+        weight: float64 [N, K] on the device; None where there are too many of them.
+        square: weight^T weight; None with `weight`.
+        feed: `_feed` of `square`; None with `weight`.
+    """
+
+    rows: np.ndarray
+    weight: torch.Tensor | None
+    square: np.ndarray | None
+    feed: np.ndarray | None
+
+
+class _Search:
+    """Finds integers of a model at given steps, and the error that they leave."""
+
+    def __init__(self, model: ProbeModel, position: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
+        content = model.content
+        assert isinstance(content, Gaussians)
+        self._gain, self._sphere = content.gain, content.support == "sphere"
+        self._x = torch.from_numpy(model.normalise(position).astype(np.float64)).to(device)
+        self._wanted = self._put(values.astype(np.float64) / self._gain)
+        rows = least_turned(content.rows())
+        centre = rows[:, STORED_CENTRE]
+        order = np.argsort(morton_keys(np.rint((centre - centre.min(0)) * CODES / 4).astype(np.int64)))
+        self._rows = rows = rows[order]
+        self._layers = [layer.astype(np.float64) for layer in content.layers()]
+        self._latent = self._latents(self._sums(rows[:, : STORED_LATENT.start]), rows[:, STORED_LATENT])
+        self._inside = []  # inputs of the second and of the third layer, before the sigmoid
+        inputs = self._inputs(self._latent)
+        for layer in self._layers[:2]:
+            self._inside.append(inputs @ self._put(layer))
+            inputs = _with_one(self._inside[-1].sigmoid())
+        self._faint = faint / self._gain**2
+        self._base = self._error(inputs @ self._put(self._layers[2]))
+        # Change of the first layer's sums by one unit of each latent, and by one unit of its weight.
+        first = self._layers[0][: self._latent.shape[1]]
+        self._of_latent = 1.0 / _positive(np.linalg.norm(first, axis=1))
+        self._of_first = 1.0 / _positive(self._latent.square().mean(0).sqrt().cpu().numpy())
+
+    def within(self, growth: float) -> WholeNumbers | None:
+        """Returns the coarsest integers found with which the error grows by at most this share, or None."""
+        best, natural, most = None, self._natural(), (1.0 + growth) * self._base
+        least, times, tried = 0.0, 1.0, []
+        for _ in range(_TRIES):
+            whole, error = self._rounded(_Steps(*(natural * times)))
+            tried.append((times**2, error))
+            if error <= most and times > least:
+                best, least = whole, times
+                if error >= most - (1.0 - _NEAR) * growth * self._base:
+                    break
+            # The error is about that without rounding plus a multiple of the squared step.
+            (square, last), (other, before) = tried[-1], tried[-2] if len(tried) > 1 else (0.0, self._base)
+            slope = (last - before) / (square - other) if square != other else 0.0
+            wanted = square + (most - 0.5 * (1.0 - _NEAR) * growth * self._base - last) / slope if slope > 0.0 else 0.0
+            times *= math.sqrt(min(max(wanted / square, 1 / 8), 8.0)) if slope > 0.0 else 2.0
+        return best
+
+    def finest(self) -> WholeNumbers:
+        """Returns integers with steps so fine that rounding changes next to nothing."""
+        return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
+
+    def _natural(self) -> np.ndarray:
+        """Returns steps that do about as much harm in each group at `_SHARES` of them, float64 [8]."""
+        rows, (first, second, third) = self._rows, self._layers
+        latents = first[: len(self._of_latent)]
+        slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
+        units = [1.0 / _rms(np.exp(-rows[:, STORED_SCALE].min(1))), 1.0, min(1.0 / _rms(slender), 1.0)]
+        units.append(_rms(rows[:, STORED_LATENT] / self._of_latent))
+        units += map(_rms, (latents / self._of_first[:, None], first[len(latents) :], second, third))
+        return np.array(units) * _SHARES
+
+    def _rounded(self, steps: _Steps) -> tuple[WholeNumbers, float]:
+        """Returns integers and their mean squared error over gain squared."""
+        rows, latents, start = self._rows, self._latent.shape[1], STORED_LATENT.start
+        step = np.concatenate([np.repeat(steps[:3], 3), steps.latent * self._of_latent])
+        least = np.ptp(rows, axis=0) * (1.01 / CODES)
+        least[STORED_ROTATION] = 1.0 / CODES
+        step = np.array([stored_step(each) for each in np.maximum(step, least)])
+        whole = np.rint(rows[:, :start] / step[:start])
+        turn = whole[:, STORED_ROTATION] * step[STORED_ROTATION]
+        # A file holds at most half a turn, which only steps that are far too coarse exceed.
+        whole[np.square(turn).sum(1) > 1.0, STORED_ROTATION] = 0.0
+        sums = self._sums(whole * step[:start])
+        latent = rows[:, STORED_LATENT]
+        if sums.square is not None:
+            latent = _fitted(sums.square, (sums.weight.T @ self._latent).cpu().numpy(), latent, _OF_LATENTS)
+        latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), sums.feed, CODES // 2)
+        net_step = [steps.first * each for each in self._of_first]
+        net_step += [steps.position] * 4 + [steps.second, steps.third]
+        net_step = np.array([stored_step(each) for each in net_step])
+        inputs = self._inputs(self._latents(sums, latent * step[STORED_LATENT]))
+        net = []
+        wanted = [*self._inside, self._wanted]
+        for number, layer in enumerate(self._layers):
+            own = net_step[: latents + 4] if number == 0 else np.full(len(layer), net_step[latents + 3 + number])
+            square = (inputs.T @ inputs).cpu().numpy()
+            fitted = _fitted(square, (inputs.T @ wanted[number]).cpu().numpy(), layer, _OF_LAYERS)
+            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
+            result = inputs @ self._put(net[-1] * own[:, None])
+            inputs = _with_one(result.sigmoid())
+        numbers = np.concatenate([whole, latent], 1).astype(np.int64)
+        centre = numbers[:, STORED_CENTRE] - numbers[:, STORED_CENTRE].min(0)
+        numbers = numbers[np.argsort(morton_keys(centre), kind="stable")]
+        packed = WholeNumbers(numbers, step, tuple(layer.astype(np.int64) for layer in net), net_step)
+        return packed, self._error(result)
+
+    def _error(self, result: torch.Tensor) -> float:
+        return float((result - self._wanted).square().mean()) + self._faint
+
+    def _sums(self, rows: np.ndarray) -> _Sums:
+        if len(rows) > _TOGETHER:
+            return _Sums(rows, None, None, None)
+        weight = torch.cat(list(self._weights(rows)))
+        square = (weight.T @ weight).cpu().numpy()
+        return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))
+
+    def _weights(self, rows: np.ndarray) -> Iterator[torch.Tensor]:
+        """Yields the weights of Gaussians [K, 9] at the probes, float64 [n, K] piece by piece."""
+        scale = np.exp(rows[:, STORED_SCALE])
+        whiten = (
+            Rotation.from_mrp(rows[:, STORED_ROTATION]).as_matrix().transpose(0, 2, 1) / scale[:, :, None]
+        )  # S^-1 R^T
+        middle = self._put(np.einsum("kij,kj->ki", whiten, rows[:, STORED_CENTRE]))
+        flat, centre = self._put(whiten.reshape(-1, 3).T), self._put(rows[:, STORED_CENTRE])
+        reach = self._put(np.square(CUT * scale.max(1)))
+        for x in self._x.split(max(1, _PIECE // len(rows))):
+            square = ((x @ flat).reshape(-1, len(rows), 3) - middle).square_().sum(2)
+            reached = (x[:, None] - centre).square_().sum(2) < reach if self._sphere else square < CUT**2
+            yield square.mul_(-0.5).exp_().mul_(reached)
+
+    def _latents(self, sums: _Sums, latent: np.ndarray) -> torch.Tensor:
+        """Returns the sum of latents at the probes, float64 [N, L] on the device."""
+        latents = self._put(latent)
+        pieces = self._weights(sums.rows) if sums.weight is None else [sums.weight]
+        return torch.cat([weight @ latents for weight in pieces])
+
+    def _put(self, numbers: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(numbers)).to(self._x.device)
+
+    def _inputs(self, latent: torch.Tensor) -> torch.Tensor:
+        return _with_one(torch.cat([latent, self._x], 1))
+
+
+def stored_step(step: float) -> float:
+    """Rounds a positive step to what a file stores, the upper half of a float32."""
+    bits = max(int(np.array(step, np.float32).view(np.uint32)) + 0x8000 >> 16, 1)
+    return float(np.array(bits << 16, np.uint32).view(np.float32))
+
+
+def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: float) -> np.ndarray:
+    """Solves normal equations with a ridge that pulls the solution towards `before`."""
+    ridge = _ridge(square, share)
+    return linalg.solve(square + ridge * np.eye(len(square)), right + ridge * before, assume_a="pos")
+
+
+def _feed(square: np.ndarray, share: float) -> np.ndarray:
+    """Returns the upper Cholesky factor of the inverse of a matrix with a ridge."""
+    inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
+    return linalg.cholesky(0.5 * (inverse + inverse.T))
+
+
+def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
+    """Rounds numbers [I, O] row by row to integers of at most `most`, each row making up for those before it."""
+    numbers, whole = numbers.copy(), np.empty_like(numbers)
+    for row in range(len(numbers)):
+        whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
+        if feed is not None:
+            over = (numbers[row] - whole[row] * step[row]) / feed[row, row]
+            numbers[row + 1 :] -= np.outer(feed[row, row + 1 :], over)
+    return whole
+
+
+def _ridge(square: np.ndarray, share: float) -> float:
+    return max(share * float(np.trace(square)) / len(square), np.finfo(np.float32).tiny)
+
+
+def _with_one(inputs: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.pad(inputs, (0, 1), value=1.0)
+
+
+def _positive(numbers: np.ndarray) -> np.ndarray:
+    """Replaces numbers that are next to nothing by the largest one."""
+    most = float(numbers.max()) or 1.0
+    return np.where(numbers > 1e-3 * most, numbers, most)
+
+
+def _rms(numbers: np.ndarray) -> float:
+    return float(np.sqrt(np.square(numbers).mean())) or 1.0

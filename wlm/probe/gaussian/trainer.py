@@ -1,0 +1,400 @@
+"""Training Gaussians and network on a device (gaussian-probe-compression, sections 3.2 and 3.3)."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+import warp as wp
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.formats.parts import Part, all_finite, check_part, check_parts
+from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, ROTATION, SCALE, Gaussians, layer_shapes
+from wlm.probe.gaussian.start import first_gaussians
+from wlm.probe.model import Profile
+from wlm.probe.morton import morton_order
+from wlm_kernels.probe import network as probe_network
+from wlm_kernels.probe import step as probe_step
+from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
+from wlm_kernels.probe.network import CPU_LANES
+from wlm_kernels.probe.optimiser import Optimiser
+from wlm_kernels.probe.step import GROUP
+
+CODE_BITS, CENTRE_BITS = 10, 16
+"""Bits of a code in training: of scale, rotation and latent, and of a centre."""
+
+FINAL_RATE = 1e-3
+"""Last learning rates as a share of the first; the schedule is half a cosine."""
+
+_QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the second and the third stage begin
+_FIRST_LATENT = 0.1  # standard deviation of the first latents
+_PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
+_STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
+_BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe at the edge of its group's box
+
+
+class Trainer:
+    """A running fit.
+
+    A step runs over all probes (eq. 8). There are three stages: the Gaussians are free; then their numbers are rounded
+    to codes in each step (section 3.3); then they are fixed, and only the network is trained.
+
+    Attributes:
+        count: K, number of Gaussians.
+        needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
+        dropped_change: Largest change of a probe's number that dropping causes.
+    """
+
+    def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str) -> None:
+        """Starts a fit.
+
+        Args:
+            x: float32 [N, 3], normalised positions of the live probes.
+            values: float32 [N, D].
+            profile: The settings.
+            seed: One seed gives one result on one device.
+            device: "cpu" or "cuda:N".
+        """
+        self.profile, self.device = profile, device
+        self._cuda = device != "cpu"
+        kind = "cuda" if self._cuda else "cpu"
+        self._step_kernels = probe_step.step_kernels(profile.latent, kind)
+        self._network = probe_network.network_kernels(profile.latent, profile.hidden, values.shape[1], kind)
+        random = np.random.default_rng(seed)
+        order = morton_order(x)
+        x, values = x[order], values[order]
+        self._probes, self._outputs = values.shape
+        self._upload(x, values)
+        self._allocate(*self._first(x, values, random))
+        self._optimiser = self._settings()
+        self.needed = np.ones(self.count, bool)
+        self.dropped_change = 0.0
+        self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
+        self._stages = [interop.StepGraph(lambda stage=s: self._step(stage), device, warmup=1) for s in range(3)]
+        self._entered = 0
+        # Loaded before two threads launch kernels, since two threads must not load a module at once.
+        self._step_kernels.load(device)
+        self._network.load(device)
+
+    def _upload(self, x: np.ndarray, values: np.ndarray) -> None:
+        n, d = values.shape
+        padded = -(-n // GROUP) * GROUP
+        boxes = np.concatenate([x, np.repeat(x[-1:], padded - n, 0)]).astype(np.float32)
+        groups = boxes.reshape(-1, GROUP, 3)
+        low, high = groups.min(1), groups.max(1)
+        self._groups = probe_step.Groups()
+        self._groups.x = self._put(boxes, wp.vec3)
+        self._groups.middle = self._put((low + high) / 2, wp.vec3)
+        self._groups.half = self._put((high - low) / 2 + _BOX_MARGIN, wp.vec3)
+        self._groups.count = n
+        exact = values.astype(np.float64)
+        self.mean, self.spread = exact.mean(0), exact.std(0)
+        spread = self.spread
+        target = np.zeros((d, padded), np.float32)
+        # A channel that never changes equals its mean, and the network's output for it has no effect.
+        target[:, :n] = np.divide(exact - self.mean, spread, out=np.zeros_like(exact), where=spread > 0).T
+        self._target = self._put(target, float)
+        # Squared errors are measured in units of the largest variance of a channel.
+        self._unit = float(max(spread.max() ** 2, np.finfo(np.float64).tiny))
+        self._weight = self._put(spread**2 / self._unit / (n * d), float)
+
+    def _first(self, x: np.ndarray, values: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the first Gaussians and network."""
+        p = self.profile
+        count = max(1, round(p.ratio * len(x)))
+        centre, scale = first_gaussians(x, values, count, p.detail, p.first_scale, random)
+        rows = np.zeros((len(centre), LATENT.start + p.latent), np.float32)
+        rows[:, CENTRE] = centre
+        rows[:, SCALE] = np.log(scale)[:, None]
+        rows[:, ROTATION.start] = 1.0
+        rows[:, LATENT] = random.normal(size=(len(centre), p.latent)) * _FIRST_LATENT
+        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(self._outputs)
+        first = random.uniform(-1, 1, (inputs + 1, hidden)) * p.gain / math.sqrt(inputs)
+        first[inputs] /= p.gain
+        first[inputs] -= x.mean(0) @ first[p.latent : inputs]
+        second = np.zeros((hidden + 1, hidden))
+        second[:hidden] = random.uniform(-1, 1, (hidden, hidden)) * p.gain / math.sqrt(hidden)
+        third = np.zeros((hidden + 1, wide))
+        third[:hidden, : self._outputs] = random.uniform(-1, 1, (hidden, self._outputs)) / math.sqrt(hidden)
+        # A sigmoid is 1/2 on average; the biases make each layer's inputs 0 on average.
+        second[hidden] = -0.5 * second[:hidden].sum(0)
+        third[hidden] = -0.5 * third[:hidden].sum(0)
+        return rows, np.concatenate([first.ravel(), second.ravel(), third.ravel()]).astype(np.float32)
+
+    def _allocate(self, rows: np.ndarray, net: np.ndarray) -> None:
+        count, channels = rows.shape
+        padded = self._groups.x.shape[0]
+        groups, parts = padded // GROUP, self._network.parts(padded)
+        latent = self.profile.latent
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, device=self.device)
+
+        self.count = count
+        self._tensors = {
+            "rows": torch.from_numpy(rows).to(self.device),
+            "net": torch.from_numpy(net).to(self.device),
+            "moments": zeros(4, count, channels),
+            "net_moments": zeros(2, len(net)),
+            "bounds": zeros(2, channels),
+            "control": torch.zeros(1, dtype=torch.int32, device=self.device),
+            "used": zeros(count, channels),
+            "f": zeros(probe_step.SPLITS if self._cuda else 1, latent, padded),
+            "grad_f": zeros(latent, padded),
+            "sums": zeros(count, SHAPE_NUMBERS + latent),
+            "partial": zeros(parts, len(net)),
+            "loss": zeros(parts),
+        }
+        self._arrays = {key: interop.to_warp(value) for key, value in self._tensors.items()}
+        self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
+        self._by_group = wp.zeros((groups, -(-count // 32)), dtype=wp.uint32, device=self.device)
+        self._by_gaussian = wp.zeros((count, -(-groups // 32)), dtype=wp.uint32, device=self.device)
+        self._levels = self._put(self._largest_codes(), float)
+
+    def _settings(self) -> Optimiser:
+        p = self.profile
+        share = np.linspace(0.0, 1.0, p.steps)
+        rates = np.empty(LATENT.start + p.latent)
+        rates[CENTRE], rates[SCALE], rates[ROTATION] = p.centre_rate, p.scale_rate, p.rotation_rate
+        rates[LATENT] = p.latent_rate
+        optimiser = Optimiser()
+        optimiser.control = self._arrays["control"]
+        optimiser.schedule = self._put(FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + np.cos(np.pi * share)), float)
+        optimiser.rates = self._put(rates, float)
+        optimiser.net_rate = p.net_rate
+        optimiser.bounds = self._arrays["bounds"]
+        optimiser.adan = int(p.optimiser == "adan")
+        return optimiser
+
+    def _put(self, values: np.ndarray, dtype) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=dtype, device=self.device)
+
+    @property
+    def step(self) -> int:
+        """Number of finished steps."""
+        return int(self._tensors["control"].item())
+
+    def stage(self, step: int) -> int:
+        """Stage of a step: 0 with free Gaussians, 1 with rounded ones, 2 with fixed ones."""
+        steps = self.profile.steps
+        return int(step >= round(_QUANTISE_FROM * steps)) + int(step >= round(_FREEZE_FROM * steps))
+
+    def run(self, steps: int) -> None:
+        """Runs the next steps; on CUDA they are queued, not awaited."""
+        first = self.step
+        with interop.stream(self.device):
+            for step in range(first, first + steps):
+                stage = self.stage(step)
+                while self._entered < stage:
+                    self._enter(self._entered + 1)
+                self._stages[stage]()
+
+    def _enter(self, stage: int) -> None:
+        """Starts a stage: sets the range of the codes, or fixes the Gaussians."""
+        t = self._tensors
+        if stage == 1:
+            t["bounds"].copy_(torch.stack([t["rows"].amin(0), t["rows"].amax(0)]))
+        else:
+            self._make_shapes(quantised=True)
+            self._prune()
+        self._entered = stage
+
+    def finish(self) -> None:
+        """Enters the stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
+        with interop.stream(self.device):
+            while self._entered < 2:
+                self._enter(self._entered + 1)
+
+    def _make_shapes(self, quantised: bool) -> None:
+        p, a = self.profile, self._arrays
+        self._step_kernels.shapes(
+            a["rows"],
+            a["bounds"],
+            int(quantised),
+            self._levels,
+            CUT,
+            int(p.support == "sphere"),
+            a["used"],
+            self._shapes,
+        )
+        probe_step.touch(self._groups, self._shapes, self._by_group, self._by_gaussian)
+
+    def _step(self, stage: int) -> None:
+        k, a, t = self._step_kernels, self._arrays, self._tensors
+        move = stage < 2
+        probe_step.count_step(a["control"])
+        if move:
+            self._make_shapes(quantised=stage > 0)
+        if not self._cuda:
+            # The CPU's two lanes add to these arrays.
+            t["partial"].zero_()
+            t["loss"].zero_()
+        if move:
+            self._features()
+        network = (self._groups, a["f"], self._target, self._weight, a["net"], a["grad_f"], a["partial"], a["loss"])
+        self._share(self._groups.x.shape[0], lambda *lane: self._network.launch(*network, *lane))
+        if move:
+            collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], CUT, a["sums"])
+            self._share(self.count, lambda *lane: k.collect(*collect, *lane))
+        self._optimiser.keep, self._optimiser.move = int(stage > 0), int(move)
+        k.update(
+            self._optimiser,
+            a["rows"],
+            a["used"],
+            self._shapes,
+            a["sums"],
+            a["moments"],
+            a["net"],
+            a["net_moments"],
+            a["partial"],
+        )
+
+    def _features(self) -> None:
+        a = self._arrays
+        args = (self._groups, self._shapes, a["used"], self._by_group, CUT, a["f"])
+        self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
+
+    def _share(self, total: int, work) -> None:
+        """Runs `work` over all rows: at once on CUDA, in two halves on two threads on the CPU."""
+        if self._cuda:
+            work()
+            return
+        half = total // 2
+        lanes = [(base, count) for base, count in ((0, half), (half, total - half)) if count]
+        list(self._pool.map(lambda lane: work(*lane), lanes))
+
+    def _prune(self) -> None:
+        """Drops the Gaussians whose absence changes no decoded number by more than the limit.
+
+        Gaussians are dropped in the order of an upper bound of their influence on the probes, as many as stay within
+        the limit together. One Gaussian always stays.
+        """
+        t, latent = self._tensors, self._tensors["used"][:, LATENT]
+        # With a gradient of one in one channel, the first sum of the latent is the sum of the Gaussian's weights.
+        t["grad_f"].zero_()
+        t["grad_f"][0, : self._probes] = 1.0
+        a = self._arrays
+        collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], CUT, a["sums"])
+        self._share(self.count, lambda *lane: self._step_kernels.collect(*collect, *lane))
+        influence = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
+        order = influence.argsort(stable=True)
+        stored = latent.clone()
+        self._features()
+        whole = self._decoded()
+        scale = torch.from_numpy(self.spread).to(whole)
+        exact = torch.from_numpy(self.mean).to(whole) + whole * scale
+        allowed = _PRUNE * float(exact.max() - exact.min())
+
+        def change(count: int) -> float:
+            latent.copy_(stored)
+            latent[order[:count]] = 0.0
+            self._features()
+            return float(((self._decoded() - whole) * scale).abs().max())
+
+        low, high = 0, self.count - 1
+        while low < high:
+            middle = (low + high + 1) // 2
+            if change(middle) <= allowed:
+                low = middle
+            else:
+                high = middle - 1
+        self.dropped_change = change(low)
+        self.needed = np.ones(self.count, bool)
+        self.needed[order[:low].cpu().numpy()] = False
+
+    def _decoded(self) -> torch.Tensor:
+        """Returns the network's normalised output for the features, float32 [N, D]."""
+        p, d = self.profile, self._outputs
+        shapes = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        parts = self._tensors["net"].split([rows * columns for rows, columns in shapes])
+        first, second, third = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
+        x = wp.to_torch(self._groups.x)[: self._probes]
+        h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
+        h = torch.sigmoid(h @ first[:-1] + first[-1])
+        h = torch.sigmoid(h @ second[:-1] + second[-1])
+        return (h @ third[:-1] + third[-1])[:, :d]
+
+    def mse(self) -> float:
+        """Returns the mean squared error of the live probes' numbers at the last step; NaN before the first."""
+        return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
+
+    def quantised(self) -> Gaussians:
+        """Returns the fit as codes, without whole numbers.
+
+        The network's last layer yields the probes' numbers over `gain`, the largest weight of that layer.
+        """
+        p, d = self.profile, self._outputs
+        t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
+        low, high = t["bounds"]
+        span = np.where(high > low, high - low, 1.0)
+        code = np.rint((t["used"][self.needed] - low) / span * self._levels.numpy())
+        code = np.where(high > low, code, 0).astype(np.uint16)
+        *others, last = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        before = sum(rows * columns for rows, columns in others)
+        third = t["net"][before:].reshape(last)[:, :d] * self.spread
+        third[-1] += self.mean
+        gain = float(np.abs(third).max()) or 1.0
+        net = np.concatenate([t["net"][:before], (third / gain).ravel()])
+        return Gaussians(
+            latent=p.latent,
+            hidden=p.hidden,
+            outputs=d,
+            support=p.support,
+            gain=gain,
+            code=code,
+            levels=self._largest_codes(),
+            bounds=t["bounds"].astype(np.float32),
+            net=np.clip(net, -65504, 65504).astype(np.float16),
+            dropped=int((~self.needed).sum()),
+        )
+
+    def _largest_codes(self) -> np.ndarray:
+        """Returns the largest code of each channel, int64 [10 + L]."""
+        return 2 ** np.array([CENTRE_BITS] * 3 + [CODE_BITS] * (7 + self.profile.latent)) - 1
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Returns everything that later steps depend on.
+
+        Raises:
+            WlmError: The fit diverged: a number is not finite.
+        """
+        result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
+        if not all(map(all_finite, result.values())):
+            raise WlmError(f"the fit diverged; expected smaller rates than those of {self.profile.name}")
+        return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
+
+    def table(self, step: int) -> dict[str, Part]:
+        """Returns the table of parts of a `state` after `step` steps."""
+        entered = self.stage(step - 1) if step else 0
+        table = {key: Part(np.float32, tuple(self._tensors[key].shape)) for key in _STATE}
+        return table | {
+            "control": Part(np.int32, (1,), least=step, most=step),
+            "kept": Part(np.bool_, (self.count,)),
+            "entered": Part(np.int64, (), least=entered, most=entered),
+        }
+
+    def load(self, state: dict[str, np.ndarray]) -> None:
+        """Restores a `state`.
+
+        Raises:
+            ValueError: A part is missing, has another shape or is out of its range; the trainer is unchanged.
+        """
+        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
+        state = check_parts(state, self.table(int(done[0])))
+        if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
+            raise ValueError("parts kept, bounds: expected a Gaussian, and no lowest value above its highest")
+        for key in _STATE:
+            self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
+        self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
+        if self._entered == 2:
+            with interop.stream(self.device):
+                self._make_shapes(quantised=True)
+                self._tensors["used"][torch.from_numpy(~self.needed).to(self.device), LATENT] = 0.0
+                self._features()
+
+    def close(self) -> None:
+        """Ends the CPU's threads and frees the graphs, which reference the trainer."""
+        self._stages = []
+        if self._pool is not None:
+            self._pool.shutdown()

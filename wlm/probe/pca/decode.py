@@ -1,0 +1,107 @@
+"""Decoding principal components on a device: probe by probe, and between probes through a volume."""
+
+import numpy as np
+import warp as wp
+from scipy.spatial import cKDTree
+
+from wlm.probe.decode import Decoder
+from wlm.probe.model import ProbeModel, check_points
+from wlm.probe.pca.model import Components
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import at_probes
+from wlm.probe.volume.walk import settle
+from wlm_kernels.probe.components import decode_components
+
+_BUDGET = 1024  # blocks that the volume decodes per frame; it is awaited
+
+
+class ComponentDecoder(Decoder):
+    """A model of principal components on a device, where it stays packed."""
+
+    def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
+        """Loads a model.
+
+        Args:
+            model: The model, whose content is principal components.
+            device: "cpu" or "cuda:N".
+            position: As for `wlm.probe.decode.Decoder`.
+
+        Raises:
+            WlmError: The device does not exist, or the positions are not those of the model's probes.
+        """
+        super().__init__(model, device, position=position)
+        content = model.content
+        assert isinstance(content, Components)
+        self._code = wp.array(content.code, dtype=wp.uint8, device=self.device)
+        self._bounds = wp.array(content.bounds, dtype=float, device=self.device)
+        self._basis = wp.array(content.basis, dtype=wp.float16, device=self.device)
+        live = model.live
+        row = np.where(live, np.cumsum(live) - 1, -1)
+        self._row = wp.array(row.astype(np.int32), dtype=int, device=self.device)
+        self._volume: Volume | None = None
+
+    @property
+    def device_bytes(self) -> int:
+        arrays = (self._code, self._bounds, self._basis, self._row)
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
+
+    def decode(self, position: np.ndarray) -> np.ndarray:
+        """Reads the light at any points as a renderer would, from the cascaded volume around a viewer who is near.
+
+        Points that no block of the volume covers take the light of the nearest live probe.
+        """
+        points, model = check_points(position), self.model
+        own = self.own_positions()
+        if self._volume is None:
+            self._volume = Volume(own, self.light(own), live=model.live, budget=_BUDGET)
+        volume = self._volume
+        points = np.clip(points, own.min(0), own.max(0))
+        values = np.empty((len(points), model.outputs), np.float32)
+        covered = np.empty(len(points), bool)
+        # One viewpoint for each cube of points; the finest window reaches beyond the cube on all sides.
+        side = 0.5 * volume.side * volume.sizes[0]
+        cube = np.floor((points - own.min(0)) / side)
+        for viewpoint in np.unique(cube, axis=0):
+            here = (cube == viewpoint).all(1)
+            settle(volume, own.min(0) + (viewpoint + 0.5) * side)
+            reading = volume.read(points[here])
+            values[here], covered[here] = reading.values, reading.weight > 0.0
+        if not covered.all():
+            live = np.flatnonzero(model.live)
+            nearest = live[cKDTree(own[live]).query(points[~covered])[1]]
+            values[~covered] = at_probes(ComponentLight(self), nearest)
+        return values
+
+    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
+        if position is not None:
+            self.check_own(position)
+        return at_probes(ComponentLight(self), np.arange(self.model.probes))
+
+    def light(self, position: np.ndarray) -> "ComponentLight":
+        self.check_own(position)
+        return ComponentLight(self)
+
+    def run(self, numbers: wp.array, values: wp.array) -> None:
+        """Decodes probes int [M] into float [M, D]; on CUDA the work is queued, not awaited."""
+        decode_components(self._code, self._bounds, self._basis, self._row, numbers, values)
+
+
+class ComponentLight:
+    """Light of probes that is decoded where and when a volume asks for it; a `wlm.probe.volume.light.Light`."""
+
+    def __init__(self, decoder: ComponentDecoder) -> None:
+        self._decoder = decoder
+        self.device, self.channels, self.count = decoder.device, decoder.model.outputs, decoder.model.probes
+
+    def reader(self, count: int) -> "_ComponentReader":
+        return _ComponentReader(self._decoder, count)
+
+
+class _ComponentReader:
+    def __init__(self, decoder: ComponentDecoder, count: int) -> None:
+        self._decoder = decoder
+        self.numbers = wp.zeros(count, dtype=int, device=decoder.device)
+        self.values = wp.zeros((count, decoder.model.outputs), dtype=float, device=decoder.device)
+
+    def run(self) -> None:
+        self._decoder.run(self.numbers, self.values)

@@ -1,0 +1,141 @@
+"""Principal components: every live probe is a magnitude times a sum of a few directions with 8-bit coefficients.
+
+    sh_i = m_i sum_k c_ik b_k,   m_i = exp(low_0 + step_0 q_i0),   c_ik = low_k + step_k q_ik,   q in 0 ... 255
+
+The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe: a
+bright probe costs the others nothing. The directions b_k are the right singular vectors of all probes' numbers; with as
+many directions as numbers they are the unit vectors, which take no memory. Sloan et al., Clustered Principal Components
+for Precomputed Radiance Transfer (2003), use several clusters; on sets this small one cluster is as good.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wlm.bundle import Bundle
+from wlm.probe.decode import Decoder
+from wlm.probe.model import Content, ProbeModel
+
+ENOUGH = 0.02
+"""Error that needs no further component: RMS over the probes of the error over the probe's own norm."""
+
+_LEVELS = 255
+
+
+@dataclass(frozen=True, eq=False)
+class Components(Content):
+    """V live probes of D numbers in K components.
+
+    Attributes:
+        outputs: D.
+        code: uint8 [V, 1 + K], codes of the logarithm of the magnitude and of the coefficients.
+        bounds: float16 [2, 1 + K], lowest value and step of each column of `code`.
+        basis: float16 [K, D]; empty where the directions are the unit vectors, K = D.
+    """
+
+    METHOD: ClassVar[str] = "pca"
+
+    outputs: int
+    code: np.ndarray
+    bounds: np.ndarray
+    basis: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return self.code.shape[1] - 1
+
+    @property
+    def nbytes(self) -> int:
+        return component_bytes(len(self.code), self.outputs, self.count, identity=not len(self.basis))
+
+    def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
+        from wlm.probe.pca.decode import ComponentDecoder
+
+        return ComponentDecoder(model, device, **options)
+
+    def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
+        from wlm.probe.pca.bundle import component_bundle
+
+        return component_bundle(model, decoder)
+
+    def facts(self) -> dict[str, Any]:
+        return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}
+
+
+def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:
+    """Returns the bytes of the GPU buffer of V = `live` probes in `count` components; see `wlm.probe.pca.bundle`."""
+    basis = 0 if identity else count * -(-outputs // 2)
+    return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
+
+
+def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[Components, float]:
+    """Compresses live probes in as few components as reach the error `ENOUGH`.
+
+    Args:
+        values: float32 [V, D], of live probes: no row is zero.
+        most_bytes: Most GPU bytes; None: any number. One component is fitted in any case.
+
+    Returns:
+        The components, and their error as `ENOUGH` measures it; it is larger than that only for want of bytes.
+    """
+    values = values.astype(np.float64)
+    live, outputs = values.shape
+    norm = _norm(values)
+    directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
+    identity = component_bytes(live, outputs, outputs, identity=True)
+    best, error = _coded(values, norm, directions[:1].astype(np.float16))
+    for count in range(1, min(live, outputs) + 1):
+        size = component_bytes(live, outputs, count, identity=False)
+        if size >= identity:
+            if most_bytes is None or identity <= most_bytes:
+                best, error = _coded(values, norm, np.zeros((0, outputs), np.float16))
+            break
+        if count > 1:
+            if most_bytes is not None and size > most_bytes:
+                break
+            best, error = _coded(values, norm, directions[:count].astype(np.float16))
+        if error <= ENOUGH:
+            break
+    return best, error
+
+
+def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Components, float]:
+    """Codes probes [V, D] of some norms in a basis; returns the components and their relative error."""
+    logarithm, code, bounds = _quantised(np.log(norm)[:, None])
+    magnitude = np.exp(logarithm)
+    # Coefficients for the basis as it is stored: its rounding causes no error of its own.
+    directions = basis.astype(np.float64) if len(basis) else np.eye(values.shape[1])
+    inverse = np.linalg.pinv(directions) if len(basis) else directions
+    decoded, codes, ranges = _quantised((values / magnitude) @ inverse)
+    error = magnitude * (decoded @ directions) - values
+    components = Components(
+        outputs=values.shape[1],
+        code=np.concatenate([code, codes], 1),
+        bounds=np.concatenate([bounds, ranges], 1),
+        basis=basis,
+    )
+    return components, float(np.sqrt(np.square(_norm(error) / norm).mean()))
+
+
+def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quantises columns [V, C] over their ranges: float64 numbers, uint8 codes, float16 [2, C] lowest and step."""
+    low = -_half_above(-numbers.min(0))
+    step = _half_above((numbers.max(0) - low) / _LEVELS)
+    code = np.divide(numbers - low, step, out=np.zeros_like(numbers), where=step > 0)
+    code = np.clip(np.rint(code), 0, _LEVELS).astype(np.uint8)
+    return low + code * step, code, np.stack([low, step]).astype(np.float16)
+
+
+def _half_above(numbers: np.ndarray) -> np.ndarray:
+    """Rounds numbers up to half floats, as float64."""
+    near = numbers.astype(np.float16)
+    return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
+
+
+def _norm(values: np.ndarray) -> np.ndarray:
+    """Returns the norms of rows; squares of the smallest and the largest floats would not fit."""
+    largest = np.abs(values).max(1)
+    scaled = values / np.where(largest > 0, largest, 1.0)[:, None]
+    return largest * np.linalg.norm(scaled, axis=1)

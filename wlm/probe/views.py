@@ -1,0 +1,235 @@
+"""Scoring pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
+
+50 viewers stand along the loop of `wlm probe walk`, each looking in another direction with a field of view of 90
+degrees. They see balls at some of the probes, and the scene's mesh if it is given, both diffuse and white. Three kinds
+of light are compared with the original probes:
+
+- "decoded": the decoded probes;
+- "lossless, volume": the original probes, read through a complete cascaded volume around the viewer;
+- "decoded, volume": the decoded probes, read in the same way, as an engine would draw them.
+
+A ball is lit by its own probe, or by the volume at its centre. A point of the mesh is lit by the eight nearest probes,
+weighted by the inverse square of their distance, or by the volume. The paper reads all probes through its volume, and
+compares the third kind with the second. Pictures are compared as displayed: at the exposure of the balls under the
+original light, with Reinhard's curve, in sRGB.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull, cKDTree
+
+from wlm.errors import WlmError
+from wlm.formats.geometry import Geometry
+from wlm.interop import check_device
+from wlm.metrics import Pictures
+from wlm.ops import raster
+from wlm.ops.views import clip_from
+from wlm.probe.data import ProbeSet
+from wlm.probe.places import ball_exposure, ball_radius
+from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, fibonacci_sphere, sh_count
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
+from wlm.probe.volume.walk import camera_path, settle
+from wlm.system import Meter, OnProgress, Report
+from wlm.texels import filmic, to_srgb
+
+VIEWS, RESOLUTION = 50, 128
+"""Default number of viewers, and pixels along a side of a view."""
+
+KINDS = ("decoded", "lossless, volume", "decoded, volume")
+
+_BALLS = 256
+_BALL_POINTS = 162
+_NEIGHBOURS = 8
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_DOWN = 0.2  # downward part of the viewing direction
+_BUDGET = 1024  # blocks decoded per frame; the volume is awaited
+
+
+@dataclass(frozen=True)
+class ViewScore(Report):
+    """The error of one kind of surface under one kind of light.
+
+    Attributes:
+        drawn: "balls" or "mesh".
+        light: One of `KINDS`.
+        views: Number of views that show the surface.
+        mse, psnr, ssim, flip: Errors over the pixels that show it, as in `wlm.metrics.Pictures`; NaN without a view.
+    """
+
+    drawn: str
+    light: str
+    views: int
+    mse: float
+    psnr: float
+    ssim: float
+    flip: float
+
+
+def score_views(
+    probes: ProbeSet,
+    decoded: np.ndarray,
+    geometry: Geometry | None = None,
+    *,
+    views: int = VIEWS,
+    resolution: int = RESOLUTION,
+    up: int = 1,
+    device: str = "cpu",
+    progress: OnProgress | None = None,
+) -> list[ViewScore]:
+    """Draws the views and compares them.
+
+    Args:
+        probes: The original probes, spherical harmonics.
+        decoded: float32 [N, D], all decoded probes.
+        geometry: The scene's mesh; None: only balls are drawn.
+        views: Number of viewers, at least 1.
+        resolution: Pixels along a side, 16 to 4,096.
+        up: Index of the axis that points up.
+        device: Device of the volumes and of the rasteriser.
+        progress: Called about twice a second, with the number of finished views.
+
+    Returns:
+        A score for each kind of surface and light.
+
+    Raises:
+        WlmError: A setting is out of its range, a probe's numbers are not spherical harmonics, or the device does not
+            exist.
+    """
+    count, device = sh_count(probes.outputs), check_device(device)
+    if count is None:
+        raise WlmError(f"{probes.name}: expected spherical harmonics, found {probes.outputs} numbers per probe")
+    if views < 1 or not 16 <= resolution <= 4096:
+        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels, got {views} of {resolution}")
+    live = np.flatnonzero(probes.live)
+    scene = _Scene(probes, decoded, live, count, device)
+    things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})
+    exposure = ball_exposure(probes.values[live].reshape(len(live), count, 3))
+    errors = {(thing, kind): Pictures(structural=True) for thing in things for kind in KINDS}
+    meter = Meter(progress, "views", views)
+    for number, (eye, forward) in enumerate(_viewers(probes.position[live], views, up)):
+        scene.stand(eye)
+        for thing, mesh in things.items():
+            seen, place, normal, owner = _look(mesh, eye, forward, up, resolution, device)
+            if not seen.any():
+                continue
+            first, *others = (_shown(light, normal, seen, exposure) for light in scene.lights(place, normal, owner))
+            for kind, picture in zip(KINDS, others, strict=True):
+                errors[thing, kind].add(first, picture, seen)
+        if meter.due(number + 1):
+            meter.report(number + 1)
+    return [
+        ViewScore(thing, kind, error.count, error.mse, error.psnr, error.ssim, error.flip)
+        for (thing, kind), error in errors.items()
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """Triangles without shared corners, normals float64 [V, 3], and the probe of each triangle or -1."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    owner: np.ndarray
+
+
+def _split(geometry: Geometry) -> _Mesh:
+    corners = geometry.position.astype(np.float64)[geometry.triangle]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    return _Mesh(corners.reshape(-1, 3), normal.repeat(3, 0), np.full(len(corners), -1))
+
+
+class _Scene:
+    """The original and the decoded probes, and a volume of each around a viewer."""
+
+    def __init__(self, probes: ProbeSet, decoded: np.ndarray, live: np.ndarray, count: int, device: str) -> None:
+        self._position, self._count = probes.position[live], count
+        self._values = [probes.values[live], np.asarray(decoded, np.float32)[live]]
+        self._tree = cKDTree(self._position)
+        self._normal = None if probes.normal is None else probes.normal[live]
+        self._volumes = [
+            Volume(self._position, StoredLight(values, device), normal=self._normal, budget=_BUDGET)
+            for values in self._values
+        ]
+
+    def balls(self) -> _Mesh:
+        """Returns separate balls at some probes, evenly spaced by index."""
+        chosen = np.unique(np.linspace(0, len(self._position) - 1, min(len(self._position), _BALLS)).astype(int))
+        unit = fibonacci_sphere(_BALL_POINTS)
+        hull = ConvexHull(unit)
+        triangle = hull.simplices
+        a, b, c = unit[triangle].transpose(1, 0, 2)
+        turned = (np.cross(b - a, c - a) * a).sum(1) < 0
+        triangle[turned] = triangle[turned][:, ::-1]
+        directions = unit[triangle].reshape(-1, 3)
+        centres = self._position[chosen]
+        points = centres[:, None] + ball_radius(centres) * directions
+        return _Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), chosen.repeat(len(triangle)))
+
+    def stand(self, eye: np.ndarray) -> None:
+        """Moves the volumes to a viewer."""
+        for volume in self._volumes:
+            settle(volume, eye)
+
+    def lights(self, place: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
+        """Yields SH float64 [P, C, 3] at points [P, 3] or at their probes: the original light, then each of `KINDS`."""
+        ahead = None
+        if owner[0] >= 0:
+            direct = [values[owner] for values in self._values]
+            place = self._position[owner]
+            if self._normal is not None:
+                ahead = self._normal[owner]
+        else:
+            if self._normal is not None:
+                ahead = normal
+            away, near = self._tree.query(place, k=np.arange(1, min(_NEIGHBOURS, len(self._position)) + 1))
+            weight = 1.0 / np.maximum(away, 1e-6 * ball_radius(self._position)) ** 2
+            weight /= weight.sum(1, keepdims=True)
+            direct = [np.einsum("pk,pkd->pd", weight, values[near]) for values in self._values]
+        for values in (*direct, *(volume.read(place, ahead).values for volume in self._volumes)):
+            yield values.reshape(len(place), self._count, 3).astype(np.float64)
+
+
+def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields the position and the viewing direction of each viewer."""
+    plan = [axis for axis in range(3) if axis != up]
+    for number, eye in enumerate(camera_path(position, views, up=up)):
+        angle = number * _GOLDEN_ANGLE
+        forward = np.empty(3)
+        forward[plan], forward[up] = [math.cos(angle), math.sin(angle)], -_DOWN
+        yield eye, forward
+
+
+def _look(
+    mesh: _Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the visible pixels, bool [H, W], and for each of these P points and normals [P, 3] and probes [P]."""
+    triangle = torch.arange(len(mesh.position), dtype=torch.int32, device=device).reshape(-1, 3)
+    clip = torch.tensor(clip_from(mesh.position, eye, forward, up), device=device)
+    with torch.no_grad():
+        drawn = raster.rasterize(clip, triangle, resolution, resolution)
+    number, weight = drawn.triangle.cpu().numpy(), drawn.barycentric.cpu().numpy().astype(np.float64)
+    seen = number >= 0
+    number, weight = number[seen], weight[seen]
+    corner = 3 * number[:, None] + np.arange(3)
+    weight = np.concatenate([weight, 1.0 - weight.sum(1, keepdims=True)], 1)[..., None]
+    place, normal = ((weight * values[corner]).sum(1) for values in (mesh.position, mesh.normal))
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    # Normals are turned towards the viewer, since a mesh may be wound either way.
+    normal *= np.where(((eye - place) * normal).sum(1, keepdims=True) < 0, -1.0, 1.0)
+    return seen, place, normal, mesh.owner[number]
+
+
+def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
+    """Returns a picture, sRGB [H, W, 3], of white diffuse points under SH [P, C, 3]; black elsewhere."""
+    count = values.shape[1]
+    factor = np.array([cosine_factor(band) for band in coefficient_bands(count).tolist()])
+    light = np.einsum("pc,pcd->pd", basis(normal, count) * factor, values) / math.pi * exposure
+    picture = np.zeros((*seen.shape, 3))
+    picture[seen] = to_srgb(filmic(np.maximum(light, 0.0)))
+    return picture

@@ -1,0 +1,422 @@
+"""The cascaded lighting volume: nested grids of blocks around the viewer, filled from the probes as the viewer moves.
+
+Follows gaussian-probe-compression, section 3.4: four levels whose blocks are 1, 2, 4 and 16 times as wide as the finest
+(2, 4, 8 and 32 m in the paper), and at most 64 blocks decoded per frame. Where the paper leaves a choice, or we depart:
+
+- The finest block is 1.25 times as wide as the probes' spacing (`wlm.probe.volume.index.finest_side`), in any unit.
+  Windows have 32 blocks along an axis where the paper has 16, since most are empty and empty blocks take no memory.
+- A level's window has the blocks whose centres are nearest to the viewpoint along each axis, so it depends on the
+  viewpoint alone.
+- A block's light comes from up to 16 probes within one side of its centre along each axis, weighted so that a read at a
+  probe is nearly that probe's light (`wlm_kernels.probe.volume_weights`). The paper takes the probes inside the block
+  and names no weights; a mean weighted by distance blurs differences between probes.
+- A block without a probe that near is empty: it is never queued, takes no budget and is missing for a read.
+- Blocks are rows of a pool, which is also the cache: a block that left its window stays until its row is needed. If it
+  is still there when it enters the window again, it is available in the same frame at no cost.
+- Blocks wait in the order of their distance to the viewpoint in units of their own side, so that all levels grow
+  outwards together. After a teleport the first frame covers the surroundings coarsely; filling the finest level first
+  would leave the rest of the scene black until that level was complete.
+- A point is answered by the finest level that has it, as `wlm_kernels.probe.volume.read` describes. With all blocks
+  present this is the paper's choice by the distance to the viewer.
+
+Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
+graph.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.probe.volume.index import BlockIndex, finest_side
+from wlm.probe.volume.light import Light
+from wlm_kernels.probe import volume as kernels
+from wlm_kernels.probe import volume_frame as frame_kernels
+from wlm_kernels.probe import volume_weights
+
+RATIOS = (1, 2, 4, 16)
+"""Sides of the levels' blocks over the finest."""
+
+SIDE = 32
+"""Blocks along an axis of a window."""
+
+BUDGET = 64
+"""Blocks decoded per frame."""
+
+ROWS = 32768
+"""Rows of the pool."""
+
+_LONGEST = 64  # largest side of a window: 262,144 blocks per level
+_SMALLEST = 1e-30  # smallest side of a block: float32 holds it and its inverse
+_FARTHEST = 2**30  # largest coordinate of a block: int32 on the device, with room for a window
+
+
+@dataclass(frozen=True)
+class FrameStats:
+    """The work of one frame.
+
+    Attributes:
+        entered: Blocks that entered a window, empty ones included.
+        queued: Entered blocks that were queued.
+        dropped: Blocks that left their window while they waited.
+        updated: Blocks decoded and written, at most the budget.
+        cached: Blocks that entered a window and were still in the pool.
+        left: Blocks that still wait.
+        probes: Probes decoded; a probe counts once for each block that it contributes to.
+        seconds: Duration of the frame, until the device has finished it.
+    """
+
+    entered: int
+    queued: int
+    dropped: int
+    updated: int
+    cached: int
+    left: int
+    probes: int
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """The light at M points.
+
+    Attributes:
+        values: float32 [M, D]; 0 where nothing covers the point.
+        level: int32 [M], level with the largest share in the value; -1 where nothing covers the point.
+        weight: float32 [M], share of the trilinear weights that blocks of any level cover; 1 if no block is missing.
+    """
+
+    values: np.ndarray
+    level: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Copies of the device's arrays, as `wlm_kernels.probe.volume` describes them.
+
+    Attributes:
+        pool: float32 [R, D], blocks.
+        pages: int32 [L * side^3], row of each slot's block, or -1.
+        bases: int32 [L, 3], first block of each window, relative to `BlockIndex.start`.
+        views: float32 [L, 4], position of the viewer in each window, and 1 / side of a block.
+    """
+
+    pool: np.ndarray
+    pages: np.ndarray
+    bases: np.ndarray
+    views: np.ndarray
+
+
+class Volume:
+    """A cascaded lighting volume on a device. Call `update` once per frame, then `read`.
+
+    Attributes:
+        index: The live probes sorted by cell, and the blocks near them.
+        light: Source of the probes' light.
+        position: float64 [N, 3], of all probes.
+        numbers: int64 [V], indices of the live probes.
+        normal: float32 [N, 3], unit surface normals of all probes, 0 for a probe on no surface; None if unknown.
+        sizes: Side of a block at each level.
+        side: Blocks along an axis of a window.
+        budget: Blocks decoded per frame.
+        channels: D.
+        device: "cpu" or "cuda:N".
+    """
+
+    def __init__(
+        self,
+        position: np.ndarray,
+        light: Light,
+        *,
+        live: np.ndarray | None = None,
+        normal: np.ndarray | None = None,
+        block: float | None = None,
+        ratios: Sequence[int] = RATIOS,
+        side: int = SIDE,
+        budget: int = BUDGET,
+        rows: int = ROWS,
+    ) -> None:
+        """Builds an empty volume on the device of the light.
+
+        Args:
+            position: [N, 3], of all probes.
+            light: Light of the N probes.
+            live: bool [N], false for probes to leave out; None: all are live.
+            normal: [N, 3], normal of each probe's surface, of any length; 0 for a probe on no surface. Blocks behind a
+                probe's surface then take less of its light. None: no normal is known.
+            block: Side of the finest blocks, in the unit of the positions; None: derived from the probes' spacing.
+            ratios: Sides of the levels' blocks over the finest, rising powers of two from 1, at most 8.
+            side: Blocks along an axis of a window, even, 2 to 64.
+            budget: Most blocks decoded per frame, 1 to 1024.
+            rows: Blocks that the pool holds, at least the budget. If the windows have more blocks near probes, the
+                farthest ones are never decoded.
+
+        Raises:
+            WlmError: A setting is out of its range.
+            ValueError: `position`, `light` or `live` has a wrong shape, or a position is not finite.
+        """
+        position = np.asarray(position, np.float64)
+        if position.shape != (light.count, 3):
+            raise ValueError(f"position: expected [{light.count}, 3] for the light's probes, got {position.shape}")
+        self.numbers = np.arange(len(position))
+        if live is not None:
+            live = np.asarray(live)
+            if live.shape != position.shape[:1] or live.dtype != bool:
+                raise ValueError(f"live: expected bool {list(position.shape[:1])}, got {live.dtype} {list(live.shape)}")
+            self.numbers = np.flatnonzero(live)
+        _check(block, ratios, side, budget, rows)
+        lit = position[self.numbers]
+        self.index = BlockIndex(lit, finest_side(lit) if block is None else block, ratios)
+        self.sizes = self.index.sizes
+        if not _SMALLEST <= self.sizes[0] <= self.sizes[-1] <= 1.0 / _SMALLEST:
+            limits = f"{_SMALLEST:g} to {1.0 / _SMALLEST:g}"
+            raise WlmError(f"volume block: expected sides from {limits}, got {list(self.sizes)}")
+        self.position, self.light = position, light
+        self.side, self.budget, self.channels = side, budget, light.channels
+        self.device = light.device
+        self._size = np.array(self.sizes)
+        self._viewpoint: np.ndarray | None = None
+        self._base = np.zeros((len(ratios), 3), np.int64)
+        self._frame = 0
+        self.normal = None if normal is None else _unit(normal, position.shape)
+        self._make(rows, _unit(normal, position.shape)[self.numbers])
+        self._step = interop.StepGraph(self._work, self.device)
+
+    def _make(self, rows: int, normal: np.ndarray) -> None:
+        """Allocates everything on the device."""
+        device, levels, budget = self.device, len(self.sizes), self.budget
+        slots = levels * self.side**3
+
+        reader = self.light.reader(budget * frame_kernels.PROBES)
+        self._arrays = [reader.numbers, reader.values]
+
+        def full(shape: int | tuple[int, ...], dtype: type, value: object) -> wp.array:
+            self._arrays.append(wp.full(shape, value, dtype=dtype, device=device))
+            return self._arrays[-1]
+
+        def put(array: np.ndarray, dtype: type) -> wp.array:
+            self._arrays.append(wp.array(array, dtype=dtype, device=device))
+            return self._arrays[-1]
+
+        index, host = frame_kernels.Index(), self.index
+        index.key, index.number = put(host.key, wp.int64), put(self.numbers[host.number].astype(np.int32), int)
+        index.cell, index.place = put(host.cell, wp.vec3i), put(host.place, wp.vec3)
+        index.normal = put(normal[host.number], wp.vec3)
+        index.block, index.level_start = put(host.block, wp.int64), put(host.level_start, int)
+        index.ratios = put(np.array(host.ratios, np.int32), int)
+        windows = frame_kernels.Windows()
+        windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
+        windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
+        windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
+        windows.away, windows.forward = full(slots, float, -1.0), full(1, wp.vec3, wp.vec3())
+        pool = frame_kernels.Pool()
+        pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
+        pool.rows = full(len(host.block), int, -1)
+        work = frame_kernels.Work()
+        work.clock, work.counters, work.limit = full(1, int, 0), full(7, int, 0), full(1, int, 0)
+        work.histogram = full(frame_kernels.TOTALS, int, 0)
+        work.gathered, work.distance = full(frame_kernels.MOST, int, 0), full(frame_kernels.MOST, float, 0.0)
+        work.chosen, work.taken = full(budget, int, -1), full(budget, int, -1)
+        work.begin = full((budget, frame_kernels.HALVES), int, 0)
+        work.count = full((budget, frame_kernels.HALVES), int, 0)
+        work.picked, work.noise = full(budget, int, 0), full(budget, float, 0.0)
+        block = (budget, frame_kernels.PROBES)
+        work.places, work.hats = full(block, wp.vec4, wp.vec4()), full(block, float, 0.0)
+        work.rows = full(block, frame_kernels.Row, frame_kernels.Row())
+        work.numbers, work.weights = reader.numbers, full(block, float, 0.0)
+        self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        self._look = frame_kernels.Look(windows, work)
+        self._nowhere = full(0, wp.vec3, wp.vec3())
+        self._pool = full((rows, self.channels), float, 0.0)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of device memory of the volume and its index, without the light; constant."""
+        return sum(array.capacity for array in self._arrays)
+
+    @property
+    def viewpoint(self) -> np.ndarray:
+        """Viewpoint of the last update, float64 [3].
+
+        Raises:
+            ValueError: There was no update.
+        """
+        if self._viewpoint is None:
+            raise ValueError("viewpoint: expected one update at least")
+        return self._viewpoint.copy()
+
+    @property
+    def base(self) -> np.ndarray:
+        """Coordinates of the first block of each window, int64 [L, 3]; block b spans [b, b + 1) times its side."""
+        return self._base + self.index.start.astype(np.int64)
+
+    def update(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> FrameStats:
+        """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
+
+        Args:
+            viewpoint: [3], in the unit of the positions.
+            forward: [3], viewing direction, of any length: blocks behind the viewer wait as if they were twice as far
+                away. None: all directions are alike.
+
+        Returns:
+            The work of the frame.
+
+        Raises:
+            WlmError: The viewpoint or the direction is not three finite numbers, or the viewpoint is so far away that
+                the coordinates of its block overflow.
+        """
+        start = time.perf_counter()
+        entered = self.advance(viewpoint, forward)
+        counters = self._frame_work.counters.numpy()
+        seconds = time.perf_counter() - start
+        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
+
+    def advance(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> int:
+        """Does the work of `update`; on CUDA the frame is queued, not awaited, as a renderer needs it.
+
+        Args:
+            viewpoint, forward: As for `update`.
+
+        Returns:
+            Number of blocks that entered a window.
+
+        Raises:
+            WlmError: As for `update`.
+        """
+        viewpoint = np.array(viewpoint, np.float64)
+        if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
+            raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
+        ahead = np.zeros(3) if forward is None else np.array(forward, np.float64)
+        if ahead.shape != (3,) or not np.isfinite(ahead).all():
+            raise WlmError(f"forward: expected three finite numbers, got {ahead.tolist()}")
+        ahead = _unit(ahead[None], (1, 3))[0]
+        at = viewpoint / self._size[:, None] - self.index.start
+        if np.abs(at).max() > _FARTHEST:
+            limit = _FARTHEST * self.sizes[0]
+            raise WlmError(f"viewpoint: expected at most {limit:g} from the probes, got {viewpoint.tolist()}")
+        base = np.floor(at + 0.5).astype(np.int64) - self.side // 2
+        kept = np.maximum(self.side - np.abs(base - self._base), 0).prod(1).sum() if self._viewpoint is not None else 0
+        self._viewpoint, self._base = viewpoint, base
+        self._frame += 1
+        views = np.column_stack([at - (base + self.side // 2) - 0.5, 1.0 / self._size])
+        with interop.stream(self.device):
+            self._look(base, views, ahead, self._frame)
+            self._step()
+        return len(self.sizes) * self.side**3 - int(kept)
+
+    def _work(self) -> None:
+        """Runs the part of a frame that a CUDA graph contains."""
+        work, windows = self._frame_work, self._windows
+        frame_kernels.scroll(self._index, windows, self._pool_rows, self.side, work)
+        frame_kernels.choose(windows, self.side, work)
+        frame_kernels.allocate(windows, self._pool_rows, work)
+        if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
+            return
+        frame_kernels.search(self._index, windows, self.side, work)
+        volume_weights.weigh(self._index, windows, self.side, work)
+        self._reader.run()
+        frame_kernels.combine(work, self._reader.values, self._pool)
+
+    def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
+        """Reads the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
+
+        Args:
+            points: [M, 3], in the unit of the positions. Nothing covers a point that is NaN or infinite.
+            normals: [M, 3], normals of the points' surfaces, of any length: the light is read half a block in front of
+                the surface. None: the light is read at the points.
+
+        Returns:
+            The light at the points.
+
+        Raises:
+            ValueError: There was no update, or the shape is different.
+        """
+        points = np.asarray(points, np.float64)
+        if self._viewpoint is None or points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"read: expected points [M, 3] after an update, got {points.shape}")
+        # The difference is computed in float64, so that a viewer far from the origin loses nothing.
+        with np.errstate(over="ignore"):
+            relative = (points - self._viewpoint).astype(np.float32)
+        with interop.stream(self.device):
+            on_device = wp.array(relative, dtype=wp.vec3, device=self.device)
+            values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
+            level = wp.empty(len(points), dtype=int, device=self.device)
+            weight = wp.empty(len(points), dtype=float, device=self.device)
+            ahead = None
+            if normals is not None:
+                ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
+            self.read_into(on_device, values, level, weight, ahead)
+            return Reading(values.numpy(), level.numpy(), weight.numpy())
+
+    def read_into(
+        self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array, normals: wp.array | None = None
+    ) -> None:
+        """Reads the light at points that are on the device, without a copy, as a renderer needs it.
+
+        Args:
+            points: vec3 [M], relative to the viewpoint of the last update.
+            values: float [M, D], written; this and the next two as in `Reading`.
+            level: int [M], written.
+            weight: float [M], written.
+            normals: vec3 [M], unit normals, as for `read`.
+        """
+        windows = self._windows
+        place = (windows.pages, windows.bases, windows.views, self.side, points)
+        kernels.read(self._pool, *place, self._nowhere if normals is None else normals, values, level, weight)
+
+    def state(self) -> State:
+        """Copies the arrays that a shader reads to the host."""
+        windows = self._windows
+        with interop.stream(self.device):
+            return State(*(part.numpy() for part in (self._pool, windows.pages, windows.bases, windows.views)))
+
+    def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the windows in spatial order, as a texture for each level (the last step of section 3.4).
+
+        Returns:
+            float32 [L, side, side, side, D], by level, x, y and z, 0 where a block is missing; and bool
+            [L, side, side, side], true where it is present. The first block of each level is that of `base`.
+        """
+        shape = (len(self.sizes), self.side, self.side, self.side)
+        with interop.stream(self.device):
+            out = wp.empty((math.prod(shape), self.channels), dtype=float, device=self.device)
+            valid = wp.empty(math.prod(shape), dtype=wp.uint8, device=self.device)
+            kernels.unscroll(self._pool, self._windows.pages, self._windows.bases, self.side, out, valid)
+            return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
+
+
+def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Normalises vectors to float32; vectors of length 0 stay 0.
+
+    Raises:
+        ValueError: The shape is different, or a number is not finite.
+    """
+    if normal is None:
+        return np.zeros(shape, np.float32)
+    normal = np.asarray(normal, np.float64)
+    if normal.shape != shape or not np.isfinite(normal).all():
+        raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return (normal / np.where(length > 0, length, 1.0)).astype(np.float32)
+
+
+def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:
+    """Checks the ranges of settings."""
+    if block is not None and not _SMALLEST <= block <= 1.0 / _SMALLEST:
+        raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
+    rising = list(ratios[:1]) == [1] and all(a < b for a, b in zip(ratios, ratios[1:], strict=False))
+    if not rising or len(ratios) > frame_kernels.LEVELS or any(r & (r - 1) or r > 1024 for r in ratios):
+        raise WlmError(f"volume ratios: expected up to 8 rising powers of two from 1 to 1024, got {list(ratios)}")
+    if not 2 <= side <= _LONGEST or side % 2:
+        raise WlmError(f"volume side: expected an even number of blocks from 2 to {_LONGEST}, got {side}")
+    if not 1 <= budget <= 1024:
+        raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
+    if rows < budget:
+        raise WlmError(f"volume rows: expected at least the budget of {budget}, got {rows}")

@@ -1,0 +1,143 @@
+"""An index of probes for a device: sorted cells, and the blocks near a probe.
+
+Positions are put on a grid of cubic cells and sorted by the Morton key of their cell, so that every cell of the octree
+above the grid is one range of the list, and two binary searches find it (the octree of gaussian-probe-compression,
+section 3.4). A cell is half a side of the finest block. A block of a coarser level is wider by a power of two, so that
+its halves are cells of the octree themselves.
+
+A point reads the eight blocks whose centres surround it. Only blocks that have a tenth of the weight at some probe take
+memory, and the index lists them for each level. Leaving out the others saves a third of the blocks and costs 0.4 dB.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wlm.errors import WlmError
+from wlm.probe.morton import morton_keys
+
+_BITS = 21  # bits of a Morton key for each axis: three of them fill 63 bits
+_FARTHEST = 1e100  # no length overflows below it
+_LEAST = 0.1  # smallest weight at a probe for which a block is listed
+_SHARE = 1.25  # side of the finest blocks over the probes' spacing: see `finest_side`
+_EACH = 2  # least blocks per probe
+_SHRINKS = 8
+
+
+class BlockIndex:
+    """The probes sorted by cell, and the blocks of each level that are read at a probe.
+
+    Block b of a level spans [b, b + 1) times its side, in the positions' own frame. Blocks are numbered from `start`,
+    and cells from `2 * start` of the finest level.
+
+    Attributes:
+        count: N.
+        sizes: Side of a block at each level, rising.
+        ratios: Each level's side over the finest, powers of two.
+        start: float64 [L, 3], coordinates of the first block of each level, whole numbers.
+        key: int64 [N], Morton keys of the cells, rising.
+        number: int32 [N], index of each probe in the input.
+        cell: int32 [N, 3], cell of each probe.
+        place: float32 [N, 3], position within the cell, 0 to 1.
+        block: int64 [W], Morton keys of the blocks near probes, level after level, rising within each.
+        level_start: int32 [L + 1], index in `block` at which each level begins.
+    """
+
+    def __init__(self, position: np.ndarray, side: float, ratios: Sequence[int]) -> None:
+        """Sorts the probes and lists the blocks.
+
+        Args:
+            position: [N, 3], in any unit; N may be 0.
+            side: Side of a block of the finest level. It is doubled until the keys hold all cells and float64
+                separates neighbouring cells.
+            ratios: Sides of the levels over the finest, rising powers of two from 1.
+
+        Raises:
+            ValueError: The shape is different, a position is NaN or above 1e100, or the side is not a positive
+                finite number.
+        """
+        position = np.asarray(position, np.float64)
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise ValueError(f"position: expected [N, 3], got {position.shape}")
+        if not (np.abs(position) <= _FARTHEST).all():
+            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or more")
+        if not 0.0 < side < np.inf:
+            raise ValueError(f"side: expected a positive number, got {side}")
+        self.count = len(position)
+        self.ratios = tuple(ratios)
+        widest = 2 * self.ratios[-1]  # cells along a side of the coarsest block
+        low, high = position.min(0, initial=np.inf), position.max(0, initial=-np.inf)
+        cell_side = float(side) / 2
+        if self.count:
+            # One coarsest block stays free on both sides, so that no block near a probe has a negative index.
+            least = float((high - low).max()) / (2**_BITS - 4 * widest)
+            least = max(least, float(np.abs(position).max()) * 2.0**-48)
+            if cell_side < least:
+                cell_side = math.ldexp(cell_side, math.ceil(math.log2(least) - math.log2(cell_side)))
+        else:
+            low = np.zeros(3)
+        self.sizes = tuple(2 * cell_side * ratio for ratio in self.ratios)
+        first = (np.floor(low / cell_side / widest) - 1) * widest
+        self.start = first / 2 / np.array(self.ratios)[:, None]
+        place = position / cell_side
+        whole = np.floor(place)
+        cell = (whole - first).astype(np.int64)
+        key = morton_keys(cell).astype(np.int64)
+        order = np.argsort(key, kind="stable")
+        self.key = key[order]
+        self.number = order.astype(np.int32)
+        self.cell = cell[order].astype(np.int32)
+        self.place = (place - whole)[order].astype(np.float32)
+        levels = [_near(cell, place - whole, ratio) for ratio in self.ratios]
+        self.block = np.concatenate(levels)
+        self.level_start = np.cumsum([0, *map(len, levels)]).astype(np.int32)
+
+
+def finest_side(position: np.ndarray) -> float:
+    """Returns a side for the finest blocks: 1.25 times the median distance to the nearest neighbour, or less.
+
+    The light is linear between blocks, so that reproducing the probes takes more blocks than probes. Probes scattered
+    over surfaces have two and more blocks each at this side. Probes on a lattice have fewer; there the side shrinks by
+    a fifth at a time until they have two.
+
+    Read at its probes, `livingroom` has 45.1 dB (43.5 at 1.5 times the distance) from 31,417 blocks, and `city` 44.0
+    (42.3) from 24,217. Between probes the light is within 0.3 dB of the same.
+
+    Args:
+        position: [N, 3].
+
+    Returns:
+        The side, in the unit of the positions; 1 where there are fewer than two distinct positions.
+
+    Raises:
+        WlmError: The positions are so far apart, or so close, that float64 does not hold their distances.
+    """
+    places = np.unique(np.asarray(position, np.float64), axis=0)
+    if len(places) < 2:
+        return 1.0
+    with np.errstate(over="ignore", under="ignore"):
+        side = _SHARE * float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    if not 0.0 < side < np.inf:
+        raise WlmError(f"positions: expected distances that float64 holds, got a median of {side:g}")
+    for _ in range(_SHRINKS):
+        index = BlockIndex(places, side, (1,))
+        if len(index.block) >= _EACH * len(places):
+            break
+        side *= 0.8
+    return side
+
+
+def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> np.ndarray:
+    """Returns the keys of a level's blocks that are read at a probe with at least the smallest weight."""
+    # Distances in sides from the centre of block 0, as integer and fraction; the index of a cell is exact.
+    half = cell // ratio - 1
+    whole = half >> 1
+    rest = ((half & 1) + (cell % ratio + place) / ratio) / 2
+    keys = []
+    for i in range(8):
+        corner = np.array([i & 1, i >> 1 & 1, i >> 2])
+        read = np.where(corner == 1, rest, 1.0 - rest).prod(1) >= _LEAST
+        keys.append(morton_keys(whole[read] + corner))
+    return np.unique(np.concatenate(keys)).astype(np.int64)
