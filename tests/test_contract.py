@@ -17,7 +17,7 @@ from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.system import Meter, load
 
 SYSTEMS = ("lightmap", "atlas", "probe", "smoke")
-VERBS = {"load", "evaluate", "export", "Profile", "Report", "Decoder"}
+VERBS = {"load", "evaluate", "Profile", "Report", "Decoder"}
 PROFILES = {"lightmap": "M", "atlas": "standard", "probe": "small", "smoke": "fast"}
 FITTED = ["lightmap", "probe", "atlas-tiles"]
 
