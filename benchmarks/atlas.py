@@ -1,4 +1,4 @@
-"""The atlas system against smaller and carved lightmaps, block codecs and single-colour merging: size, speed and error.
+"""The atlas system against smaller lightmaps and block codecs: size, speed and error.
 
 For each lightmap of each mesh these kinds of rows:
 
@@ -6,9 +6,9 @@ For each lightmap of each mesh these kinds of rows:
   from around, and the time to read a million random points of its surface. In a full run also the first profile at the
   bits of the first cascade, and at CRs of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
-- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at those of the others.
-  Single-colour merging has its own size instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
-  of its eq. 9, which leave out UVs and headers; a rival's bytes are these bits alone, it has no file.
+- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at the bits of the
+  others. Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers. A rival has no
+  file, so its bytes are these bits.
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
   surface; the time is that of the tuning alone.
 
@@ -32,7 +32,7 @@ import warp as wp
 
 from benchmarks.atlas_inputs import Lightmap
 from benchmarks.plot import Panel
-from benchmarks.rivals.atlas import OWN_SIZE, RIVALS, share_of
+from benchmarks.rivals.atlas import RIVALS, share_of
 from benchmarks.rivals.rival import Rival
 from benchmarks.rows import MEAN, Row, read_json
 from benchmarks.runner import Bench, Note, exact_errors
@@ -55,10 +55,8 @@ _RIVALS = {
     "BC6H": "bc6h",
     "BC6H, our encoder": "bc6h own",
     "ASTC": "astc",
-    "carving": "carving",
 }
-_METHODS = (*_RIVALS, *OWN_SIZE)
-_OWN = "its own size"  # the option of rivals without a budget
+_METHODS = tuple(_RIVALS)
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
 _HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # bits of rivals that run alone
 _FIRST = "downsampling"  # the rival of every run
@@ -97,8 +95,8 @@ def run(
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        rivals: With block codecs, carving and single-colour merging, which take minutes on the CPU: `run_rivals` has
-            them alone. Downsampling is always there.
+        rivals: Whether to measure block codecs, which take minutes on the CPU: `run_rivals` measures them alone.
+            Downsampling is always measured.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -340,7 +338,7 @@ class _AtlasBench(Bench):
             if any(abs(share / other - 1.0) < _SAME for other in measured):
                 continue
             measured.append(share)
-            for method in (name for name in methods if name in _RIVALS):
+            for method in methods:
                 if enough.get(method, math.inf) > share:
                     make = partial(RIVALS[_RIVALS[method]], self.lit, share)
                     entries.append(self._rival(method, f"bits of {profile}", make))
@@ -349,8 +347,6 @@ class _AtlasBench(Bench):
                     whole = self.lit.sheets[0].mask.shape
                     if (row.get("colour_height"), row.get("colour_width")) == whole and method != "ASTC":
                         enough[method] = _share(row)
-        for method in (name for name in methods if name in OWN_SIZE):
-            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.lit)))
         return entries
 
     def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:
