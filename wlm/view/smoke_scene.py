@@ -30,6 +30,7 @@ _GLOW = np.array([1.0, 0.45, 0.12], np.float32)  # colour of heat, as on the HTM
 _DARK, _BRIGHT, _SQUARES = 0.03, 0.06, 8  # checkerboard behind the smoke: its two levels, and its squares along a side
 _MOST_VOXELS, _MOST_LIT = 4_000_000, 250_000  # voxels that are drawn, and voxels that the light is marched through
 _AMBIENT = 0.15  # share of the light everywhere in the smoke, so that its dark side is visible
+# The sheet of planes: columns, least width of a plane in pixels, and size of a name relative to a plane.
 _COLUMNS, _LEAST_PLANE, _NAME = (
     3,
     160,
