@@ -7,10 +7,9 @@
     model.save("city.wlm")
     frame = wlm.load("city.wlm").decoder("cpu").frame(18.5)
 
-`wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same verbs; `wlm.fluid` simulates what smoke
-is seen of; `wlm.ops` has the kernels as differentiable torch operations; `wlm.export` writes raw folders, kits for
-engines and HTML pages; `wlm.inspection` says what a file holds, `wlm.bake` makes inputs. `load` reads any file of
-theirs.
+`wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same functions, and `load` reads the files of all.
+`wlm.fluid` simulates smoke, `wlm.ops` has the kernels as differentiable torch operations, `wlm.export` writes folders,
+kits for engines and HTML pages, `wlm.inspection` describes files, and `wlm.bake` makes inputs.
 """
 
 from wlm._facade import facade

@@ -1,4 +1,4 @@
-"""YAML to checked settings, and where the profiles are."""
+"""Reads YAML files into checked settings and finds profiles by name."""
 
 import difflib
 import os
@@ -18,14 +18,14 @@ from wlm.formats.reading import read_file
 
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
-_SHOWN_VALUE = 60  # characters of a wrong value that an error repeats
+_SHOWN_VALUE = 60  # characters of a wrong value that an error message repeats
 _DEEPEST = 50
 _MERGE = "tag:yaml.org,2002:merge"
 _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
-    """Reads a YAML file into a settings model. Unknown keys are errors, whatever the model's own policy.
+    """Reads a YAML file into a settings model. Unknown keys are errors, whatever the model's own configuration says.
 
     Args:
         cls: The pydantic model; every key of the file must be one of its fields.
@@ -53,41 +53,42 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
 
 
 def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Settings:
-    """Checks a mapping of settings. Unknown keys are errors, whatever the model's own policy.
+    """Checks a mapping of settings. Unknown keys are errors, whatever the model's own configuration says.
 
     Args:
         cls: The pydantic model.
-        values: A mapping of its fields, plain values.
-        prefix: Text before the field's name in an error: `"scene.yaml: "`, `"--"` or `"file: profile."`.
+        values: Mapping of the model's fields to plain values.
+        prefix: Text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"` writes
+            the field as a command line option, with dashes.
 
     Returns:
         The checked settings.
 
     Raises:
-        WlmError: One line with the field, what was expected and what was found; the first of several problems.
+        WlmError: One line with the field, the expectation and the value found, for the first of several problems.
     """
     try:
         return cls.model_validate(values, extra="forbid")
     except ValidationError as error:
-        raise WlmError(f"{prefix}{_first_problem(cls, error)}") from error
+        raise WlmError(f"{prefix}{_first_problem(cls, error, as_option=prefix == '--')}") from error
 
 
 def profile_path(system: str, name: str) -> Path:
-    """Finds a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
+    """Finds the file of a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
 
     Args:
-        system: `lightmap`, `atlas`, `probe` or `smoke-network`.
-        name: The profile's name, `M` for example.
+        system: First part of the file name, the attribute `FILES` of the settings.
+        name: Name of the profile, `M` for example.
 
     Returns:
         The path of the YAML file.
 
     Raises:
-        WlmError: There is no such profile; the line lists those that there are.
+        WlmError: There is no such profile; the line lists the known ones.
     """
     file_name = f"{system}-{name}.yaml"
     for folder in _profile_folders():
-        # Compared with the listing, not joined: a name such as `../x` can't leave the folder.
+        # The name is compared with the listing and not joined to a path, so that `../x` cannot leave the folder.
         for candidate in folder.glob("*.yaml"):
             if candidate.name == file_name:
                 return candidate
@@ -96,10 +97,10 @@ def profile_path(system: str, name: str) -> Path:
 
 
 def profile_names(system: str) -> list[str]:
-    """Lists the profiles of a system, sorted.
+    """Lists the names of a system's profiles, sorted.
 
     Args:
-        system: `lightmap`, `atlas`, `probe` or `smoke-network`.
+        system: First part of the file names, the attribute `FILES` of the settings.
     """
     prefix = f"{system}-"
     files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
@@ -107,9 +108,9 @@ def profile_names(system: str) -> list[str]:
 
 
 def _profile_folders() -> Iterator[Path]:
-    """Yields the folders that hold profiles: the checkout's, then the one installed with the package."""
+    """Yields the folders that hold profiles: that of a checkout, then the one installed with the package."""
     root = Path(__file__).resolve().parents[1]
-    # Beside an installed package lies all of site-packages; only a checkout has its pyproject.toml there.
+    # An installed package is in site-packages; only a checkout has a pyproject.toml beside the package.
     if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():
         yield root / "configs"
     with suppress(ModuleNotFoundError):
@@ -119,10 +120,10 @@ def _profile_folders() -> Iterator[Path]:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that refuses what settings don't need and strangers misuse.
+    """A safe loader that refuses YAML features which settings do not need and an attacker could misuse.
 
-    A key given twice, of which YAML would silently keep the last; `&name`, `*name` and `<<`, with which a few lines
-    stand for billions of values; integers beyond 64 bits; values in values without end.
+    It refuses a repeated key, of which YAML would silently keep the last value; anchors, aliases and merge keys, with
+    which a few lines can stand for billions of values; integers beyond 64 bits; and unlimited nesting.
     """
 
     _depth = 0
@@ -151,7 +152,7 @@ class _Loader(yaml.SafeLoader):
         super().flatten_mapping(node)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        # Its length first: the value of a million digits takes long to compute.
+        # The length is checked first, because the value of a million digits takes long to compute.
         value = super().construct_yaml_int(node) if len(node.value) <= _INTEGER_LENGTH else INTEGER
         if not -INTEGER < value < INTEGER:
             raise yaml.constructor.ConstructorError(
@@ -182,10 +183,12 @@ def _yaml_problem(error: Exception) -> str:
     return problem if mark is None else f"{problem} (line {mark.line + 1}, column {mark.column + 1})"
 
 
-def _first_problem(cls: type[BaseModel], error: ValidationError) -> str:
+def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool) -> str:
     problems = error.errors(include_url=False)
     problem = problems[0]
     field = ".".join(str(part) for part in problem["loc"]) or "settings"
+    if as_option:
+        field = field.replace(".", "-").replace("_", "-")
     if problem["type"] == "extra_forbidden":
         text = f"unknown key '{field}'{_suggestion(cls, problem['loc'])}"
     elif problem["type"] == "missing":
@@ -197,12 +200,12 @@ def _first_problem(cls: type[BaseModel], error: ValidationError) -> str:
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Says which keys the mapping at a location knows, or the one that was likely meant."""
+    """Lists the known keys of the mapping at a location, or the one that was probably meant."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)
         model = None if field is None else field.annotation
-        # A union, a list or a dict of models: its keys would need a guess.
+        # The keys of a union, a list or a dict of models are not known here.
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
             return ""
     fields = [field.alias or name for name, field in model.model_fields.items()]
@@ -215,7 +218,7 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Writes the beginning of a value, however large it is."""
+    """Writes the beginning of a value of any size."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,15 +1,15 @@
-"""What the four systems share: settings by name, progress, reports, headers of files, save and load.
+"""Code that the four systems share: settings by name, progress, reports, headers of files, save and load.
 
-Only manners are shared here; each system's mathematics stays in its own rooms:
+The mathematics is not shared. It is in the modules of each system:
 
-    data.py        what comes in, checked          `load`
+    data.py        the checked input               `load`, `from_arrays`
     model.py       settings and arrays             `Profile`, the model
     fit.py         training                        `compress` (smoke: `train`)
-    codec.py       model to parts and back         `encode`, `decode`
+    codec.py       model to file parts and back    `encode`, `decode`
     decode.py      the runtime path                `Decoder`
-    exact.py       the same in float64, to check
+    exact.py       a float64 reference of the decoder
     evaluation.py  scores                          `evaluate`
-    exporter.py    files for engines               `export`
+    bundle.py      textures, buffers and shader    `bundle`
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
@@ -28,7 +28,10 @@ from wlm.config import check_settings, load_settings, profile_path
 from wlm.errors import WlmError
 from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read_artifact, write_artifact
 
-# Which package reads which system's files.
+if TYPE_CHECKING:
+    from wlm.bundle import Bundle
+
+# The package that reads the files of each system.
 _PACKAGES = {
     "lightmap": "wlm.lightmap",
     "atlas": "wlm.atlas",
@@ -44,28 +47,32 @@ def _printable(text: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_printable)]
-"""A name from a file: what a terminal would obey rather than show has become spaces."""
+"""A name from a file, in which spaces replace the control characters that a terminal would obey."""
 
 
 class Settings(BaseModel):
     """Settings of a fit, loaded by name: the base of each system's `Profile`.
 
+    The docstring under a field becomes its description, from which the command line makes an option's help.
+
     Attributes:
-        FILES: First part of the names of its files, `configs/FILES-NAME.yaml`.
-        name: Shown in reports.
+        FILES: First part of the names of the profile files, `configs/FILES-NAME.yaml`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     FILES: ClassVar[str]
+
     name: Name
+    """Name of the profile, shown in reports."""
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
         """Loads a profile.
 
         Args:
-            profile: A name (`configs/FILES-NAME.yaml`), the path of a YAML file, or settings, which are returned.
+            profile: A name (`configs/FILES-NAME.yaml`), the path of a YAML file, or settings, which are returned as
+                they are.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.
@@ -79,8 +86,8 @@ class Settings(BaseModel):
         """Replaces some settings.
 
         Args:
-            values: By name; None leaves a setting as it is.
-            prefix: Text before the setting's name in an error, `"--"` where they are options.
+            values: New values by name; None leaves a setting as it is.
+            prefix: Text before the setting's name in an error; `"--"` writes the name as an option.
 
         Raises:
             WlmError: Unknown or out of range.
@@ -89,20 +96,20 @@ class Settings(BaseModel):
         return check_settings(type(self), self.model_dump() | changes, prefix) if changes else self
 
     def changes(self) -> dict[str, Any]:
-        """The settings that differ from the defaults, as plain values: what a file's header holds."""
+        """Returns the settings that differ from the defaults, as plain values for a file's header."""
         defaults = type(self)(name="").model_dump()
         return {name: value for name, value in self.model_dump().items() if value != defaults[name]}
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far long work is.
+    """The state of long work.
 
     Attributes:
-        stage: What is being done, in a word or two: "fit", "cluster".
-        done, total: Steps done and in all; a total of 0 is unknown.
-        seconds: Since the work began.
-        figures: What can be said so far, by name with the unit: `{"PSNR dB": 41.2}`. NaN is unknown.
+        stage: Name of the current stage in a word or two, such as "fit" or "cluster".
+        done, total: Finished steps and all steps of the stage; a total of 0 is unknown.
+        seconds: Time since the work began, seconds.
+        figures: Measured values so far by name and unit, such as `{"PSNR dB": 41.2}`. NaN is unknown.
     """
 
     stage: str
@@ -113,15 +120,15 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
-"""A callback of long work. It may raise KeyboardInterrupt: the work stops between two steps, after its checkpoint, if
-there is one, has been written."""
+"""A callback of long work. It may raise KeyboardInterrupt: the work then writes its checkpoint, if it has one, and
+stops between two steps."""
 
 
 class Meter:
     """Reports progress about twice a second.
 
     Attributes:
-        seconds: Since the work began.
+        seconds: Time since the work began, seconds.
     """
 
     def __init__(self, progress: OnProgress | None, stage: str, total: int, every: float = _REPORT_EVERY) -> None:
@@ -129,8 +136,7 @@ class Meter:
 
         Args:
             progress: The callback, or None for no reports.
-            stage: As in `Progress`.
-            total: As in `Progress`.
+            stage, total: Values of the attributes of `Progress`.
             every: Seconds between two reports.
         """
         self._progress, self._stage, self._total, self._every = progress, stage, total, every
@@ -141,13 +147,13 @@ class Meter:
         return time.perf_counter() - self._start
 
     def due(self, done: int) -> bool:
-        """Whether a report is due: worth asking before figures that cost time."""
+        """Returns whether a report is due, for callers whose figures take time to compute."""
         if self._progress is None:
             return False
         return done >= self._total > 0 or time.perf_counter() - self._last >= self._every
 
     def report(self, done: int, **figures: float) -> None:
-        """Reports at once; `figures` have their names' spaces as underscores: `PSNR_dB=41.2`."""
+        """Reports at once. An underscore in the name of a figure stands for a space: `PSNR_dB=41.2`."""
         if self._progress is None:
             return
         self._last = time.perf_counter()
@@ -159,12 +165,12 @@ class Report:
     """Base of a system's report, which is a frozen dataclass."""
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON's own types, under the attributes' names; NaN and infinity are None."""
+        """Returns the attributes as JSON values by name; NaN and infinity become None."""
         return plain({item.name: getattr(self, item.name) for item in dataclasses.fields(self)})
 
 
 def plain(value: Any) -> Any:
-    """Turns NumPy values, tuples, dataclasses, NaN and infinity into what JSON holds."""
+    """Converts NumPy values, tuples and dataclasses to JSON values; NaN and infinity become None."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -179,9 +185,9 @@ def plain(value: Any) -> Any:
 
 
 class Header(BaseModel):
-    """What a file's header says beside its parts: the base of each codec's table of settings.
+    """The settings in a file's header: the base of each codec's table.
 
-    Types are exact: no number is taken from a text, no count from a float. No number is NaN or infinite.
+    Types are strict: a text is never read as a number, nor a float as a count. NaN and infinity are refused.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -195,7 +201,7 @@ class Model:
 
     Attributes:
         SYSTEM: The system's name in files.
-        DECODER: Module and class of the decoder, in the system's package.
+        DECODER: Module and class of the decoder in the system's package.
     """
 
     SYSTEM: ClassVar[str]
@@ -208,19 +214,19 @@ class Model:
             The file's size, bytes.
 
         Raises:
-            WlmError: What the file would hold can't be read again, NaN from a fit that diverged for example; or the
-                file can't be written. What was there before stays.
+            WlmError: The content could not be read back, because of a NaN from a fit that diverged for example; or the
+                file cannot be written. An earlier file of that name then stays as it was.
         """
         try:
             settings, parts, source = self._encoded()
         except WlmError as error:
             raise WlmError(f"{path}: {error}") from error
         content = Artifact(self.SYSTEM, FORMAT_VERSION, settings, source, parts, {}, 0, 0)
-        decode(f"{path}: not written", content, _room(self.SYSTEM, "codec").decode)
+        decode(f"{path}: not written", content, _module(self.SYSTEM, "codec").decode)
         return write_artifact(path, self.SYSTEM, settings, parts, source)
 
     def file_bytes(self) -> int:
-        """Size of the file that `save` writes, bytes."""
+        """Returns the size of the file that `save` writes, bytes."""
         return sum(memoryview(part).nbytes for part in encode_artifact(self.SYSTEM, *self._encoded()))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
@@ -228,7 +234,7 @@ class Model:
 
         Args:
             device: "cpu", "cuda" or "cuda:N".
-            options: As the system's `Decoder` takes them.
+            options: Further options of the system's `Decoder`.
 
         Returns:
             The system's `Decoder`.
@@ -236,58 +242,53 @@ class Model:
         Raises:
             WlmError: No such device.
         """
-        room, name = self.DECODER
-        return getattr(_room(self.SYSTEM, room), name)(self, device, **options)
+        module, name = self.DECODER
+        return getattr(_module(self.SYSTEM, module), name)(self, device, **options)
 
-    def bundle(self, device: str = "cpu", **options: Any) -> Any:
-        """Makes the textures, buffers and shader that a GPU reads.
+    def bundle(self, device: str = "cpu", **options: Any) -> "Bundle":
+        """Converts the model to textures, buffers and shader source for a GPU.
 
         Args:
-            device: Device that decodes the reference.
-            options: Further arguments of the system's `bundle`.
-
-        Returns:
-            The `wlm.bundle.Bundle`.
+            device: Device that computes the reference values.
+            options: Further options of the system's `bundle`.
 
         Raises:
-            WlmError: There is no such device, or the model can not be exported.
+            WlmError: No such device.
         """
-        return _room(self.SYSTEM, "bundle").bundle(self, device=device, **options)
+        return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-        """Settings, parts and source of the file."""
-        return _room(self.SYSTEM, "codec").encode(self)
+        """Returns settings, parts and source of the file."""
+        return _module(self.SYSTEM, "codec").encode(self)
 
 
 def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
-    """Reads any file that a model was saved to.
+    """Reads a file that a model of any system was saved to.
 
     Args:
         path: The file.
-        system: The system that must have written it; None: any.
+        system: Name of the system that must have written it; None for any.
 
     Returns:
         The system's model.
 
     Raises:
-        WlmError: One line: not such a file, cut short, damaged, of another system or version, or with parts that don't
-            fit each other.
+        WlmError: One line: the file is no model, is cut short or damaged, is of another system or version, or has
+            parts that do not fit each other.
     """
     artifact = read_artifact(path, system)
-    if artifact.system not in _PACKAGES:
-        systems = ", ".join(_PACKAGES)
-        raise WlmError(f"{path}: expected a model of {systems}, found a file of {artifact.system}")
-    return decode(path, artifact, _room(artifact.system, "codec").decode)
+    _package(path, artifact)
+    return decode(path, artifact, _module(artifact.system, "codec").decode)
 
 
 def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Artifact], Any]) -> Any:
-    """Makes an object of an artifact's parts; whatever is wrong with them is one line that names the file.
+    """Makes an object from an artifact's parts and turns any error into one line that names the file.
 
     Args:
         path: The file, for messages.
-        artifact: Its content.
+        artifact: Content of the file.
         make: A codec's `decode`, which raises WlmError, ValueError, TypeError, LookupError or AttributeError on parts
-            that don't fit.
+            that do not fit.
     """
     try:
         return make(artifact)
@@ -297,6 +298,21 @@ def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Art
         raise WlmError(f"{path}: the file's parts do not fit its settings: {error}") from error
 
 
-def _room(system: str, name: str) -> Any:
-    """One module of a system's package."""
+def system_of(path: str | os.PathLike[str]) -> str:
+    """Returns the name of the system that wrote a file, which is the name of its package in `wlm`.
+
+    Raises:
+        WlmError: The file is not a model.
+    """
+    return _package(path, read_artifact(path)).split(".")[1]
+
+
+def _package(path: str | os.PathLike[str], artifact: Artifact) -> str:
+    if artifact.system not in _PACKAGES:
+        raise WlmError(f"{path}: expected a model of {', '.join(_PACKAGES)}, found a file of {artifact.system}")
+    return _PACKAGES[artifact.system]
+
+
+def _module(system: str, name: str) -> Any:
+    """Imports a module of a system's package."""
     return import_module(f"{_PACKAGES[system]}.{name}")

@@ -53,7 +53,8 @@ def check_a_stop_is_resumed(monkeypatch, folder, words):
     with monkeypatch.context() as patched:
         press_ctrl_c(patched)
         assert call(*words, "-o", out, code=130) == ""
-    assert call.stderr.splitlines() == [f"stopped at step 5: the same command with --resume goes on from {out}.partial"]
+    stopped = f"stopped at step 5: repeat the command with --resume to continue from {out}.partial"
+    assert call.stderr.splitlines() == [stopped]
     assert sorted(path.name for path in folder.iterdir()) == ["a.wlm.partial", "whole.wlm"]
 
     assert "made with seed 0, not 1" in fails(*words, "-o", out, "--resume", "--seed", 1)

@@ -17,6 +17,7 @@ from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.formats.exr import read_planes
 from wlm.smoke.camera import axis_faults
 from wlm.smoke.data import load_frames, read_shaded, read_six_way
+from wlm.smoke.flipbook.shots import with_surface
 from wlm.smoke.flipbook.textures import read_flipbook
 from wlm.smoke.march.coarse import guide
 from wlm.smoke.march.fine import bake
@@ -82,14 +83,15 @@ def test_frames_that_were_made_are_not_made_again(words, place, stem, other, fra
 
     monkeypatch.setattr(place, interrupted)
     call(*words, "-o", out, code=130)
-    assert f"stopped at frame 2: the same command with --resume goes on from {out / stem}.partial" in call.stderr
+    assert f"stopped at frame 2: repeat the command with --resume to continue from {out / stem}.partial" in call.stderr
     names = [f"{stem}_0001.exr", f"{stem}_0002.exr", f"{stem}.partial"]
     assert sorted(os.listdir(out)) == sorted(names)
     before = [(out / name).stat().st_mtime_ns for name in names[:2]]
-    for change, says in ((other, f"{stem}.partial: of another run, whose"), (["--turn", 5], "whose camera differs")):
+    turned = (["--camera", "turn=5"], "whose camera differs")
+    for change, says in ((other, f"{stem}.partial: of another run, whose"), turned):
         assert says in fails(*words, *change, "-o", out, "--resume")
     call(*words, "-o", out, "--resume")
-    assert len(made) == 4 and "2 frames are there" in call.stderr
+    assert len(made) == 4 and "2 frames are finished" in call.stderr
     assert [(out / name).stat().st_mtime_ns for name in names[:2]] == before
     assert sorted(os.listdir(out)) == sorted(os.listdir(whole))
     for path in whole.iterdir():
@@ -102,7 +104,8 @@ def test_frames_that_were_made_are_not_made_again(words, place, stem, other, fra
 
 def test_guide(volume, tmp_path):
     out = tmp_path / "g.exr"
-    text = call("smoke", "guide", volume, "-o", out, "--resolution", 20, "--step", 3, "--jitter", 0, "--extinction", 8)
+    words = ["--resolution", 20, "--step", 3, "--jitter", 0, "--volume", "extinction=8"]
+    text = call("smoke", "guide", volume, "-o", out, *words)
     loaded = load_volume(volume, extinction=8.0)
     expected = guide(loaded, camera_of(loaded), March(3.0, jitter=0.0))
     planes, note = read_planes(out)
@@ -112,8 +115,9 @@ def test_guide(volume, tmp_path):
     depth = expected.depth[expected.depth > 0]
     assert f"{float(depth.min()):.4g}" in text and "g.exr" in text
     # From elsewhere, and from within.
-    words = ["--toward", "1,0,0", "--turn", 90, "--distance", 0.1, "--extent", 0.5, "--perspective", "--resolution", 8]
-    call("smoke", "guide", volume, "-o", out, *words)
+    settings = ("toward=1,0,0", "turn=90", "distance=0.1", "extent=0.5", "perspective=true")
+    words = [word for setting in settings for word in ("--camera", setting)]
+    call("smoke", "guide", volume, "-o", out, *words, "--resolution", 8)
     camera = read_planes(out)[1]["camera"]
     assert camera["perspective"] and (camera["height"], camera["extent"]) == (8, 0.5)
     np.testing.assert_allclose(camera["toward"], [0, 0, -1], atol=1e-9)
@@ -134,7 +138,7 @@ def test_guide_of_frames(frames, tmp_path):
 
 def test_bake(volume, tmp_path):
     out = tmp_path / "b.exr"
-    text = call("smoke", "bake", volume, "-o", out, *SMALL, "--supersample", 2, "--g", 0.3, "--emission", 2)
+    text = call("smoke", "bake", volume, "-o", out, *SMALL, "--supersample", 2, "--g", 0.3, "--volume", "emission=2")
     loaded = load_volume(volume, emission=2.0)
     camera = camera_of(loaded)
     expected = bake(loaded, camera, step=1.0, supersample=2, g=0.3)
@@ -154,20 +158,20 @@ def test_bake_of_frames(baked):
 def test_lightmaps_that_are_alike_are_noted(tmp_path):
     # A small piece of an even, thin cloud is as bright everywhere.
     save_volume(tmp_path / "a.npz", from_array(np.full((8, 8, 8), 0.1), voxel=0.1))
-    call("smoke", "bake", tmp_path / "a.npz", "-o", tmp_path / "a.exr", *SMALL, "--extent", 0.01)
+    call("smoke", "bake", tmp_path / "a.npz", "-o", tmp_path / "a.exr", *SMALL, "--camera", "extent=0.01")
     assert re.search(r"a.exr: note: \w+ isn't brighter", call.stderr)
 
 
-def test_shade(volume, frames, baked, tmp_path):
+def test_shade(baked, tmp_path):
     out = tmp_path / "s.png"
     lights = ["--light", "1,0,0", "--light", "0,2,0:6,3,0", "--light", "0,0,1:1"]
-    call("smoke", "shade", volume, "-o", out, *SMALL, *lights, "--background", "0.1,0.2,0.3", "--white", 2)
-    loaded = load_volume(volume)
-    camera = camera_of(loaded)
+    one = baked / "six_0001.exr"
+    call("smoke", "shade", one, "-o", out, *lights, "--background", "0.1,0.2,0.3", "--white", 2)
     given = [((1, 0, 0), (4 * math.pi,) * 3), ((0, 2, 0), (6, 3, 0)), ((0, 0, 1), (1, 1, 1))]
     made = [LightSettings(toward=toward, irradiance=irradiance).light() for toward, irradiance in given]
-    six = bake(loaded, camera, step=1.0, estimate=False)
-    expected = to_bytes(picture(six, made, background=(0.1, 0.2, 0.3)), 2.0)
+    six, looks = read_shaded(one)
+    scene = {"obstacles": looks.obstacles, "time": looks.time}
+    expected = to_bytes(picture(six, made, background=(0.1, 0.2, 0.3), **scene), 2.0)
     np.testing.assert_array_equal(png(out), expected)
     # Baked lightmaps know their camera.
     call("smoke", "shade", baked / "six_0002.exr", "-o", out, "--light", "1,1,0", "--rule", "absolute")
@@ -176,7 +180,7 @@ def test_shade(volume, frames, baked, tmp_path):
     expected = picture(six, [light], rule="absolute", obstacles=looks.obstacles, time=looks.time)
     np.testing.assert_array_equal(png(out), to_bytes(expected))
     # Frames have a scene: its obstacle is in the picture, and moves.
-    text = call("smoke", "shade", frames, "-o", tmp_path / "s", *SMALL)
+    text = call("smoke", "shade", baked, "-o", tmp_path / "s")
     names = [f"shade_{i:04d}.png" for i in (1, 2, 3)]
     assert sorted(os.listdir(tmp_path / "s")) == [*names, "sheet.png"] and all(name in text for name in names)
     without = [to_bytes(read_six_way(baked / f"six_{i:04d}.exr").shade([LIGHT])) for i in (1, 2, 3)]
@@ -191,18 +195,22 @@ def test_every_route_keeps_the_scene(tmp_path):
     lights = [{"toward": [1, 0, 1], "irradiance": [20, 2, 2]}, {"toward": [-1, 1, 0], "irradiance": [0, 0, 30]}]
     looks = {"lights": lights, "background": [0.0, 0.2, 0.0], "obstacles": [SPHERE | {"colour": [0.5, 0.5, 0.1]}]}
     smoke = {"extinction": 8.0, "emission": 2.0, "glow": [[0, 0, 0, 0], [1, 3, 1, 0]], "albedo": [0.9, 0.5, 0.7]}
-    folder = write_frames(tmp_path / "a", smoke=smoke, frames=2, **looks).path
+    folder, small = write_frames(tmp_path / "a", smoke=smoke, frames=2, **looks).path, CameraSettings(resolution=20)
     for number in (1, 2):
         save_volume(folder / f"frame_{number:04d}.npz", plume(number + 1, hot=True))
-    call("smoke", "shade", folder, "-o", tmp_path / "s", *SMALL)
     for name, words in {"bake": ["bake", "--step", 1], "coarse": ["predict", "--coarse", "--step", 1]}.items():
         call("smoke", *words, folder, "-o", tmp_path / name, "--resolution", 20)
         call("smoke", "shade", tmp_path / name, "-o", tmp_path / f"{name}_s")
-        for number in (1, 2):
-            file = f"shade_{number:04d}.png"
-            expected, got = (np.int32(png(tmp_path / at / file)) for at in ("s", f"{name}_s"))
-            # Half floats, and of the march of `--coarse` its steps.
-            error = np.abs(got - expected)
+    scene = load_frames(folder)
+    for number in (1, 2):
+        volume, looks = scene.load(number), scene.looks(number)
+        six = with_surface(bake(volume, scene.view(small, volume), step=1.0, estimate=False), volume, looks)
+        extra = {"obstacles": looks.obstacles, "time": looks.time, "ramp": looks.ramp, "albedo": looks.albedo}
+        given = [settings.light() for settings in looks.lights]
+        expected = np.int32(to_bytes(picture(six, given, background=looks.background, **extra)))
+        for name in ("bake", "coarse"):
+            # Half floats, and for `--coarse` the steps of its march.
+            error = np.abs(np.int32(png(tmp_path / f"{name}_s" / f"shade_{number:04d}.png")) - expected)
             assert error.max() <= 1 if name == "bake" else (error.mean() < 2 and error.max() < 40), name
     # One file has them too.
     call("smoke", "shade", tmp_path / "bake" / "six_0002.exr", "-o", tmp_path / "one.png")
@@ -222,14 +230,15 @@ def test_a_scenes_glow(tmp_path):
     smoke = {"extinction": 8.0, "emission": 5.0, "glow": [[0, 0, 0, 0], [0.1, 1, 0.5, 0], [9, 1, 0.5, 0]]}
     folder = write_frames(tmp_path / "a", smoke=smoke, lights=[], frames=1).path
     save_volume(folder / "frame_0001.npz", plume(hot=True))
-    call("smoke", "shade", folder, "-o", tmp_path / "s", *SMALL)
+    call("smoke", "bake", folder, "-o", tmp_path / "six", *SMALL)
+    call("smoke", "shade", tmp_path / "six", "-o", tmp_path / "s")
     result = png(tmp_path / "s" / "shade_0001.png")
     # sRGB of a half is 188.
     assert result.reshape(-1, 3).max(0).tolist() == [255, 188, 0]
 
 
 @pytest.mark.parametrize("layout", ["unity", "o3de", "o3de-tlrb", "embergen"])
-def test_flipbook(layout, baked, volume, tmp_path):
+def test_flipbook(layout, baked, tmp_path):
     text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--layout", layout)
     assert sorted(os.listdir(tmp_path)) == ["f_1.exr", "f_2.exr"] and "2 x 2 cells of 20 x 20" in text
     paths = (tmp_path / "f_1.exr", tmp_path / "f_2.exr")
@@ -241,33 +250,29 @@ def test_flipbook(layout, baked, volume, tmp_path):
     assert ("emission" in text) == (layout == "o3de-tlrb"), "the last channel is left out where nothing glows"
 
 
-def test_a_padded_flipbook_and_its_shaders(baked, tmp_path):
-    text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--padding", 3, "--shader")
-    assert (
-        sorted(os.listdir(tmp_path)) == ["f.glsl", "f.hlsl", "f.metal", "f.wgsl", "f_1.exr", "f_2.exr"]
-        and "3 around each" in text
-    )
-    result = read_flipbook((tmp_path / "f_1.exr", tmp_path / "f_2.exr"), rows=2, columns=2, count=3, padding=3)
+def test_a_padded_flipbook(baked, tmp_path):
+    text = call("smoke", "flipbook", baked, "-o", tmp_path / "f.exr", "--mips", 2)
+    assert sorted(os.listdir(tmp_path)) == ["f_1.exr", "f_2.exr"]
+    padding = int(re.search(r"padded by (\d+)", text)[1])
+    paths = (tmp_path / "f_1.exr", tmp_path / "f_2.exr")
+    result = read_flipbook(paths, rows=2, columns=2, count=3, padding=padding)
     torch.testing.assert_close(result[1].lightmaps, read_six_way(baked / "six_0002.exr").lightmaps)
-    assert "of 3 frames, in 2 x 2 cells" in (tmp_path / "f.hlsl").read_text()
-    assert f"place.x * {20 / 26:.9g}" in (tmp_path / "f.glsl").read_text()
 
 
-def test_flipbook_of_volumes(volume, frames, tmp_path):
-    text = call("smoke", "flipbook", volume, "-o", tmp_path / "f.png", *SMALL)
+def test_the_gain_of_a_flipbook(volume, baked, tmp_path):
+    call("smoke", "bake", volume, "-o", tmp_path / "six.exr", *SMALL)
+    text = call("smoke", "flipbook", tmp_path / "six.exr", "-o", tmp_path / "f.png")
     gain = float(re.search(r"gain +│ +([\d.]+) ", text)[1])
-    loaded = load_volume(volume)
-    six = bake(loaded, camera_of(loaded), step=1.0, estimate=False)
+    six = read_six_way(tmp_path / "six.exr")
     brightest = max(float(six.lightmaps.max()), float(six.emission.max()))
     assert gain == pytest.approx(1 / brightest, rel=1e-3)
     gain = 1 / brightest
-    assert " 0 numbers clipped" in text
+    assert " 0 values clipped" in text
     result = read_flipbook((tmp_path / "f_1.png", tmp_path / "f_2.png"), "unity", rows=1, columns=1, gain=gain)[0]
     torch.testing.assert_close(result.lightmaps, six.lightmaps, rtol=0, atol=0.51 / 255 / gain)
     torch.testing.assert_close(result.emission, six.emission, rtol=0, atol=0.51 / 255 / gain)
-    words = ["--count", 2, "--columns", 9, "--gain", 9]
-    text = call("smoke", "flipbook", frames, "-o", tmp_path / "g.tga", *SMALL, *words)
-    assert "1 x 2 cells of 20 x 20" in text and " 0 numbers clipped" not in text
+    text = call("smoke", "flipbook", baked, "-o", tmp_path / "g.tga", "--count", 2, "--gain", 9)
+    assert "1 x 2 cells of 20 x 20" in text and " 0 values clipped" not in text
     result = read_flipbook((tmp_path / "g_1.tga", tmp_path / "g_2.tga"), "unity", rows=1, columns=2, gain=9.0)
     opaque = [1 - float(frame.transparency.mean()) for frame in result]
     assert opaque[1] > 3 * opaque[0], "the first and the last"
@@ -279,12 +284,14 @@ def test_hard_volumes(tmp_path):
     for name, density in cases.items():
         path = tmp_path / f"{name}.npz"
         np.savez(path, density=density)
-        for command, suffix in (("guide", "exr"), ("bake", "exr"), ("shade", "png"), ("flipbook", "png")):
-            # A light and a camera along an axis.
-            light = ["--light", "0,-1,0"] if command == "shade" else []
-            words = [*light, "--toward", "0,1,0", "--resolution", 5]
-            call("smoke", command, path, "-o", tmp_path / f"{name}-{command}.{suffix}", *words)
+        for command in ("guide", "bake"):
+            # A camera along an axis.
+            words = ["--camera", "toward=0,1,0", "--resolution", 5]
+            call("smoke", command, path, "-o", tmp_path / f"{name}-{command}.exr", *words)
             assert ("warning: " in call.stderr and "27 NaN" in call.stderr) == (name == "nan")
+        six = tmp_path / f"{name}-bake.exr"
+        call("smoke", "shade", six, "-o", tmp_path / f"{name}-shade.png", "--light", "0,-1,0")
+        call("smoke", "flipbook", six, "-o", tmp_path / f"{name}-flipbook.png")
         picture = png(tmp_path / f"{name}-shade.png")
         assert bool(picture.any()) == (name == "one")
 
@@ -292,32 +299,39 @@ def test_hard_volumes(tmp_path):
 def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     out = tmp_path / "a.exr"
     made = ("smoke", "bake", volume, "-o", out)
-    assert "--toward: expected three numbers" in fails(*made, "--toward", "1,0")
-    assert "--toward: expected a direction of some length" in fails(*made, "--toward", "0,0,0")
-    assert "--toward: expected finite numbers" in fails(*made, "--toward", "0,inf,0")
-    assert "--extent: expected greater than 0" in fails(*made, "--extent", -1)
-    assert "--distance: expected greater than 0" in fails(*made, "--distance", 0)
-    assert "extinction: expected a number above 0" in fails(*made, "--extinction", 0)
+    for text, line in (
+        ("toward=1,0", "--camera toward: expected three numbers"),
+        ("toward=0,0,0", "--camera toward: expected a direction of some length"),
+        ("toward=0,inf,0", "--camera toward: expected finite numbers"),
+        ("extent=-1", "--camera extent: expected greater than 0"),
+        ("distance=0", "--camera distance: expected greater than 0"),
+        ("turn=left", "--camera turn: expected a number"),
+        ("resolution=8", "--camera: expected NAME=VALUE with a name of toward"),
+    ):
+        assert line in fails(*made, "--camera", text)
+    for text, line in (
+        ("extinction=0", "extinction: expected a number above 0"),
+        ("extinction=x", "--volume extinction: expected a number"),
+        ("up=w", "--volume up: expected one of x, y, z, got 'w'"),
+        ("up", "--volume: expected NAME=VALUE"),
+    ):
+        assert line in fails(*made, "--volume", text)
     assert "--step" in fails(*made, "--step", 0)
     assert "device 'tpu'" in fails(*made, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
     assert "gone.npz: cannot read the arrays: No such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
     assert "expected a name that ends in .npz, .nvdb, .vdb" in fails("smoke", "bake", tmp_path / "a.abc", "-o", out)
-    assert "--up: expected one of x, y, z, got 'w'" in fails(*made, "--up", "w")
-    assert "expected no up for the frames of a scene" in fails("smoke", "bake", frames, "-o", out, "--up", "z")
-    shaded = ("smoke", "shade", volume, "-o", tmp_path / "a.png")
+    line = fails("smoke", "bake", frames, "-o", out, "--volume", "up=z")
+    assert "expected no up for the frames of a scene" in line
+    shaded = ("smoke", "shade", baked / "six_0001.exr", "-o", tmp_path / "a.png")
     assert "--light: expected three numbers" in fails(*shaded, "--light", "up")
     assert "--light: toward: expected a direction" in fails(*shaded, "--light", "0,0,0")
     assert "--light: irradiance.0: expected greater than or equal to 0" in fails(*shaded, "--light", "0,0,1:-1")
     assert "--rule: expected one of squared" in fails(*shaded, "--rule", "cubed")
     assert "--white: expected a number above 0" in fails(*shaded, "--white", 0)
     assert "--background: expected three numbers" in fails(*shaded, "--background", "black")
-    one = baked / "six_0001.exr"
-    for option, value in (("resolution", 8), ("emission", 0), ("step", 1), ("supersample", 1), ("turn", 5)):
-        for command in ("shade", "flipbook"):
-            line = fails("smoke", command, one, "-o", tmp_path / "a.png", f"--{option}", value)
-            assert f"was baked: --{option} has to be given to bake" in line
-    assert "expected a folder of simulate, or one sequence" in fails("smoke", "shade", tmp_path, "-o", tmp_path / "x")
+    for smoke in (volume, frames, tmp_path):
+        assert "with wlm smoke bake or predict" in fails("smoke", "shade", smoke, "-o", tmp_path / "x")
     packed = ("smoke", "flipbook", baked, "-o", tmp_path / "a.png")
     assert "--layout: expected one of unity" in fails(*packed, "--layout", "godot")
     assert "--gain: expected a number above 0" in fails(*packed, "--gain", 0)

@@ -1,4 +1,4 @@
-"""Smoke for engines from the command line: what is read, the rate, the motion, what is refused."""
+"""Flip books for engines from the command line: input, rate, kits, and wrong options."""
 
 import json
 
@@ -27,7 +27,7 @@ def fails(*words) -> str:
 
 
 def info_of(folder) -> dict:
-    return json.loads((folder / "smoke.json").read_text())
+    return json.loads((folder / "bundle.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -42,27 +42,27 @@ def baked(tmp_path_factory):
 
 
 def test_baked_frames(baked, tmp_path):
-    """The rate is that of the scene's frames, as far apart as they are taken; the fire has its ramp."""
-    text = call("export", baked, "-o", tmp_path / "all", "--engine", "three")
-    assert "2 x 3 cells of 16 x 12, 1 around each" in text and "first.png" in text
+    """The rate is that of the scene's frames that are taken; the fire has its ramp."""
+    text = call("flipbook", baked, "-o", tmp_path / "all", "--engine", "three")
+    assert "2 x 3 cells of 16 x 12, padded by 1" in text and "first.png" in text
     info = info_of(tmp_path / "all")
     assert info["rate"] == pytest.approx(20.0) and info["frames"] == 5 and info["name"] == baked.name
-    assert info["extent"][1] == 2.0 and info["motion_scale"] is None
+    assert info["extent"][1] == 2.0 and info.get("motion_scale") is None
     assert "vec3(1.0, 0.5, 0.0)" in (tmp_path / "all" / "smoke.glsl").read_text()
-    call("export", baked, "-o", tmp_path / "some", "--engine", "raw", "--count", 3, "--shader", "wgsl", "--mips", 2)
+    call("flipbook", baked, "-o", tmp_path / "some", "--count", 3, "--shader", "wgsl", "--mips", 2)
     info = info_of(tmp_path / "some")
     assert (info["rate"], info["frames"], info["levels"]) == (pytest.approx(10.0), 3, 2)
     assert info["shader"] == "smoke.wgsl" and "@binding" in (tmp_path / "some" / "smoke.wgsl").read_text()
-    call("export", baked, "-o", tmp_path / "some", "--engine", "raw", "--layout", "o3de", "--rate", 12, "--padding", 0)
+    call("flipbook", baked, "-o", tmp_path / "some", "--layout", "o3de", "--rate", 12)
     assert info_of(tmp_path / "some")["rate"] == 12.0 and info_of(tmp_path / "some")["layout"] == "o3de"
 
 
 def test_a_flip_book(tmp_path):
-    """Of another layout; its rate isn't known, nor its size in the world."""
+    """A flip book of another layout; its rate and its size in the world are unknown."""
     frames = random_frames(4)
     paths = tmp_path / "a.png", tmp_path / "b.png"
     write_flipbook(paths, frames, "o3de", rows=2, columns=2)
-    words = ["export", paths[0], "--with", paths[1], "--cells", "2x2", "--from", "o3de", "--gain", 1]
+    words = ["flipbook", paths[0], "--with", paths[1], "--cells", "2x2", "--from", "o3de", "--gain", 1]
     call(*words, "-o", tmp_path / "out", "--engine", "unity")
     info = info_of(tmp_path / "out")
     assert (info["rate"], info["extent"][1], info["layout"]) == (25.0, 1.0, "unity")
@@ -71,19 +71,14 @@ def test_a_flip_book(tmp_path):
     np.testing.assert_allclose(right, frames[0]["right"], atol=0.51 / 255)
 
 
-def test_what_is_refused(baked, tmp_path):
-    out = ["-o", tmp_path / "out"]
-    engine = ["export", baked, *out, "--engine"]
-    assert "--shader: means nothing with --engine godot" in fails(*engine, "godot", "--shader", "hlsl")
-    assert "--layout: means nothing with --engine unity" in fails(*engine, "unity", "--layout", "o3de")
-    assert "--layout: expected one of unity, o3de" in fails(*engine, "raw", "--layout", "godot")
-    assert "--rate: expected a number above 0, got 0" in fails(*engine, "raw", "--rate", 0)
-    assert "--gain: expected a number above 0, got nan" in fails(*engine, "raw", "--gain", "nan")
-    assert "--mips: expected without --padding" in fails(*engine, "raw", "--mips", 1, "--padding", 1)
-    assert "--step has to be given to bake" in fails(*engine, "raw", "--step", 1)
-    assert "--engine three: expected smoke" in fails("export", *out, "--engine", "three")
-    for option, value in (("columns", 2), ("count", 2), ("motion", tmp_path), ("layout", "unity"), ("toward", "1,0,0")):
-        line = fails("export", "-o", tmp_path / "a.onnx", f"--{option}", value)
-        assert f"--{option}: means nothing without --engine" in line
-    assert "--straight: means nothing without --engine" in fails("export", "-o", tmp_path / "a.onnx", "--straight")
+def test_wrong_options_are_one_line(baked, tmp_path):
+    book = ["flipbook", baked, "-o", tmp_path / "out"]
+    assert "shader and exact have no meaning for a kit" in fails(*book, "--engine", "godot", "--shader", "hlsl")
+    assert "layout: expected unity for unity, got o3de" in fails(*book, "--engine", "unity", "--layout", "o3de")
+    assert "--layout: expected one of unity, o3de" in fails(*book, "--layout", "godot")
+    assert "--rate: expected a number above 0, got 0" in fails(*book, "--rate", 0)
+    assert "--gain: expected a number above 0, got nan" in fails(*book, "--gain", "nan")
+    textures = ["flipbook", baked, "-o", tmp_path / "a.png"]
+    assert "--engine: expected a folder as the output" in fails(*textures, "--engine", "three")
+    assert "--shader: expected a folder as the output" in fails(*textures, "--shader", "wgsl")
     assert not list(tmp_path.iterdir())

@@ -36,11 +36,11 @@ def camera_of(volume) -> Camera:
 
 def test_light_and_trace_show_the_same(volume, tmp_path):
     """All orders are brighter than one, and near what is traced; an albedo of 0 is black where no fire is."""
-    lamp = ("--light", "1,0.5,0.6:9", "--extinction", 8, "--emission", 0)
+    lamp = ("--light", "1,0.5,0.6:9", "--volume", "extinction=8", "--volume", "emission=0")
     for name, words in (
         ("all", ("light", "--albedo", "0.95")),
         ("single", ("light", "--orders", "single", "--albedo", "0.95")),
-        ("black", ("light", "--albedo", "0", *lamp[4:])),
+        ("black", ("light", "--albedo", "0")),
         ("traced", ("trace", "--albedo", "0.95", "--samples", 512)),
     ):
         call("smoke", words[0], volume, "-o", tmp_path / f"{name}.png", *SMALL, *words[1:], *lamp)
@@ -77,7 +77,7 @@ def test_trace_writes_orders_and_noise(volume, tmp_path):
 
 
 def test_smoke_too_dense_to_trace_is_named(volume, tmp_path):
-    line = fails("smoke", "trace", volume, "-o", tmp_path / "a.png", *SMALL, "--extinction", 1e9)
+    line = fails("smoke", "trace", volume, "-o", tmp_path / "a.png", *SMALL, "--volume", "extinction=1e9")
     assert str(volume) in line and "optical depth" in line
 
 
@@ -99,8 +99,6 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
     ("words", "message"),
     [
         (("light", "--orders", "two"), "--orders"),
-        (("light", "--orders", "single", "--model", "a.npz"), "--model"),
-        (("light", "--model", "absent.npz"), "absent.npz"),
         (("light", "--albedo", "1.5"), "--albedo"),
         (("light", "--light", "0,0,0"), "--light"),
         (("light", "--point", "0,0,0:-1"), "--point"),
@@ -108,7 +106,7 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
         (("trace", "--sky", "1,-1,1"), "--sky"),
         (("light", "--sky", "1,-1,1"), "--sky"),
         (("trace", "--white", "0"), "--white"),
-        (("trace", "--extinction", "1e9"), "optical depth"),
+        (("trace", "--volume", "extinction=1e9"), "optical depth"),
     ],
 )
 def test_wrong_options_are_one_line(volume, tmp_path, words, message):

@@ -71,12 +71,10 @@ def test_what_run_refuses(scene, tmp_path, monkeypatch):
     out = tmp_path / "a"
     assert "--white: expected a number above 0" in fails("smoke", "run", scene, "-o", out, "--white", 0)
     for words, line in (
-        (("--orders", "two"), "--orders: expected all or single"),
-        (("--orders", "single", "--model", "a.npz"), "--model: expected --orders all"),
+        (("--orders", "two"), "--orders: expected one of all, single"),
         (("--orders", "all", "--network", "a.safetensors"), "--network: expected --orders single"),
         (("--seed", 1), "--seed: expected --orders single"),
         (("--albedo", "0.5,2,1"), "--albedo: expected numbers of 0 to 1"),
-        (("--model", "absent.npz"), "absent.npz"),
     ):
         assert line in fails("smoke", "run", scene, "-o", out, *words)
     both = ("--step", 1, "--network", tmp_path / "n.safetensors")

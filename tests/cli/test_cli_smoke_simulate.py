@@ -41,7 +41,7 @@ def jet(tmp_path_factory):
 def test_simulate(jet, tmp_path):
     scene, out = jet / "jet.yaml", tmp_path / "out"
     text = call("smoke", "simulate", scene, "-o", out)
-    assert re.search(r"density +│ +16 x 20 x 16 │", text) and "simulate: 4 of 4, smoke" in call.stderr
+    assert re.search(r"voxels of the smoke +│ +16 x 20 x 16 │", text) and "simulate: 4 of 4, smoke" in call.stderr
     assert sorted(os.listdir(out)) == [*(f"frame_{i:04d}.npz" for i in range(1, 5)), "scene.json"]
     footage = load_frames(out)
     assert footage.scene == Scene.model_validate(JET)
@@ -106,7 +106,7 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     call("smoke", "simulate", scene, "-o", out, code=130)
     monkeypatch.undo()
     whole = ["frame_0001.npz", *["frame_0002.npz"] * (not within)]
-    assert f"stopped at frame {len(whole)}: the same command with --resume goes on from {out}" in call.stderr
+    assert f"stopped at frame {len(whole)}: repeat the command with --resume to continue from {out}" in call.stderr
     assert sorted(os.listdir(out)) == [*whole, "scene.json", CHECKPOINT]
     # With another scene it isn't resumed, and nothing is lost by the attempt.
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
@@ -218,14 +218,14 @@ def test_hard_scenes(case, tmp_path):
 def test_earlier_results_outlast_a_command_that_cannot_be(jet, tmp_path, monkeypatch):
     """Frames, and lightmaps, guides and pictures made of them, when the next run ends before its first result."""
     frames = write_frames(tmp_path / "frames", frames=2).path
-    made = {"bake": "bake", "guide": "guide", "shade": "shade"}
+    made = {"bake": "bake", "guide": "guide"}
     for command, folder in made.items():
         call("smoke", command, frames, "-o", tmp_path / folder, "--resolution", 8)
     call("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for command, folder in made.items():
-        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--toward", "0,0,0")
-        assert "--toward: expected a direction" in line
+        line = fails("smoke", command, frames, "-o", tmp_path / folder, "--camera", "toward=0,0,0")
+        assert "--camera toward: expected a direction" in line
     for path in (frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"):
         path.write_bytes(b"x")
     fails("smoke", "guide", frames, "-o", tmp_path / "guide")

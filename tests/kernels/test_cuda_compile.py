@@ -1,4 +1,8 @@
-"""Every kernel is compiled for a GPU (sm_90), which needs none: what a machine without one can say of that half."""
+"""Every kernel compiles for a GPU (sm_90), checked on machines without one.
+
+The quick run compiles one variant of the kernels whose CUDA form the CPU never runs, such as native CUDA code. The long
+run compiles every kernel and variant.
+"""
 
 import importlib
 from collections.abc import Iterable
@@ -6,14 +10,13 @@ from pathlib import Path
 
 import pytest
 import warp as wp
-from wlm_kernels.lightmap.video import VIDEO
 
+import wlm_kernels
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
-from wlm_kernels.lightmap.frames import FRAMES
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
@@ -31,43 +34,14 @@ from wlm_kernels.smoke import (
 from wlm_kernels.smoke import march as smoke_march
 
 ARCHITECTURE = 90
-MODULES = (
-    "atlas.cascade",
-    "atlas.decode",
-    "atlas.patch_graph",
-    "atlas.patches",
-    "atlas.scene",
-    "atlas.solve",
-    pytest.param("bc6h", marks=pytest.mark.slow),  # several seconds
-    "fluid.advection_places",
-    "fluid.grids",
-    "fluid.lattice_links",
-    "fluid.lattice_fields",
-    "interpolate",
-    "lightmap.blocks",
-    "lightmap.decode",
-    "lightmap.gather",
-    "lightmap.levels",
-    "lightmap.matrix_decode",
-    "lightmap.output",
-    "probe.cubes",
-    "probe.gaussian_sum",
-    "probe.mixture",
-    "probe.step",
-    "probe.volume",
-    "probe.volume_frame",
-    "probe.volume_weights",
-    "raster.gradient",
-    "raster.rasterize",
-    "raster.rays",
-    "raster.texture",
-    "smoke.depth_lattice",
-    "smoke.diffusion",
-    "smoke.orders",
-    "smoke.picture",
-    "smoke.shadow",
-    "smoke.single_scatter",
+KERNELS = Path(wlm_kernels.__file__).parent
+MODULES = sorted(
+    ".".join(path.relative_to(KERNELS).with_suffix("").parts)
+    for path in KERNELS.rglob("*.py")
+    if "\n@wp.kernel" in path.read_text(encoding="utf-8")
 )
+"""The modules with kernels of one form; factories make the others."""
+QUICK_MODULES = ("fluid.advection_places", "probe.cubes", "raster.rasterize")
 WIDTHS = (8, 17, 32, 64)
 
 
@@ -78,7 +52,7 @@ def _compile(module: object, folder: Path) -> None:
 
 
 def _kernels_of(built: Iterable[object]) -> list[wp.Kernel]:
-    """The kernels among what a factory gives; each is a module of its own."""
+    """Selects the kernels of a factory's result; each is a module of its own."""
     found = [value for value in built if isinstance(value, wp.Kernel)]
     assert found, "the factory builds kernels"
     return found
@@ -90,22 +64,24 @@ def _compile_all(built: Iterable[object], folder: Path) -> None:
 
 
 def _slow_but(first: object, others: Iterable[object]) -> list:
-    """One value for every run, the others for the long one."""
+    """One value for every run, and others for the long run."""
     return [first, *(pytest.param(value, marks=pytest.mark.slow) for value in others)]
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK_MODULES else pytest.mark.slow) for name in MODULES]
+)
 def test_modules(name: str, tmp_path: Path):
-    """The kernels that have one form."""
+    """Modules whose kernels have one form."""
     _compile(importlib.import_module(f"wlm_kernels.{name}"), tmp_path)
 
 
+@pytest.mark.parametrize("outputs", _slow_but(3, [5]))
 @pytest.mark.parametrize("gelu", _slow_but("fast", ["exact", "tanh"]))
 @pytest.mark.parametrize("hidden", _slow_but(8, (16, *WIDTHS[1:])))
-def test_mlp(hidden: int, gelu: str, tmp_path: Path):
-    """ "fast" has an instruction that only a GPU has; three outputs, and another number."""
-    _compile_all(vars(mlp.kernels(16, hidden, gelu)).values(), tmp_path / "three")
-    _compile_all(vars(mlp.kernels(16, hidden, gelu, 5)).values(), tmp_path / "five")
+def test_mlp(hidden: int, gelu: str, outputs: int, tmp_path: Path):
+    """The "fast" GELU uses an instruction of the GPU; networks of three and of other numbers of outputs."""
+    _compile_all(vars(mlp.kernels(16, hidden, gelu, outputs)).values(), tmp_path)
 
 
 @pytest.mark.parametrize("gelu", _slow_but("tanh", ["exact"]))
@@ -116,6 +92,7 @@ def test_step(dynamic: bool, hidden: int, gelu: str, tmp_path: Path):
     _compile_all(vars(lightmap_step.step_kernels(dynamic, hidden, gelu, "cuda")).values(), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", _slow_but(8, (16, *WIDTHS[1:])))
 @pytest.mark.parametrize("dynamic", _slow_but(True, [False]))
 def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
@@ -123,8 +100,9 @@ def test_exact_decode(dynamic: bool, hidden: int, tmp_path: Path):
     _compile_all(lightmap_decode.exact_kernels(dynamic, hidden, "tanh"), tmp_path)
 
 
-@pytest.mark.parametrize("shared", _slow_but(True, [False]))
-@pytest.mark.parametrize("hidden", _slow_but(16, WIDTHS))
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("hidden", [16, *WIDTHS])
 def test_strip_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding four texels a thread."""
     _compile_all(vars(lightmap_decode.strip_kernels(hidden, "fast", shared)).values(), tmp_path)
@@ -137,18 +115,18 @@ def test_matrix_decode(hidden: int, shared: bool, tmp_path: Path):
     _compile_all(vars(matrix_decode.matrix_kernels(hidden, shared)).values(), tmp_path)
 
 
-@pytest.mark.parametrize("kernels", [FRAMES, VIDEO], ids=["frames", "video"])
-def test_images(kernels: object, tmp_path: Path):
-    """Decoding what is stored as an image at each time."""
-    _compile_all(vars(kernels).values(), tmp_path)
-
-
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
 def test_gaussians(latent: int, tmp_path: Path):
-    """The sum of Gaussians at any point, a training step's, and the update."""
-    _compile_all(vars(gaussian_sum.sum_kernels(latent)).values(), tmp_path / "sum")
+    """A training step's sum of Gaussians, and the update."""
     _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path / "step")
     _compile_all([optimiser.update_kernel(latent)], tmp_path / "update")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("latent", [1, 9, 12, 32])
+def test_gaussian_sum(latent: int, tmp_path: Path):
+    """The sum of Gaussians at any point."""
+    _compile_all(vars(gaussian_sum.sum_kernels(latent)).values(), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -164,6 +142,7 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
     _compile_all(vars(probe_decode.decode_kernels(latent, hidden, outputs, "cuda")).values(), tmp_path / "decode")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
@@ -173,6 +152,7 @@ def test_marching(dtype: type, tmp_path: Path):
     _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hot", _slow_but(True, [False]))
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
@@ -181,6 +161,7 @@ def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
     _compile_all([march_coarse.coarse_kernel(dtype, hot), *depths], tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_lights_and_paths(dtype: type, tmp_path: Path):
     """The march to lights, light from points by diffusion, and the path tracer."""
@@ -201,6 +182,7 @@ LATTICE_STEPS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", _slow_but(LATTICE_STEPS[1], [LATTICE_STEPS[0], *LATTICE_STEPS[2:]]))
 def test_lattice_step(settings: dict, tmp_path: Path):
     """Streaming and collision, by everything that changes the code."""

@@ -11,6 +11,8 @@ from builders.checks import assert_same, error_of
 from builders.small_sets import moving_light, static_light, tiny_profile, write_set
 from builders.synthetic import any_blocks, random_model
 from typer.testing import CliRunner
+from wlm.lightmap.frame_packing import needed_blocks
+from wlm.lightmap.frames import choose_frames, round_half
 
 import wlm
 from benchmarks.rivals.lightmap import encode_set
@@ -22,8 +24,6 @@ from wlm.lightmap.decode import Decoder
 from wlm.lightmap.evaluation import count_kinds, memory_bytes, part_bytes
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, open_checkpoint
-from wlm.lightmap.frame_packing import needed_blocks
-from wlm.lightmap.frames import choose_frames, round_half
 from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import Profile
 from wlm.lightmap.runtime import FrameDecoder
@@ -212,7 +212,7 @@ def test_the_command_says_that_the_encoder_is_missing(monkeypatch, tmp_path):
     write_set(tmp_path / "set", moving_light(24, 40, hours=(6.0,)))
     profile = tiny_profile(frames="auto", steps=10).model_dump(mode="json")
     (tmp_path / "tiny.yaml").write_text(json.dumps(profile))
-    command = ["lightmap", "compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
+    command = ["compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
     for missing, kind in ((False, "frames"), (True, "static")):
         if missing:
             monkeypatch.setitem(sys.modules, "ispc_texcomp", None)

@@ -113,7 +113,7 @@ def test_the_command_writes_the_texture(tmp_path):
     model.save(tmp_path / "a.wlm")
     files = ["-o", str(tmp_path / "a.exr"), "--texture", str(tmp_path / "a.dds")]
     assert (
-        CliRunner().invoke(app, ["lightmap", "decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
+        CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
     )
     decoder = MapDecoder(model)
     decoder.set_time(9.0)

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from builders.running import report_always
 from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+from wlm.lightmap.worker import Fitter
 
 import wlm
 from wlm.errors import WlmError
 from wlm.formats import scratch
 from wlm.lightmap import fit
 from wlm.lightmap.data import from_arrays, load
-from wlm.lightmap.worker import Fitter
 from wlm.workers import Here, Lost, Processes, Workers
 
 PROFILE = tiny_profile(steps=40)
@@ -165,7 +165,7 @@ def test_a_stopped_command_leaves_no_process_behind(number, lightmaps, tmp_path)
     folder, out = tmp_path / "set", tmp_path / "out" / "a.wlm"
     write_set(folder, lightmaps)
     out.parent.mkdir()
-    words = ["lightmap", "compress", folder, "-o", out, "--steps", 10_000, "--samples", 128, "--workers", 2]
+    words = ["compress", folder, "-o", out, "--steps", 10_000, "--samples", 128, "--workers", 2]
     code = "from wlm.cli import main\nfrom wlm.cli import console\nconsole._PLAIN_REPORTS = 10**7\nmain()"
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2]), "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", code, *map(str, words), "--checkpoint-every", "0.1"]
@@ -180,7 +180,7 @@ def test_a_stopped_command_leaves_no_process_behind(number, lightmaps, tmp_path)
         errors = run.stderr.read()
     assert len(workers) == 2
     if number != signal.SIGKILL:
-        assert run.returncode == 128 + number and "--resume goes on from" in errors and "Traceback" not in errors
+        assert run.returncode == 128 + number and "--resume to continue from" in errors and "Traceback" not in errors
     # An orphan ends once it has answered.
     for pid in workers:
         for _ in range(100):

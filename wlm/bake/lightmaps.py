@@ -191,7 +191,7 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
 
 
 def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:
-    """Writes a set that `wlm lightmap compress` takes, in place of an earlier one.
+    """Writes a set that `wlm compress` takes, in place of an earlier one.
 
     Args:
         folder: Made if it isn't there.

@@ -1,11 +1,11 @@
-"""The command's root: its groups, its version, and what becomes of an error.
+"""The root of the command line: its commands, its version, and its errors.
 
-Exit codes: 0 done; 1 the reader of our output went away; 2 bad input or an unwritable output, with one line on
-stderr that starts with `error:`; 130 stopped by Ctrl-C; 143 stopped by SIGTERM. Any other exception is a bug and shows
-its traceback.
+Exit codes: 0 success; 1 the reader of the output closed the pipe; 2 wrong input or an output that cannot be written,
+with one line on stderr that starts with `error:`; 130 stopped by Ctrl-C; 143 stopped by SIGTERM. Any other exception
+is a bug and shows its traceback.
 
-What takes long to import (torch, Warp) is imported by the commands that need it, so that `wlm --version` answers at
-once.
+Modules that take long to import (torch, Warp) are imported by the commands that need them, so that `wlm --version`
+answers at once.
 """
 
 import errno
@@ -13,42 +13,43 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bake, compare, doctor, inspect, lightmap, probe, smoke, view, web
+from wlm.cli import atlas, bake, compare, doctor, inspect, probe, smoke, verbs, view, web
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
 BAD_INPUT = 2
-_INTERRUPTED = 130  # what typer makes of KeyboardInterrupt
+_INTERRUPTED = 130  # typer's code for KeyboardInterrupt
 
-# The base of all that the parser says of an argument; typer names only this child of it.
+# The base class of all errors of the argument parser, of which typer only exports this child.
 _UsageError = typer.BadParameter.__base__
 
 
 class Group(TyperGroup):
-    """Turns errors that are meant for the user into one line and an exit code."""
+    """A group of commands that turns errors meant for the user into one line and an exit code."""
 
     def main(self, args: Sequence[str] | None = None, **extra: Any) -> Any:
         args = list(sys.argv[1:] if args is None else args)
         extra["standalone_mode"] = False
         try:
-            # A returned number is that of an `Exit`, which an interrupt becomes too.
+            # A returned number is that of an `Exit`, which typer also makes of an interrupt.
             code = super().main(args=args or ["--help"], **extra)
             sys.exit(exit_code() if code == _INTERRUPTED else code)
         except WlmError as error:
             line = str(error)
         except _UsageError as error:
-            # "Value error" is the checker's own word.
+            # pydantic adds "Value error" in front of messages.
             text = one_line(error.format_message()).replace("Value error, ", "")
-            line = f"{text} ({_command_path(error)} --help tells more)"
+            line = f"{text} (see {_command_path(error)} --help)"
         except OSError as error:
             if error.errno == errno.EPIPE:
-                # What Python still holds for the closed pipe must not fail again when it ends.
+                # Text that Python still buffers for the closed pipe must not fail again at exit.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if error.errno is None:
@@ -60,21 +61,62 @@ class Group(TyperGroup):
 
 app = typer.Typer(
     cls=Group,
-    # A bug's traceback is for a report: plain, whole, without the values of locals.
+    # The traceback of a bug is meant for a report: plain, whole, without the values of local variables.
     pretty_exceptions_enable=False,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.add_typer(lightmap.app, name="lightmap")
-app.add_typer(atlas.app, name="atlas")
-app.add_typer(probe.app, name="probe")
-app.add_typer(smoke.app, name="smoke")
-app.add_typer(bake.app, name="bake")
+
+
+def _input_system(path: Path) -> str:
+    from wlm.inspection import input_system
+
+    return input_system(path)
+
+
+verbs.register(
+    app,
+    "compress",
+    "Compress lightmaps over time, lightmaps of a mesh, or light probes into one .wlm file.\n\n"
+    "The kind of the input chooses the system. wlm compress INPUT --help lists the options of that system, "
+    "wlm compress --system probe --help those of probes without an input.",
+    metavar="INPUT",
+    argument_help="A lightmap set or a folder of lightmaps; a mesh, followed by its lightmaps; or a probe file.",
+    detect=_input_system,
+)
+verbs.register(
+    app,
+    "evaluate",
+    "Compare a compressed file with its original and report the error.\n\n"
+    "wlm evaluate FILE.wlm --help lists the options of the file's system.",
+)
+verbs.register(
+    app,
+    "decode",
+    "Decode a compressed file: a lightmap at a time, the lightmap of a mesh, or probes.\n\n"
+    "wlm decode FILE.wlm --help lists the options of the file's system.",
+)
+verbs.register(
+    app,
+    "export",
+    "Write a compressed file as a folder for an engine: textures, buffers, a shader, and a kit for engines by name.\n\n"
+    "wlm export FILE.wlm --help lists the options of the file's system.",
+)
+verbs.register(
+    app,
+    "info",
+    "Show what a compressed file contains: settings, sizes on disk and on a device.\n\n"
+    "wlm info FILE.wlm --help lists the options of the file's system.",
+)
 app.command()(compare.compare)
 app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)
 app.command()(doctor.doctor)
+app.add_typer(atlas.app, name="atlas")
+app.add_typer(probe.app, name="probe")
+app.add_typer(smoke.app, name="smoke")
+app.add_typer(bake.app, name="bake")
 
 
 def main() -> None:
@@ -83,9 +125,9 @@ def main() -> None:
 
 
 def run(command: Callable[[], Any]) -> None:
-    """Runs a command line with the signals and exit codes above."""
+    """Runs a command line with the signals and exit codes that the module describes."""
     try:
-        # All is written when it ends: a signal then comes too late to stop anything, and must not change its exit code.
+        # At the end everything is written. A late signal can stop nothing and must not change the exit code.
         with handled(after=signal.SIG_IGN):
             command()
     except KeyboardInterrupt:
@@ -107,7 +149,7 @@ def _root(
 ) -> None:
     """Compressed precomputed lighting on NVIDIA Warp kernels.
 
-    Begin with wlm inspect PATH: it says what a file or a folder holds, and which command takes it.
+    Start with wlm inspect PATH: it says what a file or folder contains and which command reads it.
     """
 
 

@@ -23,7 +23,7 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEveryIfKept,
     Device,
-    Engine,
+    EngineOrRaw,
     ExactShader,
     PageFile,
     ReportFile,
@@ -302,7 +302,7 @@ def decode(
 def export(
     folder: _Folder,
     output: Annotated[Path, output_option("OUT", "The folder to write to.")],
-    engine: Engine = "raw",
+    engine: EngineOrRaw = "raw",
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`wlm bake`: make lightmaps, probes and six-way lightmaps of a scene."""
+"""`wlm bake`: makes lightmaps, probes and six-way lightmaps of a scene by path tracing."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,10 +9,12 @@ from wlm.cli.console import check_output, exclusive, note, note_start, quiet_war
 from wlm.cli.options import Device, Resume, Trust, output_option
 
 app = typer.Typer(
-    help="Make inputs: lightmaps and probes by Mitsuba (extra `bake`), six-way lightmaps by path tracing."
+    help="Make inputs by path tracing: lightmaps and probes with Mitsuba (extra `bake`), six-way lightmaps without."
 )
 
-_Scene = Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="A glTF file, its lights by hour, and how finely.")]
+_Scene = Annotated[
+    Path, typer.Argument(metavar="SCENE.yaml", help="Names a glTF file, its lights by hour, and the resolution.")
+]
 
 
 @app.command()
@@ -21,15 +23,16 @@ def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "The folder of the set.")],
     directional: Annotated[
-        bool, typer.Option("--directional", help="Bake where the light comes from, too: a layer as Unity's comp_dir.")
+        bool,
+        typer.Option("--directional", help="Also bake the main direction of the light, a layer like Unity's comp_dir."),
     ] = False,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
-    """Bake a lightmap at each hour into a set that wlm lightmap compress takes.
+    """Bake a lightmap for each hour into a set for wlm compress.
 
-    Finished hours are kept in DIR.partial; the same command with --resume goes on with the next one.
+    Finished hours are kept in DIR.partial; repeat the command with --resume to continue with the next hour.
     """
     quiet_warp()
     from wlm.bake.lightmaps import bake_lightmaps, check_folder, write_lightmaps
@@ -38,18 +41,18 @@ def lightmaps(
     check_folder(output)
     task = open_task(scene, trust, directional)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
-    note_start(checkpoint, resume, "anew")
+    note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
         baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "mean", "largest", "noise"])
+    rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
     for hour, light, error in zip(baked.hours, baked.light, baked.error, strict=True):
         seen = light[baked.mask].astype("float32")
         rows.add_row(f"{hour:g}", f"{seen.mean():.4g}", f"{seen.max():.4g}", f"{error:.2%}")
     show(rows)
     height, width = baked.mask.shape
-    note(f"{len(files)} files; {width}x{height} texels, {baked.mask.mean():.0%} of them in charts")
+    note(f"{len(files)} files of {width}x{height} texels, {baked.mask.mean():.0%} of them in charts")
 
 
 @app.command()
@@ -61,9 +64,9 @@ def probes(
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
-    """Bake SH probes at each hour into a file that wlm probe compress takes.
+    """Bake SH probes for each hour into a file for wlm compress.
 
-    Finished hours are kept in OUT.npz.partial; the same command with --resume goes on with the next one.
+    Finished hours are kept in OUT.npz.partial; repeat the command with --resume to continue with the next hour.
     """
     check_output(output, ".npz")
     quiet_warp()
@@ -72,12 +75,12 @@ def probes(
 
     task = open_task(scene, trust)
     checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
-    note_start(checkpoint, resume, "anew")
+    note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
         baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "probes", "lit", "mean L00", "noise"])
+    rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])
     for hour, values, error in zip(baked.hours, baked.values, noise_share(baked), strict=True):
         lit = values.any(axis=(1, 2))
         mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"
@@ -88,15 +91,17 @@ def probes(
 @app.command()
 @exclusive
 def sixway(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="Smoke, the camera, and how finely.")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE.yaml", help="Names the smoke, the camera, and the number of samples.")
+    ],
     output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
-    """Bake six-way lightmaps with light of all orders of scattering, by path tracing; needs no extra.
+    """Bake six-way lightmaps with all orders of scattering by path tracing; needs no extra.
 
-    wlm smoke bake makes them of light that is scattered once, without noise.
+    wlm smoke bake makes lightmaps of single scattering without noise.
     """
     quiet_warp()
     from wlm.bake.sixway import bake_sixway, load_sixway
@@ -114,4 +119,4 @@ def sixway(
     run = settings.model_dump(mode="json")
     write_lightmaps(frames, settings.camera, output, make, run, resume=resume)
     if errors:
-        note(f"noise: at most {max(errors):.2%} of the light, RMS, in a frame")
+        note(f"noise: RMS of at most {max(errors):.2%} of the light in a frame")

@@ -1,4 +1,4 @@
-"""`wlm compare`: two models of one input beside each other."""
+"""`wlm compare`: compares two compressed files of the same input."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,21 +6,18 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
-from wlm.cli.options import Device, PageFile
+from wlm.cli.options import Device, Key, Original, PageFile
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="A", help="A .wlm, or a folder of wlm atlas compress.")],
-    second: Annotated[Path, typer.Argument(metavar="B", help="Another of the same input.")],
-    original: Annotated[
-        Path | None,
-        typer.Option(metavar="PATH", help="What was compressed, for scores: a set, a probe file or a lightmap."),
-    ] = None,
-    key: Annotated[str | None, typer.Option(help="Which of the original's arrays of probes.")] = None,
+    first: Annotated[Path, typer.Argument(metavar="A.wlm", help="A compressed file.")],
+    second: Annotated[Path, typer.Argument(metavar="B.wlm", help="Another compressed file of the same input.")],
+    original: Original = None,
+    key: Key = None,
     html_path: PageFile = None,
     device: Device = "cpu",
 ) -> None:
-    """Compare two models of one input: bytes by part, settings that differ, scores, and how far apart they decode."""
+    """Compare two compressed files of the same input: sizes, settings, scores, and the difference of their light."""
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()

@@ -1,4 +1,4 @@
-"""What the commands share: tables, notes, and progress."""
+"""Output of the commands: tables, notes, progress, and checks of output files."""
 
 import functools
 import json
@@ -7,7 +7,7 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,39 +32,42 @@ __all__ = [
     "exclusive",
     "note",
     "note_start",
+    "note_warnings",
     "number",
     "progress_bar",
     "quiet_warp",
     "running",
     "show",
+    "show_facts",
     "show_figures",
+    "show_files",
     "show_json",
     "show_text",
     "table",
     "write_json",
 ]
 
-_PLAIN_WIDTH = 10_000  # characters: no cell of a table that goes to a file or a pipe wraps, names of files stay whole
-_PLAIN_REPORTS = 10  # lines of progress that a log gets in all
+_PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
+_PLAIN_REPORTS = 10  # lines of progress in a log
 _STDERR = 2
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 def _console(stderr: bool = False) -> Console:
-    # Made at each use: it binds the stream that is there now, which a test or a caller may have replaced.
+    # A new object at each use binds the current stream, which a test or a caller may have replaced.
     console = Console(stderr=stderr, highlight=False)
     return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_PLAIN_WIDTH)
 
 
 class _Table(Table):
-    """A table whose cells can't obey a terminal: names come from files."""
+    """A table that replaces control characters in its cells, because names come from files."""
 
     def add_row(self, *cells: Any, **options: Any) -> None:
         super().add_row(*(printable(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
 
 def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table:
-    """Starts a table: the first column and those named in `text` hold text, the others numbers."""
+    """Starts a table. The first column and those named in `text` are aligned as text, the others as numbers."""
     rows = _Table(title=title, header_style="bold")
     for i, heading in enumerate(columns):
         rows.add_column(heading, justify="right" if i and heading not in text else "left", overflow="fold")
@@ -72,8 +75,8 @@ def table(title: str, columns: Sequence[str], text: Sequence[str] = ()) -> Table
 
 
 def show(content: Table) -> None:
-    """Prints a table to stdout, its title in a line above it, which wraps at no width but the terminal's."""
-    # Rich would wrap it at the width of the columns.
+    """Prints a table to stdout with its title in a line above it."""
+    # Rich would wrap the title at the width of the columns.
     title, content.title = content.title, None
     _console().print(printable(str(title)), style="bold", markup=False, soft_wrap=True)
     _console().print(content)
@@ -82,11 +85,11 @@ def show(content: Table) -> None:
 def show_figures(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]], text: Sequence[str] = ()
 ) -> None:
-    """Prints a table of words and figures, which are whole numbers in full, others to four digits.
+    """Prints a table of words and numbers.
 
     Args:
-        title, columns, text: As for `table`.
-        rows: A cell for each column.
+        title, columns, text: Arguments of `table`.
+        rows: A cell for each column. Integers are written in full, floats with four digits.
     """
     content = table(title, columns, text)
     for row in rows:
@@ -94,35 +97,74 @@ def show_figures(
     show(content)
 
 
-def _figure(value: str | float) -> str:
-    if isinstance(value, str):
-        return value
-    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+def _figure(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float) or value is None:
+        return number(value, ".4g")
+    return ", ".join(map(_figure, value)) if isinstance(value, list | tuple) else escape(str(value))
+
+
+def show_facts(title: str, facts: Mapping[str, Any]) -> None:
+    """Prints facts as a table of two columns.
+
+    Args:
+        title: Title of the table.
+        facts: JSON values by name; underscores in names become spaces. A mapping becomes a section of the table, with
+            the names of its entries behind its own.
+    """
+    rows = table(title, ["", "value"])
+    for name, value in facts.items():
+        label = escape(name.replace("_", " "))
+        if isinstance(value, Mapping):
+            rows.add_section()
+            for key, each in value.items():
+                rows.add_row(f"{label}: {escape(str(key))}", _figure(each))
+        else:
+            rows.add_row(label, _figure(value))
+    show(rows)
+
+
+def show_files(title: Path, paths: Iterable[Path]) -> None:
+    """Prints a table of written files, by their paths in the folder `title` where they are inside it."""
+    rows = table(str(title), ["file", "bytes"])
+    for path in paths:
+        shown = path.relative_to(title) if path.is_relative_to(title) else path
+        rows.add_row(escape(str(shown)), f"{path.stat().st_size:,}")
+    show(rows)
 
 
 def note(text: str) -> None:
-    """Prints a line to stderr, as it is: paths may hold what rich takes for markup."""
+    """Prints a line to stderr without interpreting markup, which may occur in paths."""
     _console(stderr=True).print(printable(text), markup=False, soft_wrap=True)
 
 
+def note_warnings(warnings: Iterable[str]) -> None:
+    """Prints warnings to stderr, a line each."""
+    for warning in warnings:
+        note(f"warning: {warning}")
+
+
 def note_start(checkpoint: "Checkpoint", resume: bool, start: str) -> None:
-    """Says where work begins, at `start`, that was to be resumed and of which nothing is kept."""
+    """Notes that work which was to be resumed has no checkpoint and begins at `start`."""
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting {start}")
 
 
 def show_text(text: str) -> None:
-    """Prints lines to stdout as they are, uncoloured, but for what a terminal would obey, and ends the last."""
+    """Prints lines to stdout without colours and without control characters."""
     sys.stdout.write("\n".join(map(printable, text.removesuffix("\n").split("\n"))) + "\n")
 
 
 def number(value: float | None, form: str) -> str:
-    """Formats a number; a dash where there is none (None or NaN)."""
+    """Formats a number; None and NaN become a dash."""
     return "–" if value is None or value != value else format(value, form)
 
 
 def show_json(value: Any) -> None:
-    """Prints JSON to stdout, unwrapped and uncoloured."""
+    """Prints JSON to stdout without wrapping and colours."""
     _console().out(json.dumps(value, indent=1, allow_nan=False), highlight=False)
 
 
@@ -138,14 +180,14 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def check_output(path: Path, *suffixes: str) -> None:
-    """Checks, before long work, that a file can be written at its end.
+    """Checks before long work that its output file can be written.
 
     Args:
         path: The file.
-        suffixes: What its name may end in: a slip between input and output must not replace an input.
+        suffixes: Allowed suffixes of the name, so that an input given as the output is not overwritten.
 
     Raises:
-        WlmError: The name ends otherwise, the folder is missing or read-only, or something else is in its place.
+        WlmError: The name has another suffix, the folder is missing or read-only, or the path is no regular file.
     """
     if path.suffix.lower() not in suffixes:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
@@ -159,10 +201,10 @@ def check_output(path: Path, *suffixes: str) -> None:
 
 
 def exclusive(command: Callable[..., None]) -> Callable[..., None]:
-    """Keeps other processes from writing a command's `output` while it runs, and removes what killed ones left of it.
+    """Locks the `output` of a command while it runs, and removes temporary files that killed processes left there.
 
     Raises:
-        WlmError: Another process is writing it.
+        WlmError: Another process is writing that output.
     """
 
     @functools.wraps(command)
@@ -174,14 +216,15 @@ def exclusive(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def quiet_warp() -> None:
-    """Starts Warp without its banner, its notes on compiling, and its line on a missing GPU driver.
+    """Starts Warp without its banner, its notes on compilation, and its line about a missing GPU driver.
 
-    That the driver is missing is no news to who computes on the CPU, and `--device cuda` has an error of its own.
+    The missing driver does not matter on the CPU, and `--device cuda` has an error of its own. One line says that
+    kernels will be compiled if Warp's cache is empty.
     """
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    # Its C library writes to the process's stderr, past any setting.
+    # Warp's C library writes to the stderr of the process, whatever the settings are.
     with tempfile.TemporaryFile() as sink:
         sys.stderr.flush()
         saved = os.dup(_STDERR)
@@ -195,22 +238,25 @@ def quiet_warp() -> None:
                 if _MISSING_DRIVER not in line:
                     os.write(saved, line)
             os.close(saved)
+    cache = Path(wp.config.kernel_cache_dir)
+    if not (cache.is_dir() and any(cache.iterdir())):
+        note("compiling kernels (first run; cached afterwards)")
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """Shows progress on stderr: a bar on a terminal, else a plain line about every tenth of the work.
 
-    Of work without a known number of steps there is one line, at its beginning.
+    Work without a known number of steps gets one line at its beginning.
 
     Args:
-        what: The work, in a word or two.
+        what: Name of the work in a word or two.
 
     Yields:
-        A function to call with what is done, what there is in all, and a text to show with it.
+        A function to call with the finished steps, the total, and a text to show with them.
     """
     console = _console(stderr=True)
-    start = time.perf_counter()
+    clock = _Clock()
     if not console.is_terminal:
         reported = 0
 
@@ -221,7 +267,9 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
             if (part := done * _PLAIN_REPORTS // max(total, 1)) > reported:
                 reported = part
                 count = f"{done} of {total}" if total else f"{done}"
-                note(", ".join(filter(None, (f"{what}: {count}", text, _left(start, done, total)))))
+                note(", ".join(filter(None, (f"{what}: {count}", text, clock.left(done, total)))))
+            else:
+                clock.left(done, total)
 
         yield line
         return
@@ -235,7 +283,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
         task = bar.add_task(what, total=None, note="")
 
         def update(done: int, total: int, text: str) -> None:
-            fields = ", ".join(filter(None, (text, _left(start, done, total))))
+            fields = ", ".join(filter(None, (text, clock.left(done, total))))
             bar.update(task, completed=done, total=total or None, note=fields)
 
         yield update
@@ -245,20 +293,19 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 def running(
     what: str, checkpoint: Path | None = None, unit: str = "step", *, whole: bool = True
 ) -> "Iterator[OnProgress]":
-    """Shows the progress of long work and, where it has a checkpoint, lets a signal stop it between two steps.
+    """Shows the progress of long work and, if it has a checkpoint, lets a signal stop it between two steps.
 
-    What has to be whole once the work is done, its output above all, is written inside the block too.
-
-    Each stage that isn't `what` has a bar of its own, named `what: stage`.
+    The output of the work must be written inside the block, so that a signal cannot interrupt it. Each stage with
+    another name than `what` has a bar of its own, named `what: stage`.
 
     Args:
-        what: The work, in a word or two.
+        what: Name of the work in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
-        unit: What the work's progress counts.
-        whole: Whether a signal waits for the end of a step; what is written at the end of each can do without.
+        unit: Name of a step.
+        whole: Whether a signal waits for the end of a step; unnecessary for steps that write their own results.
 
     Yields:
-        A callback for the work. Once it has been called and a signal stopped the work, a line says how to go on.
+        A callback for the work. If a signal stops the work after the first call, a line says how to continue.
     """
     last: Any = None
     hold = checkpoint is not None and whole
@@ -286,20 +333,31 @@ def running(
                 place = ""
                 if last is not None:
                     place = f" at {unit} {last.done}" if last.stage in (what, f"{unit}s") else f" in {last.stage}"
-                note(f"stopped{place}: the same command with --resume goes on from {checkpoint}")
+                note(f"stopped{place}: repeat the command with --resume to continue from {checkpoint}")
             raise
 
 
 def _named_figure(name: str, value: float) -> str:
-    """`PSNR dB` of 41.2 is written "PSNR 41.2 dB"."""
+    """Writes the figure `PSNR dB` of 41.2 as "PSNR 41.2 dB"."""
     label, _, unit = name.partition(" ")
     return " ".join(filter(None, (label, number(value, ".4g"), unit)))
 
 
-def _left(start: float, done: int, total: int) -> str:
-    """Writes the time left, if the rest goes as the work so far did; nothing where the total is unknown."""
-    if done <= 0 or not total:
-        return ""
-    seconds = round((time.perf_counter() - start) * (total - done) / done)
-    minutes, seconds = divmod(seconds, 60)
-    return f"{minutes}:{seconds:02d} left"
+class _Clock:
+    """Estimates the time left from the pace since the first finished step, which may have compiled kernels."""
+
+    def __init__(self) -> None:
+        self._first: tuple[int, float] | None = None
+
+    def left(self, done: int, total: int) -> str:
+        """Writes the time left; an empty text at the first finished step, or if the total is unknown."""
+        if done <= 0 or not total:
+            return ""
+        now = time.perf_counter()
+        if self._first is None:
+            self._first = done, now
+        steps, start = done - self._first[0], self._first[1]
+        if steps <= 0:
+            return ""
+        minutes, seconds = divmod(round((now - start) * (total - done) / steps), 60)
+        return f"{minutes}:{seconds:02d} left"

@@ -1,4 +1,4 @@
-"""`wlm doctor`: what this installation has and what it lacks."""
+"""`wlm doctor`: shows devices, libraries, and installed and missing extras."""
 
 import platform
 import re
@@ -38,12 +38,12 @@ def doctor() -> None:
     cache = Path(wp.config.kernel_cache_dir)
     size = sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
     rows.add_row("kernel cache", escape(str(cache)))
-    rows.add_row("its size", f"{size / 1e6:.1f} MB")
+    rows.add_row("size of the cache", f"{size / 1e6:.1f} MB")
     show(rows)
 
 
 def _extras() -> dict[str, list[str]]:
-    """The extras that the package states, each with the packages of it that are not installed."""
+    """Returns the extras of the package, each with those of its packages that are not installed."""
     try:
         requirements = metadata.requires("wlm") or []
     except metadata.PackageNotFoundError:

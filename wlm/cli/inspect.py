@@ -1,4 +1,4 @@
-"""`wlm inspect`: what a file or a folder holds, and which command takes it."""
+"""`wlm inspect`: describes a file or a folder and names the command that reads it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +12,9 @@ from wlm.cli.options import AsJson
 def inspect(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Any file or folder.")], as_json: AsJson = False
 ) -> None:
-    """Say what a file or a folder holds, which command takes it, and what looks wrong with it.
+    """Describe a file or a folder: its content, the command that reads it, and possible problems.
 
-    Nothing is written, and what can't be read is said to be so: the exit status is 0 wherever there is such a path.
+    Nothing is written. Unreadable files are reported like others, and the exit status is 0 if the path exists.
     """
     quiet_warp()
     from wlm.inspection import inspect

@@ -1,26 +1,26 @@
-"""`wlm lightmap`: compress a set of lightmaps over time, decode it, score it, describe it, export it."""
+"""The verbs for lightmaps over time: compress, evaluate, decode, export, info."""
 
-import time as clock
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from wlm.cli import models
 from wlm.cli.console import (
     check_output,
     escape,
     exclusive,
     note,
-    note_start,
+    note_warnings,
     number,
     quiet_warp,
     running,
     show,
-    show_json,
+    show_facts,
     table,
     write_json,
 )
-from wlm.cli.lightmap_tables import kinds_of, show_report, show_tiles
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
@@ -29,132 +29,169 @@ from wlm.cli.options import (
     ExactShader,
     ModelFile,
     PageFile,
+    Profile,
     ReportFile,
     Resume,
     Seed,
     ShaderLanguage,
     Trust,
     output_option,
-    shader_of,
 )
+from wlm.cli.settings import with_settings
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.lightmap import LightmapModel, LightmapSet
-
-app = typer.Typer(help="Lightmaps over time: BC7 feature maps and a tiny network for each 128² tile.")
+    from wlm.lightmap import LightmapModel, LightmapSet, Report
+    from wlm.lightmap.evaluation import SheetReport
+    from wlm.lightmap.model import SheetModel
 
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET",
-        help="A set.json, or a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or of Unity's states of light.",
+        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity's states."
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, by commas.")
+    str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, separated by commas.")
 ]
-_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as the set says.')]
-_Period = Annotated[float | None, typer.Option(help="Length of the day; default as the set says.")]
-_Layers = Annotated[str | None, typer.Option(metavar="NAMES", help="Layers to read, separated by commas; default all.")]
+_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default that of the set.')]
+_Period = Annotated[float | None, typer.Option(help="Length of the day; default that of the set.")]
+_Layers = Annotated[
+    str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
+]
+
+# Columns of the scores of a sheet: heading, attribute, format, factor.
+_SCORES = (
+    ("PSNR, dB", "psnr", ".2f", 1.0),
+    ("SSIM", "ssim", ".4f", 1.0),
+    ("FLIP", "flip", ".4f", 1.0),
+)
+_SHOWN = (
+    ("filtered reads, dB", "seen", ".2f", 1.0),
+    ("texels beside charts, dB", "ring", ".2f", 1.0),
+    ("between stored times, dB", "between", ".2f", 1.0),
+    ("error at tile borders relative to inside", "border", ".2f", 1.0),
+    ("flicker, %", "flicker", ".3f", 100.0),
+    ("views, dB", "view_psnr", ".2f", 1.0),
+    ("views, FLIP", "view_flip", ".4f", 1.0),
+)
 
 
-@app.command()
+@with_settings("wlm.lightmap:Profile")
 @exclusive
 def compress(
     set_path: _Set,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[str, typer.Option(help="L, M, H, standard, fine, frames, or a YAML file of settings.")] = "M",
-    tiles: Annotated[str | None, typer.Option(help="Only these tiles, such as 0-3,7; default all.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps of the fit; default as the profile says.")] = None,
-    samples: Annotated[int | None, typer.Option(help="Samples of each tile in a step; a multiple of 128.")] = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
+    settings: dict[str, Any],
+    profile: Profile = "M",
+    times: _Times = None,
+    mask: _Mask = None,
+    period: _Period = None,
+    layers: _Layers = None,
     workers: Annotated[
         int | None,
         typer.Option(
             min=1,
             metavar="N",
-            help="Processes that fit tiles side by side; the file is the same. Default: one for two cores, one on a "
-            "GPU, as many as a cluster has room for; with cuda N are spread over the GPUs.",
+            help="Processes that fit tiles in parallel, with the same result; default one for two cores, one on a GPU.",
         ),
     ] = None,
     cluster: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help='Fit on a cluster of Ray (extra `cluster`): ray://HOST:10001, or "auto" on one of its machines.',
-        ),
+        typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
     ] = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
+    trust: Trust = False,
+) -> None:
+    """Compress lightmaps over time into one file.
+
+    The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
+    continue exactly. Lightmaps of more than 1 GiB are kept in a temporary file (TMPDIR) during the fit.
+    """
+    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
+    options |= {"workers": workers, "cluster": cluster}
+    data, model, facts = models.fit(
+        "lightmap", lambda: _load(set_path, times, mask, period, layers, trust), output, profile, settings, **options
+    )
+    from wlm.lightmap.evaluation import lost_light
+
+    show_facts(model.name, facts | _facts(model))
+    _show_sheets(model)
+    # The device of a cluster is not on this machine.
+    note_warnings((*model.warnings, *lost_light(model, data, "cpu" if cluster is not None else device)))
+
+
+def evaluate(
+    file: ModelFile,
+    set_path: _Set,
+    json_path: ReportFile = None,
+    html_path: PageFile = None,
+    views: Annotated[
+        int, typer.Option(min=0, help="Number of rendered views of the set's mesh to score, if it names one.")
+    ] = 50,
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
     layers: _Layers = None,
+    device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
-    """Compress a lightmap set into one file.
+    """Compare compressed lightmaps with the originals: PSNR, SSIM and FLIP by tile and time, and bits per texel.
 
-    Long fits are saved to OUT.wlm.partial every 30 s, and on Ctrl-C and SIGTERM; the same command with --resume
-    continues exactly. Lightmaps beyond 1 GiB lie in a temporary file (TMPDIR) while it runs.
+    The error is also measured where light is shown: filtered, beside charts, between stored times, across tiles, over
+    time, and in views of the set's mesh.
     """
-    check_output(output, ".wlm")
+    if json_path is not None:
+        check_output(json_path, ".json")
+    if html_path is not None:
+        check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.lightmap import Profile, open_checkpoint
-    from wlm.lightmap import compress as fit
-    from wlm.lightmap.evaluation import lost_light
-    from wlm.lightmap.tiles import TileGrid, parse_tiles
+    from wlm.lightmap import evaluate
+    from wlm.system import load
 
-    settings = Profile.load(profile).override({"steps": steps, "samples": samples}, "--")
-    # The machines of a cluster have their own devices.
-    own_device = "cpu" if cluster is not None else check_device(device)
-    lightmaps = _load(set_path, times, mask, period, trust, layers)
-    numbers = None if tiles is None else parse_tiles(tiles, TileGrid.of(*lightmaps.light.mask.shape).count)
-    options = {"seed": seed, "device": device, "tiles": numbers}
-    checkpoint = open_checkpoint(output, lightmaps, settings, resume=resume, every=checkpoint_every, **options)
-    note_start(checkpoint, resume, "at step 0")
-    start = clock.perf_counter()
-    places = {"workers": workers, "cluster": cluster}
-    with running("fit", checkpoint.path) as progress:
-        model = fit(lightmaps, settings, progress=progress, checkpoint=checkpoint, **places, **options)
-        seconds = clock.perf_counter() - start
-        size = model.save(output)
-        checkpoint.remove()
-    rows = table(model.name, ["file", "bytes on disk", "bytes of GPU memory", "seconds", "tiles"], text=["tiles"])
-    memory = f"{model.memory_bytes:,}"
-    rows.add_row(escape(str(output)), f"{size:,}", memory, f"{seconds:.1f}", kinds_of(model))
-    show(rows)
-    for warning in (*model.warnings, *lost_light(model, lightmaps, own_device)):
-        note(f"warning: {warning}")
+    device = check_device(device)
+    model = load(file, "lightmap")
+    lightmaps = _load(set_path, times, mask, period, layers, trust)
+    note_warnings(lightmaps.warnings)
+    with running("score") as progress:
+        size = file.stat().st_size
+        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
+    if html_path is not None:
+        from wlm.view.reports import lightmap_report
+
+        lightmap_report(html_path, model, lightmaps, report)
+    if json_path is not None:
+        write_json(json_path, report.to_json())
+    _show_report(file, report)
 
 
-@app.command()
 def decode(
     file: ModelFile,
-    time: Annotated[float, typer.Option(help="In the unit of the set's times; any, also between stored ones.")],
+    time: Annotated[float, typer.Option(help="Time in the unit of the set, stored or between stored times.")],
     output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
+    texture: Annotated[
+        Path | None,
+        typer.Option(metavar="MAP.dds", help="Also write the texture of the runtime: RGB9E5 texels with mips."),
+    ] = None,
     eight_bit: Annotated[
         Path | None,
         typer.Option(
             metavar="FRAME.png",
-            help="Also write 8 bits as a texture cache holds them: radiance = (byte / 255 * bound) ** gamma, with "
-            "gamma and the bound of each tile in the PNG's text.",
+            help="Also write 8 bits for a texture cache: radiance = (byte / 255 * bound) ** gamma, with gamma and the "
+            "bound of each tile in the text of the PNG.",
         ),
     ] = None,
-    texture: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="MAP.dds",
-            help="Also write the texture that a renderer samples: RGB9E5 texels, 32 bits each, with mips.",
-        ),
+    layer: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first of radiance.")
     ] = None,
-    layer: Annotated[str | None, typer.Option(metavar="NAME", help="Layer; default the first of light.")] = None,
-    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas; default the first.")] = None,
+    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas to decode; default the first.")] = None,
     device: Device = "cpu",
 ) -> None:
-    """Decode a whole map at one time."""
+    """Decode a whole lightmap at one time."""
     check_output(output, ".exr")
     if texture is not None:
         check_output(texture, ".dds")
@@ -166,11 +203,14 @@ def decode(
     from wlm.formats.channels import read_channels
     from wlm.formats.exr import HALF_MAX, write_part
     from wlm.lightmap.runtime_texture import write_8bit, write_texture
+    from wlm.system import load
 
-    model = _model(file)
+    model = load(file, "lightmap")
     sheets = model.layer(layer, atlas)
     if (eight_bit or texture) and len(sheets) > 1:
-        raise WlmError(f"--eight-bit: expected a layer of at most three channels, found {sheets[0].layer} of more")
+        raise WlmError(
+            f"--eight-bit, --texture: expected a layer of at most three channels, {sheets[0].layer} has more"
+        )
     if texture is not None and sheets[0].linear:
         raise WlmError(f"--texture: expected a layer of light, found {sheets[0].layer}")
     decoder = model.decoder(device)
@@ -183,166 +223,151 @@ def decode(
         write_8bit(eight_bit, decoder.sheets[sheets[0]], time, sheets[0].values)
     if texture is not None:
         write_texture(texture, model.sheets[sheets[0]], time, device)
-    if len(model.sheets) > 1:
-        note(f"layer {sheets[0].layer} of atlas {sheets[0].atlas}, {sheets[0].encoding}: {', '.join(names)}")
-    rows = table(str(file), ["time", "size", "mean", "largest", "file"])
-    size, mean, largest = f"{frame.shape[1]}x{frame.shape[0]}", f"{frame.mean():.4g}", f"{frame.max():.4g}"
-    rows.add_row(f"{time:g}", size, mean, largest, escape(str(output)))
-    show(rows)
+    facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
+    facts |= {"size": f"{frame.shape[1]}x{frame.shape[0]}", "mean": float(frame.mean()), "largest": float(frame.max())}
+    show_facts(str(file), facts)
 
 
-@app.command()
-def evaluate(
-    file: ModelFile,
-    set_path: _Set,
-    json_path: ReportFile = None,
-    html_path: PageFile = None,
-    views: Annotated[
-        int, typer.Option(min=0, help="Views of the set's mesh, if it names one, that are scored; 0 for none.")
-    ] = 50,
-    device: Device = "cpu",
-    times: _Times = None,
-    mask: _Mask = None,
-    period: _Period = None,
-    layers: _Layers = None,
-    trust: Trust = False,
-) -> None:
-    """Compare a file with its input: PSNR, SSIM and FLIP by tile and by time, and the error where light is shown.
-
-    That is filtered, in the gaps beside charts, between stored times, across tiles, over time, in views of the set's
-    mesh.
-    """
-    if json_path is not None:
-        check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
-    quiet_warp()
-    from wlm.interop import check_device
-    from wlm.lightmap import evaluate as score
-
-    device = check_device(device)
-    model = _model(file)
-    lightmaps = _load(set_path, times, mask, period, trust, layers)
-    with running("score") as progress:
-        size = file.stat().st_size
-        report = score(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
-    if html_path is not None:
-        from wlm.view.reports import lightmap_report
-
-        lightmap_report(html_path, model, lightmaps, report)
-    if json_path is not None:
-        write_json(json_path, report.to_json())
-    show_report(file, report)
-
-
-@app.command()
-def info(
-    file: ModelFile,
-    tiles: Annotated[bool, typer.Option("--tiles", help="List each tile: its kind, its bytes, and why.")] = False,
-    as_json: AsJson = False,
-    device: Annotated[str, typer.Option(help="Device to load it to, to show the memory of its maps.")] = "cpu",
-) -> None:
-    """Describe a file without decoding it."""
-    quiet_warp()
-    from wlm.lightmap.codec import part_bytes, sheet_bytes
-    from wlm.lightmap.evaluation import count_kinds
-    from wlm.lightmap.tile_report import report_tiles
-
-    model = _model(file)
-    decoder, size, sizes = model.decoder(device), file.stat().st_size, sheet_bytes(model)
-    sheets = []
-    for sheet, own in model.sheets.items():
-        facts = vars(sheet) | {"width": own.width, "height": own.height, "bytes": sizes[sheet]}
-        facts |= {"tiles": count_kinds(own)}
-        sheets.append(facts | ({"each_tile": [vars(tile) for tile in report_tiles(own)]} if tiles else {}))
-    facts: dict[str, Any] = {
-        "name": model.name,
-        "bytes": size,
-        "memory_bytes": model.memory_bytes,
-        "times": model.times.tolist(),
-        "period": model.period,
-        "source": model.source,
-        "parts": part_bytes(model, size),
-        "device": decoder.device,
-        "device_bytes": decoder.device_bytes,
-        "profile": model.profile.model_dump(mode="json"),
-        "sheets": sheets,
-    }
-    if as_json:
-        show_json(facts)
-        return
-    sections = (
-        {
-            "name": escape(model.name),
-            "bytes on disk": f"{size:,}",
-            "bytes of GPU memory": f"{model.memory_bytes:,}",
-            "times": f"{len(model.times)}, {model.times[0]:g} to {model.times[-1]:g}",
-            "period": number(model.period, "g"),
-            "source": escape(model.source),
-            "profile": escape(model.profile.name),
-        },
-        {f"bytes of {part}": f"{count:,}" for part, count in facts["parts"].items()},
-        {f"bytes on {decoder.device}": f"{decoder.device_bytes:,}"},
-    )
-    rows = table(str(file), ["", "value"])
-    for section in sections:
-        for row in section.items():
-            rows.add_row(*row)
-        rows.add_section()
-    show(rows)
-    rows = table("sheets", ["", "encoding", "size", "bytes", "tiles"], text=["encoding", "tiles"])
-    for sheet, own in model.sheets.items():
-        counts = ", ".join(f"{count} {kind}" for kind, count in count_kinds(own).items() if count)
-        rows.add_row(escape(sheet.label), sheet.encoding, f"{own.width}x{own.height}", f"{sizes[sheet]:,}", counts)
-    show(rows)
-    for own in model.sheets.values() if tiles else ():
-        show_tiles(report_tiles(own))
-
-
-@app.command()
 def export(
     file: ModelFile,
     output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: Engine = "raw",
+    engine: Engine = None,
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
-    device: Annotated[str, typer.Option(help="Device that decodes the reference frame.")] = "cpu",
+    device: Device = "cpu",
 ) -> None:
-    """Write the light for an engine: textures, buffers and a shader, and for a named engine the parts that use them."""
-    language = shader_of(engine, shader, exact)
-    if engine != "raw" and device != "cpu":
-        raise WlmError(f"--device: means nothing with --engine {engine}, for which no frame is decoded")
-    quiet_warp()
-    from wlm.export import export
-
-    model = _model(file)
-    rows = table(str(output), ["file", "bytes"])
-    options = {"shader": language, "exact": exact, "device": device} if engine == "raw" else {}
-    paths = export(model, output, None if engine == "raw" else engine, **options)
-    left = [sheet.label for sheet in model.sheets if sheet.linear] if engine != "raw" else []
-    if left:
-        note(f"warning: left out, since --engine {engine} only shows light: {', '.join(left)}")
-    for path in paths:
-        rows.add_row(escape(str(path.relative_to(output))), f"{path.stat().st_size:,}")
-    show(rows)
+    """Write lightmaps for an engine: textures, buffers and a shader, or with --engine a kit that shows them."""
+    models.export(file, output, engine, shader, exact, device)
 
 
-def _model(file: Path) -> "LightmapModel":
-    """Reads a file of lightmaps."""
-    from wlm.system import load
+def info(
+    file: ModelFile,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="List each tile: its encoding, bytes, and the reason.")
+    ] = False,
+    as_json: AsJson = False,
+    device: Device = "cpu",
+) -> None:
+    """Show what a file of lightmaps contains, and its memory on a device."""
+    from wlm.lightmap.tile_report import report_tiles
 
-    return load(file, "lightmap")
+    def facts(model: "LightmapModel") -> dict[str, Any]:
+        if not as_json:
+            return _facts(model)
+        sheets = []
+        for sheet, own in model.sheets.items():
+            listed = {"each_tile": [vars(tile) for tile in report_tiles(own)]} if tiles else {}
+            sheets.append(vars(sheet) | _sheet(own) | listed)
+        return _facts(model) | {"times": model.times.tolist(), "sheets": sheets}
+
+    model = models.describe(file, device, as_json, facts)
+    if not as_json:
+        _show_sheets(model)
+        for sheet, own in model.sheets.items() if tiles else ():
+            columns = ["tile", "row", "column", "encoding", "texels", "bytes", "reason"]
+            rows = table(f"tiles of {sheet.label}", columns, text=["encoding", "reason"])
+            for tile in report_tiles(own):
+                cells = map(str, (tile.number, tile.row, tile.column))
+                rows.add_row(*cells, tile.kind, f"{tile.valid:,}", f"{tile.bytes:,}", escape(tile.why))
+            show(rows)
 
 
 def _load(
-    path: Path, times: str | None, mask: str | None, period: float | None, trust: bool, layers: str | None
+    path: Path, times: str | None, mask: str | None, period: float | None, layers: str | None, trust: bool
 ) -> "LightmapSet":
-    """Reads a set and prints its repairs."""
-    from wlm.lightmap.data import load, parse_times
+    from wlm.lightmap import load
+    from wlm.lightmap.data import parse_times
 
     stamps = None if times is None else parse_times(times)
     names = None if layers is None else [name.strip() for name in layers.split(",")]
-    lightmaps = load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names)
-    for warning in lightmaps.warnings:
-        note(f"warning: {warning}")
-    return lightmaps
+    return load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names)
+
+
+def _facts(model: "LightmapModel") -> dict[str, Any]:
+    stored = f"{len(model.times)}, {model.times[0]:g} to {model.times[-1]:g}"
+    return {"times": stored, "period": model.period, "GPU_bytes": model.memory_bytes}
+
+
+def _sheet(model: "SheetModel") -> dict[str, Any]:
+    from wlm.lightmap.evaluation import count_kinds
+
+    tiles = {kind: count for kind, count in count_kinds(model).items() if count}
+    return {"width": model.width, "height": model.height, "GPU_bytes": model.memory_bytes, "tiles": tiles}
+
+
+def _show_sheets(model: "LightmapModel") -> None:
+    from wlm.lightmap.codec import sheet_bytes
+
+    sizes = sheet_bytes(model)
+    columns = ["sheet", "values", "size", "bytes on disk", "GPU bytes", "tiles"]
+    rows = table("sheets", columns, text=["values", "tiles"])
+    for sheet, own in model.sheets.items():
+        facts = _sheet(own)
+        tiles = ", ".join(f"{count} {kind}" for kind, count in facts["tiles"].items())
+        size = f"{facts['width']}x{facts['height']}"
+        rows.add_row(escape(sheet.label), sheet.encoding, size, f"{sizes[sheet]:,}", f"{facts['GPU_bytes']:,}", tiles)
+    show(rows)
+
+
+def _show_report(file: Path, report: "Report") -> None:
+    columns = [heading for heading, *_ in _SCORES]
+    rows = table(str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"])
+    sheets = {escape(sheet.label): own for sheet, own in report.sheets.items()} if len(report.sheets) > 1 else {}
+    for name, own in {f"wlm {escape(report.profile)}": report, **sheets}.items():
+        sizes = (f"{own.bytes:,}", f"{own.bpp:.3f}", f"{own.memory_bpp:.3f}")
+        rows.add_row(name, *_cells(own, _SCORES), *sizes)
+    rows.add_section()
+    light = report.light
+    scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
+    for stamp, *values in zip(report.times, *scores, strict=True):
+        rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
+    rows.add_section()
+    for tile, values in enumerate(
+        zip(light.psnr_by_tile.ravel(), light.ssim_by_tile.ravel(), light.flip_by_tile.ravel(), strict=True)
+    ):
+        # Tiles that are empty or not in the file have no score.
+        if any(value == value for value in values):
+            rows.add_row(f"tile {tile}", *map(number, values, (".2f", ".4f", ".4f")))
+    show(rows)
+    _show_where_shown(report)
+    _note_worst(light)
+    note_warnings(report.warnings)
+
+
+def _cells(report: "Report | SheetReport", columns: Any) -> list[str]:
+    return [number(factor * getattr(report, name), form) for _, name, form, factor in columns]
+
+
+def _show_where_shown(report: "Report") -> None:
+    """Shows the scores of light where it is shown; columns without any score are left out."""
+    columns = [
+        column for column in _SHOWN if any(math.isfinite(getattr(own, column[1])) for own in report.sheets.values())
+    ]
+    if columns:
+        rows = table("PSNR and errors where light is shown", ["", *(heading for heading, *_ in columns)])
+        for sheet, own in report.sheets.items():
+            rows.add_row(escape(sheet.label), *_cells(own, columns))
+        show(rows)
+
+
+def _note_worst(report: "SheetReport") -> None:
+    """Notes the worst tiles, times and views, and the tiles without a score."""
+    if report.worst_tile is not None:
+        worst = report.worst_tile
+        note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    for what, worst in (("filtered read", report.worst_seen), ("between times", report.worst_between)):
+        if worst is not None:
+            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    if (worst := report.worst_seen_time) is not None:
+        note(f"worst time, mean of filtered reads: {worst['psnr']:.2f} dB at {worst['time']:g}")
+    if (worst := report.worst_seen_tile) is not None:
+        note(f"worst tile, mean of filtered reads: {worst['psnr']:.2f} dB, tile {worst['tile']}")
+    if (worst := report.worst_view) is not None:
+        place = f"camera {worst['view']} at {worst['time']:g}"
+        note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
+    reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
+    if reasons:
+        note(f"tiles times times without a score: {reasons}")
+    if report.format_limited:
+        psnr = number(report.psnr_unlimited, ".2f")
+        note(f"{len(report.format_limited)} scored tiles span few steps of half float; without them PSNR is {psnr} dB")

@@ -1,4 +1,4 @@
-"""Options that several commands have, each spelled out once."""
+"""Options that several commands have, each defined once."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -7,51 +7,65 @@ import typer
 
 from wlm.errors import WlmError
 
-Device = Annotated[str, typer.Option(help='Where it computes: "cpu", "cuda" or "cuda:N".')]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="One seed gives one result on one device.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run of the same output.")]
-_EVERY = typer.Option(
-    "--checkpoint-every",
-    min=0.0,
-    metavar="SECONDS",
-    show_default=False,
-    help="Between two saves of the running work, which --resume goes on from after a crash; default 30.",
-)
-CheckpointEvery = Annotated[float, _EVERY]
-CheckpointEveryIfKept = Annotated[float | None, _EVERY]  # of commands some of whose work isn't kept: None: not given
-ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write a report.")]
+Device = Annotated[str, typer.Option(help='Device that computes: "cpu", "cuda" or "cuda:N".')]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed; one seed gives one result on one device.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run with the same output.")]
+CheckpointEvery = Annotated[
+    float,
+    typer.Option(
+        "--checkpoint-every",
+        min=0.0,
+        metavar="SECONDS",
+        help="Time between two checkpoints, from which --resume continues after a crash.",
+    ),
+]
+ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write the report as JSON.")]
 PageFile = Annotated[
-    Path | None, typer.Option("--html", metavar="REPORT.html", help="Write a page with tables, plots and pictures.")
+    Path | None, typer.Option("--html", metavar="REPORT.html", help="Write an HTML page with tables, plots, pictures.")
 ]
 SceneFile = Annotated[
-    Path | None, typer.Option("--mesh", metavar="SCENE.glb", help="The scene of the light: .glb, .gltf or .obj.")
+    Path | None, typer.Option("--mesh", metavar="SCENE.glb", help="Mesh of the scene: .glb, .gltf or .obj.")
 ]
 Original = Annotated[
     Path | None,
-    typer.Option(metavar="PATH", help="What was compressed, to compare with: a set, a lightmap or a probe file."),
+    typer.Option(metavar="PATH", help="The uncompressed input to compare with: a set, a lightmap or a probe file."),
 ]
-Up = Annotated[Literal["y", "z"], typer.Option(help="The axis that points up in the scene.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Up = Annotated[Literal["y", "z"], typer.Option(help="Axis of the scene that points up.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="Trust the input's author: it may name files elsewhere, and be as large as it says."),
+    typer.Option("--trust", help="Trust the input: it may name files in other folders and have any size."),
 ]
+Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Profile, or a YAML file of settings.")]
 Engine = Annotated[
-    Literal["raw", "three", "godot", "unity", "unreal"],
-    typer.Option(help="Whose folder: raw is textures, floats and a shader for any."),
+    Literal["three", "godot", "unity", "unreal"] | None,
+    typer.Option(help="Write a kit for this engine. Default: textures, buffers and a shader for any program."),
 ]
 ShaderLanguage = Annotated[
     Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
-    typer.Option(help="Of raw, the shader's language; default glsl."),
+    typer.Option(help="Language of the shader without --engine; default glsl."),
 ]
 ExactShader = Annotated[
-    bool, typer.Option("--exact", help="Of raw, the shader mixes texels in floats rather than by the filter unit.")
+    bool, typer.Option("--exact", help="Without --engine: the shader interpolates in floats, not by the texture unit.")
 ]
-ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
+ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="Compressed file that wlm compress wrote.")]
+Key = Annotated[str | None, typer.Option(help="Array of a probe file that has several, such as an hour.")]
+
+
+def output_option(metavar: str, help_text: str) -> Any:
+    """Makes the option `--output` or `-o`, for `Annotated[Path, output_option(...)]`."""
+    return typer.Option("--output", "-o", metavar=metavar, help=help_text)
+
+
+EngineOrRaw = Annotated[
+    Literal["raw", "three", "godot", "unity", "unreal"],
+    typer.Option(help="Whose folder: raw is textures, floats and a shader for any."),
+]
+CheckpointEveryIfKept = Annotated[float | None, CheckpointEvery.__metadata__[0]]
 
 
 def shader_of(engine: str, shader: str | None, exact: bool = False) -> str:
-    """The language of a raw export's shader.
+    """Returns the language of a raw export's shader.
 
     Raises:
         WlmError: One is given, or --exact, for an engine that has its own.
@@ -63,12 +77,7 @@ def shader_of(engine: str, shader: str | None, exact: bool = False) -> str:
 
 
 def seconds_between(checkpoint_every: float | None) -> float:
-    """Seconds between two saves, where none may be given."""
+    """Returns the seconds between two saves, where none may be given."""
     from wlm.formats.checkpoint import EVERY
 
     return EVERY if checkpoint_every is None else checkpoint_every
-
-
-def output_option(metavar: str, help_text: str) -> Any:
-    """`--output` or `-o`, for `Annotated[Path, output_option(...)]`."""
-    return typer.Option("--output", "-o", metavar=metavar, help=help_text)

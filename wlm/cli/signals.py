@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: either stops a command, long work between two of its steps; a second one ends it at once."""
+"""Ctrl-C and SIGTERM: the first signal stops a command, long work between two steps; the second ends it at once."""
 
 import signal
 import threading
@@ -6,23 +6,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_received: int | None = None  # the first signal's number
+_received: int | None = None  # number of the first signal
 _holding = False
 
 
 def exit_code() -> int:
-    """The exit code of an interrupted command: 130 after Ctrl-C, 143 after SIGTERM, as shells have them."""
+    """Returns the exit code of an interrupted command, as shells define it: 130 after Ctrl-C, 143 after SIGTERM."""
     return 128 + (signal.SIGINT if _received is None else _received)
 
 
 @contextmanager
 def handled(after: signal.Handlers | None = None) -> Iterator[None]:
-    """Lets the first Ctrl-C or SIGTERM raise KeyboardInterrupt, and the second end the process.
+    """Makes the first Ctrl-C or SIGTERM raise KeyboardInterrupt, and the second end the process.
 
-    Only the main thread gets signals: in another one this changes nothing.
+    Only the main thread receives signals; in another thread this changes nothing.
 
     Args:
-        after: What becomes of signals after the block; None: what did before it.
+        after: Handler of the signals after the block; None restores the earlier ones.
     """
     global _received
     if threading.current_thread() is not threading.main_thread():
@@ -40,13 +40,13 @@ def handled(after: signal.Handlers | None = None) -> Iterator[None]:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """Holds the first Ctrl-C or SIGTERM back until the work says that it is between two steps, or at its end.
+    """Defers the first Ctrl-C or SIGTERM until the work reports that it is between two steps, or ends.
 
-    An interrupt in the middle of a step would leave half of it done, and a fit that went on from there would not be
-    the fit that was not interrupted.
+    An interrupt in the middle of a step would leave half of it done, and a fit that continued from there would differ
+    from a fit without the interrupt.
 
     Yields:
-        A function to call between steps; it raises KeyboardInterrupt if there was a signal.
+        A function to call between steps; it raises KeyboardInterrupt if a signal has arrived.
     """
     global _holding
 
@@ -69,10 +69,10 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 def _handle(number: int, _frame: object) -> None:
     global _received
     if _received is not None:
-        # A third one doesn't wait for Python, which may be in the middle of a long call.
+        # A third signal does not wait for Python, which may be in the middle of a long call.
         for each in _SIGNALS:
             signal.signal(each, signal.SIG_DFL)
-        # Not KeyboardInterrupt: that would be saved as if it came between two steps.
+        # KeyboardInterrupt would be saved as if the work were between two steps.
         raise SystemExit(128 + number)
     _received = number
     if not _holding:

@@ -1,247 +1,290 @@
-"""Flip books: options and sources of the commands that read or pack lightmaps, and `wlm smoke flipbook`."""
+"""`wlm smoke shade` and `flipbook`: six-way lightmaps as pictures, as textures, and as folders for engines."""
 
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, quiet_warp, running, show, table
-from wlm.cli.options import output_option
-from wlm.cli.smoke_options import SmokeOptions, with_smoke
+from wlm.cli.console import check_output, escape, note_warnings, quiet_warp, running, show, table
+from wlm.cli.options import Device, Engine, ShaderLanguage, output_option
+from wlm.cli.smoke_options import SHEET, Background, White, check_choice, check_white, outputs, vector, vectors
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from wlm.smoke.flipbook.book import Book
-    from wlm.smoke.flipbook.shots import BakedFiles, FlipBook, FramesToBake, Shot
+    from wlm.smoke.flipbook.shots import BakedFiles, FlipBook, Shot
+    from wlm.smoke.shading import Light
     from wlm.system import OnProgress
 
-Baked = Annotated[
+_TEXTURES = (".exr", ".png", ".tga")
+_PADDING = 1  # pixels around a frame that the filter of a folder's shader reads
+
+_Lightmaps = Annotated[
     Path,
     typer.Argument(
-        metavar="SMOKE",
-        help="A .npz, .nvdb or .vdb volume, a folder of frames, what bake wrote, or a flip book's first texture.",
+        metavar="LIGHTMAPS",
+        help="Six-way lightmaps of wlm smoke bake or predict (.exr or a folder), or the first texture of a flip book.",
     ),
 ]
-With = Annotated[
+_With = Annotated[
     list[Path] | None,
-    typer.Option("--with", metavar="TEXTURE", help="A flip book's second texture; again: one of its opacity."),
+    typer.Option("--with", metavar="TEXTURE", help="Second texture of a flip book; repeat for one of its opacity."),
 ]
-Cells = Annotated[str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Of a flip book, such as 8x8.")]
-From = Annotated[
+_Cells = Annotated[
+    str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book given by --with, such as 8x8.")
+]
+_From = Annotated[
     str | None,
-    typer.Option("--from", metavar="LAYOUT", help="Of a flip book: unity, the default, o3de, o3de-tlrb or embergen."),
+    typer.Option(
+        "--from", metavar="LAYOUT", help="Layout of that flip book: unity (default), o3de, o3de-tlrb or embergen."
+    ),
 ]
-Straight = Annotated[bool, typer.Option("--straight", help="A flip book's light isn't multiplied by its opacity yet.")]
-# Baked smoke has both already.
-BakeStep = Annotated[
-    float | None,
-    typer.Option(min=0.01, max=1000.0, help="The longest step in voxels; default 1 to shade, 0.5 for a flipbook."),
-]
-BakeSupersample = Annotated[int | None, typer.Option(min=1, max=16, help="Rays along a pixel's edge; default 1.")]
-Columns = Annotated[int | None, typer.Option(min=1, max=64, help="Of cells; default as square as can be.")]
-Count = Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")]
-Mips = Annotated[
-    int | None, typer.Option(min=1, max=6, help="Pad such that so many halvings of the textures stay clean.")
-]
-_PADDING = "Pixels around each cell that repeat its border"
-Padding = Annotated[int, typer.Option(min=0, max=64, help=f"{_PADDING}.")]
-PaddingIfGiven = Annotated[int | None, typer.Option(min=0, max=64, help=f"{_PADDING}; default 1.")]
-_GAIN = "Factor on the light; default 1 in an EXR, else the greatest without clipping."
+_Straight = Annotated[bool, typer.Option("--straight", help="That flip book has straight (not premultiplied) alpha.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to `wlm smoke`."""
+    """Adds the commands to `wlm smoke`."""
+    app.command()(shade)
     app.command()(flipbook)
 
 
-@with_smoke
-def flipbook(
-    smoke: Baked,
-    output: Annotated[Path, output_option("OUT", "A .exr, .png or .tga: becomes OUT_1 and OUT_2.")],
-    options: SmokeOptions,
-    layout: Annotated[str, typer.Option(help="unity, o3de, o3de-tlrb or embergen.")] = "unity",
-    columns: Columns = None,
-    count: Count = None,
-    gain: Annotated[float | None, typer.Option(help=_GAIN)] = None,
-    textures: With = None,
-    cells: Cells = None,
-    source_layout: From = None,
-    straight: Straight = False,
-    padding: Padding = 0,
-    mips: Mips = None,
-    motion: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity: write OUT_motion too.")
+def shade(
+    lightmaps: _Lightmaps,
+    output: Annotated[Path, output_option("OUT", "A .png, or for frames a folder.")],
+    light: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."),
     ] = None,
-    depth: Annotated[
-        Path | None, typer.Option(metavar="SMOKE", help="The smoke itself: write OUT_depth too, for point lights.")
-    ] = None,
-    shader: Annotated[
-        bool, typer.Option("--shader", help="Write OUT.glsl, OUT.hlsl, OUT.metal and OUT.wgsl too.")
-    ] = False,
-    step: BakeStep = None,
-    supersample: BakeSupersample = None,
+    background: Background = None,
+    white: White = 1.0,
+    rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
+    textures: _With = None,
+    cells: _Cells = None,
+    source_layout: _From = None,
+    straight: _Straight = False,
+    device: Device = "cpu",
 ) -> None:
-    """Pack six-way lightmaps into the two textures that an engine reads."""
-    check_output(output, ".exr", ".png", ".tga")
-    if gain is None and output.suffix.lower() == ".exr":
-        gain = 1.0
-    quiet_warp()
-    from wlm.export.shading import ENDINGS, translate
-    from wlm.formats.atomic import atomic_write
-    from wlm.smoke.flipbook.shader import book_functions
-    from wlm.smoke.flipbook.textures import write_page
+    """Light six-way lightmaps into PNGs; a folder of frames also gets the scene's obstacles and a contact sheet.
 
-    book = opened_book(smoke, textures, cells, source_layout, straight)
-    packing = {"layout": layout, "columns": columns, "count": count, "gain": gain, "motion": motion, "depth": depth}
-    packed = packed_book(
-        smoke, options, book, **packing, padding=padding, mips=mips, step=step, supersample=supersample
-    )
-    paths = {
-        name: output.with_name(f"{output.stem}_{ending}{output.suffix}")
-        for name, ending in (("first", 1), ("second", 2), ("motion", "motion"), ("depth", "depth"))
-        if name in packed.pages
-    }
-    clipped = sum(write_page(path, packed.pages[name]) for name, path in paths.items())
-    if shader:
-        for language in ("glsl", "hlsl", "msl", "wgsl"):
-            text = translate(book_functions(packed), language)
-            atomic_write(output.with_suffix(ENDINGS[language]), text.encode())
-    show_book(str(smoke), packed, paths, clipped)
-
-
-def packed_book(
-    smoke: Path,
-    options: SmokeOptions,
-    book: "FlipBook | None",
-    *,
-    layout: str,
-    columns: int | None,
-    count: int | None,
-    gain: float | None,
-    motion: Path | None,
-    padding: int,
-    mips: int | None,
-    step: float | None,
-    supersample: int | None,
-    depth: Path | None = None,
-    rate: float | None = None,
-) -> "Book":
-    """Reads or bakes frames, as the options of the same names have it, and packs them.
-
-    Args:
-        book: Of `opened_book`.
-
-    Raises:
-        WlmError: An option, the smoke or a flip book is wrong.
+    Without --light the lights are those of the scene, or one from 1,1,1. The default irradiance, 4 pi, shows a lightmap
+    unchanged.
     """
-    from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.flipbook.book import pack_book
-    from wlm.smoke.flipbook.motion import mip_padding, open_motion
+    from wlm.smoke.camera import RULES
 
-    if layout not in LAYOUTS:
-        raise WlmError(f"--layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
-    for option, number in (("gain", gain), ("rate", rate)):
-        if number is not None and not 0 < number < float("inf"):
-            raise WlmError(f"--{option}: expected a number above 0, got {number}")
-    if mips is not None and padding:
-        raise WlmError("--mips: expected without --padding, which it chooses")
-    for option, given in (("motion", motion), ("depth", depth)):
-        if given is not None and book is not None:
-            reason = "expected lightmaps of bake or predict, or frames: a flip book's camera isn't known"
-            raise WlmError(f"--{option}: {reason}")
-    if depth is not None and not depth.exists():
-        raise WlmError(f"{depth}: expected the flip book's smoke, found none")
-    source = source_of(smoke, options, step, supersample, 0.5, book)
-    # Before what takes long.
-    air = None if motion is None else open_motion(motion, options.device)
-    volumes = None if depth is None else options.open(depth)
-    with running("flipbook") as progress:
-        shots = list(shots_of(source, progress, count))
-    if mips is not None:
-        padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
-    values = {"columns": columns, "gain": gain, "padding": padding, "rate": rate}
-    try:
-        if air is None and volumes is None:
-            return pack_book(shots, layout, **values)
-        with running("motion and depth") as progress:
-            return pack_book(shots, layout, **values, air=air, volumes=volumes, progress=progress)
-    except ValueError as error:
-        raise WlmError(f"{smoke}: {error}") from error
+    check_choice("--rule", rule, RULES)
+    check_white(white)
+    lights = [_light(text) for text in light or ()]
+    behind = None if background is None else vector("--background", background)
+    quiet_warp()
+    from wlm.smoke.scene import LightSettings, Looks
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
 
-
-def show_book(title: str, book: "Book", paths: "dict[str, Path]", clipped: int) -> None:
-    """Shows a table of a flip book: its files by the names of its textures, and how to read them."""
-    rows = table(title, ["file", "bytes", "channels"], text=["channels"])
-    for name, path in paths.items():
-        rows.add_row(escape(str(path)), f"{path.stat().st_size:,}", " ".join(book.channels[name]))
-    rows.add_section()
-    height, width = book.size
-    around = f", {book.padding} around each" if book.padding else ""
-    rows.add_row("frames", f"{book.count:,}", f"{book.rows} x {book.columns} cells of {width} x {height}{around}")
-    rows.add_row("gain", f"{book.gain:.4g}", f"{clipped:,} numbers clipped")
-    if book.scale is not None:
-        rows.add_row("motion", f"{book.scale:.4g}", "of a frame, at most, to the next")
-    if book.reach is not None:
-        rows.add_row("depth", f"{book.reach:.4g}", "of a frame's height, at most, before or behind the billboard")
+    source = _source(lightmaps, textures, cells, source_layout, straight, device)
+    plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
+    file = outputs(lightmaps, source.single, output, "shade", ".png")
+    rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
+    pictures = []
+    with running("shade") as progress:
+        for shot in _shots(source, progress):
+            if shot.six.transparency is None:
+                raise WlmError(f"{lightmaps}: no opacity: expected an alpha channel, or a third texture by --with")
+            looks = shot.looks or plain
+            given = lights or [settings.light() for settings in looks.lights]
+            extra = {"albedo": looks.albedo, "ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}
+            extra["rule"] = rule
+            shaded = picture(shot.six, given, background=looks.background if behind is None else behind, **extra)
+            pictures.append(to_bytes(shaded, white))
+            path = file(shot.number)
+            save_png(path, pictures[-1])
+            covered = float((shot.six.transparency < 0.99).float().mean())
+            clipped = float((shaded > white).any(-1).float().mean())
+            figures = (f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}")
+            rows.add_row(escape(path.name), *figures)
+    if not source.single:
+        contact_sheet(output / SHEET, {"": pictures})
     show(rows)
 
 
-def opened_book(
-    smoke: Path, textures: list[Path] | None, cells: str | None, layout: str | None, straight: bool
-) -> "FlipBook | None":
-    """The flip book that the options tell; None where they tell none."""
-    from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.flipbook.shots import FlipBook
+def flipbook(
+    lightmaps: _Lightmaps,
+    output: Annotated[Path, output_option("OUT", "A folder, or a .png, .tga or .exr: written as OUT_1 and OUT_2.")],
+    engine: Engine = None,
+    shader: ShaderLanguage = None,
+    layout: Annotated[str, typer.Option(help="Channels: unity, o3de, o3de-tlrb or embergen.")] = "unity",
+    count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
+    gain: Annotated[
+        float | None,
+        typer.Option(help="Factor on the light; default 1 in an .exr, else the greatest without clipping."),
+    ] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second; default the scene's, or 25.")] = None,
+    textures: _With = None,
+    cells: _Cells = None,
+    source_layout: _From = None,
+    straight: _Straight = False,
+    mips: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=6, help="Mip levels without neighbouring frames, by padding; default padding: 1, in files 0."
+        ),
+    ] = None,
+    motion: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity, for a texture of motion.")
+    ] = None,
+    depth: Annotated[
+        Path | None, typer.Option(metavar="SMOKE", help="The smoke itself, for a texture of depth for point lights.")
+    ] = None,
+    device: Device = "cpu",
+) -> None:
+    """Pack six-way lightmaps into a flip book: two textures for an importer, or a folder with shader and kit.
 
+    A folder has the textures, a shader that plays and lights them, and with --engine what puts them together.
+    """
+    in_files = bool(output.suffix) and not output.is_dir()
+    if in_files:
+        check_output(output, *_TEXTURES)
+        for option, given in (("engine", engine), ("shader", shader)):
+            if given is not None:
+                raise WlmError(f"--{option}: expected a folder as the output, got {output}")
+        gain = 1.0 if gain is None and output.suffix.lower() == ".exr" else gain
+    quiet_warp()
+    source = _source(lightmaps, textures, cells, source_layout, straight, device)
+    for option, given in (("motion", motion), ("depth", depth)):
+        if given is not None and textures:
+            raise WlmError(f"--{option}: expected lightmaps of bake or predict: the camera of a flip book is unknown")
+    packing = {"count": count, "gain": gain, "rate": rate, "mips": mips, "motion": motion, "depth": depth}
+    packed = _packed(lightmaps, source, layout, device, **packing, padding=0 if in_files else _PADDING)
+    if in_files:
+        contents, clipped = _write_textures(packed, output)
+    else:
+        from wlm.export import export
+        from wlm.smoke.bundle import bundle as bundle_of
+
+        bundle = bundle_of(packed, name=lightmaps.resolve().stem)
+        paths = export(bundle, output, engine, shader=shader or "glsl")
+        contents, clipped = {path: packed.channels.get(path.stem, ()) for path in paths}, bundle.document["clipped"]
+    _show(str(output), packed, contents, clipped)
+
+
+def _light(text: str) -> "Light":
+    from wlm.config import check_settings
+    from wlm.smoke.scene import LightSettings
+
+    values = dict(zip(("toward", "irradiance"), vectors("--light", text), strict=False))
+    return check_settings(LightSettings, values, "--light: ").light()
+
+
+def _source(
+    lightmaps: Path,
+    textures: Sequence[Path] | None,
+    cells: str | None,
+    layout: str | None,
+    straight: bool,
+    device: str,
+) -> "BakedFiles | FlipBook":
+    """Opens lightmaps or the flip book that the options describe.
+
+    Raises:
+        WlmError: An option has no meaning, or the path is neither.
+    """
+    from wlm.interop import check_device
+    from wlm.smoke.camera import LAYOUTS
+    from wlm.smoke.flipbook.shots import FlipBook, baked_files
+
+    device = check_device(device)
     if not textures:
         for option, given in (("cells", cells), ("from", layout), ("straight", straight)):
             if given:
-                raise WlmError(f"--{option}: means nothing without --with, a flip book's second texture")
-        return None
+                raise WlmError(f"--{option}: has no meaning without --with, the second texture of a flip book")
+        if (baked := baked_files(lightmaps, device)) is None:
+            raise WlmError(
+                f"{lightmaps}: expected six-way lightmaps: make them of smoke with wlm smoke bake or predict"
+            )
+        return baked
     if len(textures) > 2:
-        raise WlmError(f"--with: expected a second texture and maybe one of opacity, got {len(textures)}")
+        raise WlmError(f"--with: expected a second texture and possibly one of opacity, got {len(textures)}")
     layout = "unity" if layout is None else layout
-    if layout not in LAYOUTS:
-        raise WlmError(f"--from: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+    check_choice("--from", layout, tuple(LAYOUTS))
     rows, cross, columns = (cells or "").partition("x")
     if not (cross and rows.isdecimal() and columns.isdecimal() and 0 < int(rows) <= 64 and 0 < int(columns) <= 64):
         raise WlmError(f"--cells: expected rows and columns of 1 to 64, such as 8x8, got {cells}")
-    return FlipBook((smoke, *textures), layout, int(rows), int(columns), straight)
+    return FlipBook((lightmaps, *textures), layout, int(rows), int(columns), straight, device)
 
 
-def source_of(
-    smoke: Path,
-    options: SmokeOptions,
-    step: float | None,
-    supersample: int | None,
-    default_step: float,
-    book: "FlipBook | None",
-) -> "BakedFiles | FlipBook | FramesToBake":
-    """The lightmaps to shade or pack: a flip book's, those of bake or predict, else of smoke that is baked now."""
-    from wlm.interop import check_device
-    from wlm.smoke.flipbook.shots import FramesToBake, baked_files
-
-    device = check_device(options.device)
-    baked = baked_files(smoke, device) if book is None else replace(book, device=device)
-    if baked is not None:
-        changes = options.given() | {"step": step, "supersample": supersample}
-        if option := next((name for name, value in changes.items() if value is not None), None):
-            kind = "was baked" if book is None else "is a flip book"
-            remedy = "has to be given to bake" if book is None else "means nothing for it"
-            raise WlmError(f"{smoke}: {kind}: --{option} {remedy}")
-        return baked
-    frames = options.open(smoke)
-    return FramesToBake(frames, options.camera(frames), step or default_step, supersample or 1)
-
-
-def shots_of(
-    source: "BakedFiles | FlipBook | FramesToBake", progress: "OnProgress", count: int | None = None
-) -> "Iterator[Shot]":
-    """The source's shots; notes repairs of their volumes."""
+def _shots(source: "BakedFiles | FlipBook", progress: "OnProgress", count: int | None = None) -> "Iterator[Shot]":
     for shot in source.shots(count, progress):
-        for warning in shot.warnings:
-            note(f"warning: {warning}")
+        note_warnings(shot.warnings)
         yield shot
+
+
+def _packed(
+    lightmaps: Path,
+    source: "BakedFiles | FlipBook",
+    layout: str,
+    device: str,
+    *,
+    count: int | None,
+    gain: float | None,
+    rate: float | None,
+    mips: int | None,
+    motion: Path | None,
+    depth: Path | None,
+    padding: int,
+) -> "Book":
+    """Packs frames into a flip book, as the options of the same names say; `padding` is replaced by that for `mips`.
+
+    Raises:
+        WlmError: An option or the lightmaps are wrong.
+    """
+    from wlm.smoke.camera import LAYOUTS
+    from wlm.smoke.data import load_frames
+    from wlm.smoke.flipbook.book import pack_book
+    from wlm.smoke.flipbook.motion import mip_padding, open_motion
+
+    check_choice("--layout", layout, tuple(LAYOUTS))
+    for option, number in (("gain", gain), ("rate", rate)):
+        if number is not None and not 0 < number < float("inf"):
+            raise WlmError(f"--{option}: expected a number above 0, got {number}")
+    if depth is not None and not depth.exists():
+        raise WlmError(f"{depth}: expected the smoke of the flip book, found none")
+    # These inputs are opened before the long work.
+    air = None if motion is None else open_motion(motion, device)
+    volumes = None if depth is None else load_frames(depth, device=device)
+    with running("flipbook") as progress:
+        shots = list(_shots(source, progress, count))
+    if mips is not None:
+        padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
+    options: dict[str, Any] = {"gain": gain, "rate": rate, "padding": padding, "air": air, "volumes": volumes}
+    try:
+        with running("motion and depth") as progress:
+            options["progress"] = None if air is None and volumes is None else progress
+            return pack_book(shots, layout, **options)
+    except ValueError as error:
+        raise WlmError(f"{lightmaps}: {error}") from error
+
+
+def _write_textures(book: "Book", output: Path) -> tuple[dict[Path, Sequence[str]], int]:
+    """Writes the textures of a flip book; returns their channels by path and the number of clipped values."""
+    from wlm.smoke.flipbook.textures import write_page
+
+    endings = {"first": "1", "second": "2", "motion": "motion", "depth": "depth"}
+    paths = {name: output.with_name(f"{output.stem}_{endings[name]}{output.suffix}") for name in book.pages}
+    clipped = sum(write_page(path, book.pages[name]) for name, path in paths.items())
+    return {path: book.channels[name] for name, path in paths.items()}, clipped
+
+
+def _show(title: str, book: "Book", contents: Mapping[Path, Sequence[str]], clipped: int) -> None:
+    rows = table(title, ["file", "bytes", "content"], text=["content"])
+    for path, channels in contents.items():
+        rows.add_row(escape(path.name), f"{path.stat().st_size:,}", " ".join(channels))
+    rows.add_section()
+    height, width = book.size
+    around = f", padded by {book.padding}" if book.padding else ""
+    rows.add_row("frames", f"{book.count:,}", f"{book.rows} x {book.columns} cells of {width} x {height}{around}")
+    rows.add_row("gain", f"{book.gain:.4g}", f"{clipped:,} values clipped")
+    if book.scale is not None:
+        rows.add_row("largest motion", f"{book.scale:.4g}", "share of a frame, to the next frame")
+    if book.reach is not None:
+        rows.add_row("largest depth", f"{book.reach:.4g}", "frame heights in front of or behind the billboard")
+    show(rows)

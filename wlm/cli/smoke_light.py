@@ -1,4 +1,4 @@
-"""`wlm smoke`: light smoke by its own lights, with light of all orders of scattering, and trace the truth."""
+"""`wlm smoke light` and `trace`: pictures of smoke with multiple scattering, by a march and by path tracing."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -6,17 +6,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, escape, exclusive, note, number, quiet_warp, running, show, table
+from wlm.cli.console import check_output, escape, exclusive, note_warnings, number, quiet_warp, running, show, table
 from wlm.cli.options import Seed, output_option
 from wlm.cli.smoke_options import (
     SHEET,
     Albedo,
+    Background,
+    G,
     Input,
     SmokeOptions,
+    White,
+    check_choice,
+    check_white,
     given_albedo,
     outputs,
-    place_and_colour,
     vector,
+    vectors,
     with_smoke,
 )
 from wlm.errors import WlmError
@@ -34,11 +39,13 @@ _Lights = Annotated[
 ]
 _Points = Annotated[
     list[str] | None,
-    typer.Option("--point", metavar="X,Y,Z[:R,G,B]", help="A light's place and its intensity; repeat for more."),
+    typer.Option(
+        "--point", metavar="X,Y,Z[:R,G,B]", help="Position of a point light and its intensity; repeat for more."
+    ),
 ]
-_Sky = Annotated[str | None, typer.Option(metavar="R,G,B", help="Light from all around, seen too.")]
-_G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
-_White = Annotated[float, typer.Option(help="The light that becomes white.")]
+_Sky = Annotated[
+    str | None, typer.Option(metavar="R,G,B", help="Radiance of a uniform sky, also visible as the background.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -57,31 +64,26 @@ def light(
     points: _Points = None,
     sky: _Sky = None,
     albedo: Albedo = None,
-    g: _G = 0.0,
-    orders: Annotated[str, typer.Option(help="all: light that is scattered again too; single: once alone.")] = "all",
-    model: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of all orders; default the one that comes with wlm.")
-    ] = None,
+    g: G = 0.0,
+    orders: Annotated[
+        str, typer.Option(help="Orders of scattering: all, of which multiple ones are predicted, or single.")
+    ] = "all",
     step: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1000.0, help="In voxels; default 1/130 of the longest edge, or 1/4."),
+        typer.Option(min=0.01, max=1000.0, help="Step of the march in voxels; default 1/130 of the longest edge."),
     ] = None,
-    perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
-    background: Annotated[str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke.")] = None,
-    white: _White = 1.0,
+    background: Background = None,
+    white: White = 1.0,
 ) -> None:
-    """Light the smoke into PNGs by a march to each light itself, and predict light that is scattered more than once.
+    """Light smoke into PNGs by a march towards each light; multiple scattering is predicted.
 
-    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. A sky is twelve lights. Obstacles
-    of a scene are drawn and cast their shadows.
+    Without --light, --point and --sky the lights are those of the scene, or one from 1,1,1. A sky counts as twelve
+    lights. Obstacles of a scene are drawn and cast shadows.
     """
-    if orders not in ("all", "single"):
-        raise WlmError(f"--orders: expected all or single, got {orders!r}")
-    if model is not None and orders == "single":
-        raise WlmError("--model: expected --orders all beside it")
+    check_choice("--orders", orders, ("all", "single"))
     colour, around = given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
-    _check_white(white)
+    check_white(white)
     own = _lights(lights, points) + ([] if around is None else list(_even(around).lights()))
     quiet_warp()
     from wlm.smoke.transport.lighting import light_smoke
@@ -91,16 +93,15 @@ def light(
     from wlm_kernels.smoke.settings import March
 
     frames = options.open(smoke)
-    camera = options.camera(frames, orthographic=False, perspective=perspective)
+    camera = options.view(frames, orthographic=False)
     lamps, colour = own or _scene_lights(frames.scene), colour or _scene_albedo(frames.scene)
-    network = load_orders(model) if orders == "all" else None
+    network = load_orders() if orders == "all" else None
     file = outputs(smoke, frames.single, output, "light", ".png")
-    rows = table(str(smoke), ["file", "covered", "mean", "largest", "clipped"])
+    rows = table(str(smoke), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
     pictures = []
     with running("light") as progress:
         for frame, volume in frames.volumes(progress=progress):
-            for warning in volume.warnings:
-                note(f"warning: {warning}")
+            note_warnings(volume.warnings)
             view = frames.view(camera, volume)
             march = orders_march(volume, g) if step is None else March(step=step, jitter=0.0, g=g)
             if network is None:
@@ -136,33 +137,31 @@ def trace(
     points: _Points = None,
     sky: _Sky = None,
     albedo: Albedo = None,
-    g: _G = 0.0,
-    samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths a pixel.")] = 64,
+    g: G = 0.0,
+    samples: Annotated[int, typer.Option(min=2, max=2**20, help="Paths per pixel.")] = 64,
     orders: Annotated[
-        int, typer.Option(min=0, max=1000, help="Orders of scattering with channels of their own in an EXR.")
+        int, typer.Option(min=0, max=1000, help="Orders of scattering with their own channels in an EXR.")
     ] = 1,
-    highest: Annotated[int | None, typer.Option(min=0, help="Scatterings after which paths end; default none.")] = None,
-    perspective: Annotated[bool, typer.Option("--perspective", help="Rays meet in the eye.")] = False,
-    white: _White = 1.0,
+    white: White = 1.0,
     seed: Seed = 0,
 ) -> None:
-    """Trace paths through the smoke: light of every order without bias, with noise, and how much noise there is.
+    """Trace paths through smoke: all orders of scattering without bias, with an estimate of the noise.
 
-    Without --light, --point and --sky the lights are the scene's, or one from 1,1,1. Hot smoke is lit by its own fire
-    as well, which is grey. Obstacles of a scene absorb all light, and its background isn't drawn. An EXR has R, G and
-    B, R.1, G.1 and B.1 of light scattered once, and so on, and R.noise, G.noise and B.noise.
+    Without --light, --point and --sky the lights are those of the scene, or one from 1,1,1. Hot smoke also emits grey
+    light. Obstacles of a scene absorb all light, and its background is not drawn. An EXR has the channels R, G, B; R.1,
+    G.1, B.1 of single scattering, and so on; and R.noise, G.noise, B.noise.
     """
     colour, around = given_albedo(albedo), None if sky is None else vector("--sky", sky)
-    _check_white(white)
+    check_white(white)
     own = _lights(lights, points)
     quiet_warp()
     from wlm.smoke.scene import obstacle_mesh
-    from wlm.smoke.transport.tracing import HIGHEST, trace
+    from wlm.smoke.transport.tracing import trace
     from wlm.view.pictures import save_png, to_bytes
 
     environment = None if around is None else _even(around)
     frames = options.open(smoke)
-    camera = options.camera(frames, orthographic=False, perspective=perspective)
+    camera = options.view(frames, orthographic=False)
     scene = frames.scene
     colour = colour or _scene_albedo(scene)
     lamps = own or ([] if environment is not None else _scene_lights(scene))
@@ -171,16 +170,16 @@ def trace(
     as_exr = frames.single and output.suffix.lower() == ".exr"
     file = (lambda frame: output) if frames.single else outputs(smoke, False, output, "trace", ".png")
     settings = {"albedo": colour, "g": g, "samples": samples, "orders": orders, "seed": seed}
-    rows = table(str(smoke), ["file", "mean", "largest", "scattered again", "noise"])
+    rows = table(str(smoke), ["file", "mean", "largest", "multiple scattering", "noise"])
     with running("trace") as progress:
         for frame, volume in _each(frames):
             view = frames.view(camera, volume)
             solid = None
             if scene is not None and scene.obstacles:
                 solid = obstacle_mesh(scene.obstacles, frames.time(frame))[:2]
-            extra = {"environment": environment, "obstacles": solid, "highest": HIGHEST if highest is None else highest}
+            extra = {"environment": environment, "obstacles": solid, "progress": progress}
             try:
-                made = trace(volume, view, lamps, **settings, **extra, progress=progress)
+                made = trace(volume, view, lamps, **settings, **extra)
             except WlmError as error:
                 raise WlmError(f"{frames.file(frame)}: {error}") from error
             path, image = file(frame), made.total
@@ -200,10 +199,9 @@ def trace(
 
 
 def _each(frames: "Frames") -> "Iterator[tuple[int, DensityVolume]]":
-    """The volumes of frames; notes their repairs."""
+    """Yields the volumes of frames and notes their warnings."""
     for frame, volume in frames.volumes():
-        for warning in volume.warnings:
-            note(f"warning: {warning}")
+        note_warnings(volume.warnings)
         yield frame, volume
 
 
@@ -222,13 +220,8 @@ def _write_exr(path: Path, made: "Transport") -> None:
     write_planes(path, planes, note, whole=tuple(planes))
 
 
-def _check_white(white: float) -> None:
-    if not 0 < white < float("inf"):
-        raise WlmError(f"--white: expected a number above 0, got {white}")
-
-
 def _checked(option: str, make: Callable[[], Any]) -> Any:
-    """What is made of an option's values, or one line that names the option."""
+    """Calls a function of an option's values; its ValueError becomes one line that names the option."""
     try:
         return make()
     except ValueError as error:
@@ -236,14 +229,14 @@ def _checked(option: str, make: Callable[[], Any]) -> Any:
 
 
 def _even(colour: tuple[float, float, float]) -> "Environment":
-    """The sky of `--sky`."""
+    """Returns the uniform sky of `--sky`."""
     from wlm.smoke.transport.lights import Environment
 
     return _checked("--sky", lambda: Environment.even(colour))
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    """Lights of `place_and_colour`."""
+    """Returns the lights of `--light` and `--point`."""
     from wlm.smoke.camera import unit
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lights import PointLight, checked_colour
@@ -251,7 +244,7 @@ def _lights(directions: list[str] | None, places: list[str] | None) -> "list[Any
     made: list[AnyLight] = []
     for option, texts in (("--light", directions), ("--point", places)):
         for text in texts or ():
-            values = place_and_colour(option, text)
+            values = vectors(option, text)
             if len(values) == 2:
                 _checked(option, lambda values=values: checked_colour("colour", values[1]))
             if option == "--light":

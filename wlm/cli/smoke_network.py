@@ -1,6 +1,5 @@
-"""`wlm smoke`: make samples, train the network that lightmaps come from, use it, measure it."""
+"""`wlm smoke train` and `export-onnx`, and `wlm evaluate` and `info` for networks."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,134 +14,113 @@ from wlm.cli.console import (
     quiet_warp,
     running,
     show,
+    show_facts,
+    show_json,
     table,
     write_json,
 )
-from wlm.cli.options import CheckpointEvery, Device, PageFile, ReportFile, Resume, Seed, output_option
-from wlm.cli.smoke_options import Input, SmokeOptions, with_smoke, write_lightmaps
-from wlm.errors import WlmError
+from wlm.cli.options import (
+    AsJson,
+    CheckpointEvery,
+    Device,
+    ModelFile,
+    PageFile,
+    ReportFile,
+    Resume,
+    Seed,
+    output_option,
+)
+from wlm.cli.settings import Generated, with_settings
 
 if TYPE_CHECKING:
-    from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.camera import Camera
     from wlm.smoke.evaluation import Comparison
-    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SmokeModel
-
-_MARCH = 130  # steps of `predict --coarse` along the longest edge
-
-_Network = Annotated[
-    Path | None,
-    typer.Argument(metavar="NETWORK", help="A file that train wrote; default the one that comes with wlm."),
-]
 
 
 def register(app: typer.Typer) -> None:
     """Adds the commands to `wlm smoke`."""
-    for command in (train, predict, evaluate):
-        app.command()(command)
+    app.command(cls=Generated)(train)
+    app.command("export-onnx")(export_onnx)
 
 
+@with_settings("wlm.smoke:Profile")
 @exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
+    settings: dict[str, Any],
     minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="After which it stops and can be resumed; default at its end.")
+        float | None, typer.Option(min=0.0, help="Time after which the training stops and can be resumed.")
     ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
-    """Train a network on smoke that is simulated as it is needed, and keep the best of its validations.
+    """Train a network on smoke that is simulated during the training, and keep the best of its validations.
 
-    The training is kept in NETWORK.partial from time to time, and by Ctrl-C and SIGTERM; the same command with --resume
-    goes on exactly. The curves are in NETWORK.csv.
+    The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
+    to continue exactly. NETWORK.csv has the curves.
     """
     check_output(output, ".safetensors")
     quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
+    from wlm.smoke import Profile
     from wlm.smoke.fit import train as fit
-    from wlm.smoke.network.settings import Profile
 
-    settings = Profile.load(profile)
+    checked = Profile.load(profile).override(settings, "--")
     checkpoint = Path(f"{output}{SUFFIX}")
     if resume and not checkpoint.exists() and not output.exists():
         note(f"{checkpoint}: there is nothing to resume; starting at step 0")
     options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
     options["checkpoint_every"] = checkpoint_every
     with running("train", checkpoint) as progress:
-        training = fit(settings, output, progress=progress, **options)
+        training = fit(checked, output, progress=progress, **options)
     if not training.finished:
-        note(f"out of time at step {training.steps}: the same command with --resume goes on from {checkpoint}")
-    rows = table(f"{output}: {settings.name}", ["", "value"])
-    rows.add_row("steps", f"{training.steps:,} of {settings.training.total:,}")
-    rows.add_row("steps skipped", f"{training.skipped:,}")
-    rows.add_row("best validation, dB", number(training.best, ".2f"))
+        note(f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}")
+    facts: dict[str, Any] = {
+        "steps": f"{training.steps:,} of {checked.training.total:,}",
+        "skipped steps": training.skipped,
+        "best validation PSNR, dB": training.best,
+    }
     if training.score is not None:
-        rows.add_row("last validation, dB", number(training.score.psnr, ".2f"))
-        rows.add_row("its flicker over the reference's", number(training.score.flicker_ratio, ".3f"))
-    rows.add_row("seconds", f"{training.seconds:.1f}")
+        facts["last validation PSNR, dB"] = training.score.psnr
+        facts["its flicker relative to the reference"] = training.score.flicker_ratio
+    facts["seconds"] = f"{training.seconds:.1f}"
     if training.model is not None:
-        rows.add_row("bytes", f"{output.stat().st_size:,}")
-    show(rows)
+        facts["bytes on disk"] = output.stat().st_size
+    show_facts(f"{output}: {checked.name}", facts)
 
 
-@with_smoke
-@exclusive
-def predict(
-    smoke: Input,
-    output: Annotated[Path, output_option("OUT", "A .exr, or of frames a folder.")],
-    options: SmokeOptions,
+def export_onnx(
+    output: Annotated[Path, output_option("NETWORK.onnx", "The file to write.")],
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A network that train wrote; default the one that wlm has.")
+        Path | None, typer.Argument(metavar="NETWORK", help="Network that train wrote; default the shipped one.")
     ] = None,
-    coarse: Annotated[bool, typer.Option("--coarse", help="By a march alone, without a network.")] = False,
-    step: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01,
-            max=1000.0,
-            metavar="H",
-            help=f"Voxels, of the march of --coarse; default 1/{_MARCH} of the longest edge.",
-        ),
-    ] = None,
-    seed: Seed = 0,
-    resume: Resume = False,
+    resolution: Annotated[int, typer.Option(min=1, max=16384, help="Edge of the square image in pixels.")] = 512,
 ) -> None:
-    """Make six-way lightmaps by the network, from a guiding map as it was trained with: what bake makes, sooner.
-
-    What is written is as of bake: shade and flipbook take it. Of frames, those done are kept when it is stopped; the
-    same command with --resume makes the others.
-    """
-    if coarse and network is not None:
-        raise WlmError("--coarse: expected no --network beside it")
-    if step is not None and not coarse:
-        raise WlmError("--step: expected --coarse beside it: a network looks as it was trained to")
+    """Write a network as ONNX: encoded guiding maps to encoded lightmaps of one size, in float32."""
+    check_output(output, ".onnx")
     quiet_warp()
-    from wlm.smoke.codec import open_network
+    from wlm.smoke.codec import open_network, shipped
+    from wlm.smoke.network import onnx_file
+    from wlm.smoke.network.planes import GUIDES, PLANES
 
-    frames = options.open(smoke)
-    if coarse:
-        made = {"made": "coarse", "step": step, "seed": seed}
-        make = _coarse(step, seed)
-    else:
-        model = open_network(network)
-        made = {"made": "network", "of": dict(model.summary), "seed": seed}
-        make = _predicted(model, seed, frames.device)
-    write_lightmaps(frames, options.camera(frames), output, make, made, resume=resume)
+    network = network or shipped()
+    model = open_network(network)
+    size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
+    facts = {"input planes": " ".join(GUIDES[model.settings.guide]), "output planes": " ".join(PLANES)}
+    show_facts(str(output), facts | {"image": f"{resolution} x {resolution} pixels", "bytes": size})
 
 
 def evaluate(
-    network: _Network = None,
+    network: ModelFile,
     smoke: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="A .npz, .nvdb or .vdb volume to score; repeat for more."),
+        list[Path] | None, typer.Argument(metavar="SMOKE...", help="Volumes (.npz, .nvdb, .vdb) to score as well.")
     ] = None,
-    resolution: Annotated[int, typer.Option(min=8, max=4096, help="Pixels along an image's edges.")] = 512,
+    resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the images in pixels.")] = 512,
     cells: Annotated[
-        int | None, typer.Option(min=16, max=512, help="Of the air along the box's edges; default as it was trained.")
+        int | None, typer.Option(min=16, max=512, help="Cells of the air along an edge; default as in the training.")
     ] = None,
     json_path: ReportFile = None,
     html_path: PageFile = None,
@@ -150,9 +128,8 @@ def evaluate(
 ) -> None:
     """Measure a network on smoke that it was not trained on.
 
-    The smoke is of sequences by which no network was chosen either, at half, once and twice its density, and the
-    volumes given. PSNR is of the lightmaps in sRGB; flicker is what changes from frame to frame beside the motion, over
-    the same of the reference.
+    The test smoke is simulated, at half, once and twice its density. PSNR compares the lightmaps in sRGB. Flicker is
+    the change from frame to frame beyond the motion, relative to that of the reference.
     """
     if json_path is not None:
         check_output(json_path, ".json")
@@ -160,18 +137,18 @@ def evaluate(
         check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
-    from wlm.smoke.codec import open_network, shipped
+    from wlm.smoke.codec import open_network
     from wlm.smoke.evaluation import compare
 
-    device, network = check_device(device), network or shipped()
+    device = check_device(device)
     model = open_network(network)
     sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
     settings = model.dataset.model_copy(update=sizes)
     with running("evaluate") as progress:
         comparisons = compare(model, settings, smoke or (), device=device, progress=progress)
     if json_path is not None:
-        facts = {"network": _facts(network, model), "device": device, **sizes}
-        write_json(json_path, facts | {"sets": [comparison.to_json() for comparison in comparisons]})
+        content = {"network": _facts(network, model), "device": device, **sizes}
+        write_json(json_path, content | {"sets": [comparison.to_json() for comparison in comparisons]})
     if html_path is not None:
         from wlm.view.reports import smoke_report
 
@@ -179,37 +156,21 @@ def evaluate(
     _show_comparisons(network, comparisons)
 
 
-def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a march whose nodes are as far apart as its steps."""
-    from wlm.smoke.march.coarse import bake_coarse
-    from wlm_kernels.smoke.settings import March
+def info(file: ModelFile, as_json: AsJson = False) -> None:
+    """Show the shape of a network and facts about its training."""
+    quiet_warp()
+    from wlm.formats.artifact import read_artifact
+    from wlm.smoke.codec import open_network
 
-    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        voxels = max(volume.shape) / _MARCH if step is None else step
-        return bake_coarse(volume, camera, March(voxels, seed=seed))
-
-    return make
-
-
-def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Makes lightmaps by a network; notes once where little of it is taken."""
-    from wlm.smoke.network.prediction import SmokePredictor
-
-    predictor, first = SmokePredictor(model, device), True
-
-    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        nonlocal first
-        six = predictor(volume, camera, seed)
-        if first and (line := predictor.note()):
-            note(line)
-        first = False
-        return six
-
-    return make
+    facts = _facts(file, open_network(file)) | {"bytes_on_disk": read_artifact(file).file_bytes}
+    if as_json:
+        show_json(facts)
+    else:
+        show_facts(str(file), facts)
 
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
-    """The network, and what its file says of its training."""
+    """Returns the shape of a network and the facts about its training that its file states."""
     from wlm.smoke.model import parameter_count
 
     names = ("profile", "seed", "steps", "seconds", "device")
@@ -221,8 +182,10 @@ def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
 def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
     from wlm.smoke.network.planes import PLANES
 
-    scores = table(str(path), ["smoke", "method", "PSNR", "lowest", "highest", "flicker"], text=["method"])
-    planes = table(f"{path}: PSNR of each plane", ["smoke", "method", *PLANES], text=["method"])
+    scores = table(
+        str(path), ["smoke", "method", "PSNR, dB", "lowest, dB", "highest, dB", "relative flicker"], text=["method"]
+    )
+    planes = table(f"{path}: PSNR of each plane, dB", ["smoke", "method", *PLANES], text=["method"])
     for comparison in comparisons:
         smoke = escape(comparison.name)
         for name, score in comparison.methods.items():

@@ -1,15 +1,15 @@
-"""What the commands of `wlm smoke` share: options of the smoke and its camera, output files, tables of lightmaps."""
+"""Options, output files and tables that the commands of `wlm smoke` have in common."""
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, escape, note, number, running, show, table
+from wlm.cli.console import check_output, escape, note, note_warnings, number, running, show, table
 from wlm.cli.options import Device, Trust
 from wlm.errors import WlmError
 
@@ -21,92 +21,97 @@ if TYPE_CHECKING:
     from wlm.smoke.scene import CameraSettings
 
 SHEET = "sheet.png"
+_CAMERA = ("toward", "turn", "extent", "distance", "perspective")
+_VOLUME = ("up", "extinction", "emission", "density", "temperature")
 
 SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML.")
+    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
+]
+SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
+SceneScale = Annotated[
+    float, typer.Option(min=0.001, max=100.0, help="Factor on the number of cells along each axis of the scene.")
 ]
 Albedo = Annotated[
     str | None,
-    typer.Option(metavar="R,G,B", help="Share of light that a scattering leaves, or one number; default the scene's."),
+    typer.Option(metavar="R,G,B", help="Single scattering albedo, three numbers or one; default the scene's."),
 ]
-Input = Annotated[Path, typer.Argument(metavar="SMOKE", help="A .npz, .nvdb or .vdb volume, or a folder of frames.")]
+G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
+White = Annotated[float, typer.Option(help="Radiance that becomes white in a PNG.")]
+Background = Annotated[
+    str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke; default the scene's, or black.")
+]
+Input = Annotated[
+    Path, typer.Argument(metavar="SMOKE", help="A volume (.npz, .nvdb, .vdb) or a folder of numbered volumes.")
+]
 
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of the smoke, its camera and the device, each spelled out once for all commands `with_smoke`."""
+    """Options of a volume, its camera and the device, for all commands `with_smoke`."""
 
     resolution: Annotated[
-        int | None, typer.Option(min=1, max=16384, help="Pixels along the image's height; default the scene's, or 512.")
+        int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's, or 512.")
     ] = None
-    toward: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="From the smoke to the camera; default the scene's, or 0,0,1.")
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Camera setting, repeatable: toward=X,Y,Z from the smoke to the camera; turn=DEGREES about the upward "
+            "axis; extent=HEIGHT of the image in world units; distance=LENGTH to the target; perspective=true.",
+        ),
     ] = None
-    turn: Annotated[float, typer.Option(help="Degrees by which the camera is turned about the upward direction.")] = 0.0
-    extent: Annotated[
-        float | None, typer.Option(help="Height of the image in the world; default such that the box fits.")
-    ] = None
-    distance: Annotated[
-        float | None, typer.Option(help="Of the camera from its target; what is behind it isn't seen. Default outside.")
-    ] = None
-    extinction: Annotated[float | None, typer.Option(help="Per length of density 1; default the scene's, or 1.")] = None
-    emission: Annotated[float | None, typer.Option(help="Per length of temperature 1; default the scene's, or 1.")] = (
-        None
-    )
-    up: Annotated[
-        str | None, typer.Option(metavar="AXIS", help="x, y or z: upwards in the file, +y here; default y.")
-    ] = None
-    density: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of the grid of density; default density, else the first.")
-    ] = None
-    temperature: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of the grid of temperature; default temperature, if any.")
+    volume: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Volume setting, repeatable: up=x|y|z, the upward axis of the file; extinction=PER_LENGTH at density "
+            "1; emission=PER_LENGTH at temperature 1; density=GRID and temperature=GRID, names of the grids.",
+        ),
     ] = None
     trust: Trust = False
     device: Device = "cpu"
 
-    def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, but for those of any input."""
-        names = [field.name for field in fields(self) if field.name not in ("device", "trust")]
-        values = {name: getattr(self, name) for name in names}
-        return {name: value for name, value in values.items() if value != getattr(SmokeOptions, name)}
-
     def open(self, smoke: Path) -> "Frames":
-        """Opens a volume or a folder of frames, on a device that there is."""
+        """Opens a volume or a folder of frames.
+
+        Raises:
+            WlmError: A setting is wrong, there is no such device, or the smoke cannot be opened.
+        """
         from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
 
-        device = check_device(self.device)
-        names = {"up": self.up, "density": self.density, "temperature": self.temperature}
-        factors = {"extinction": self.extinction, "emission": self.emission}
-        if self.up is not None and self.up not in UPS:
-            raise WlmError(f"--up: expected one of {', '.join(UPS)}, got {self.up!r}")
-        return load_frames(smoke, **factors, **names, trust=self.trust or None, device=device)
+        settings: dict[str, Any] = _pairs("--volume", self.volume, _VOLUME)
+        if settings.get("up", "y") not in UPS:
+            raise WlmError(f"--volume up: expected one of {', '.join(UPS)}, got {settings['up']!r}")
+        for name in ("extinction", "emission"):
+            if name in settings:
+                settings[name] = _float(f"--volume {name}", settings[name])
+        return load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
 
-    def camera(self, frames: "Frames", *, orthographic: bool = True, perspective: bool = False) -> "CameraSettings":
-        """The scene's camera, or the default one, changed by the options.
+    def view(self, frames: "Frames", *, orthographic: bool = True) -> "CameraSettings":
+        """Returns the camera of the scene, or the default one, changed by the options.
 
         Raises:
-            WlmError: An option is out of its range, or lightmaps are to be made in perspective.
+            WlmError: A setting is wrong, or `orthographic` lightmaps are to be made in perspective.
         """
         from wlm.config import check_settings
         from wlm.smoke.scene import CameraSettings
 
-        names = ("resolution", "toward", "extent", "distance")
-        changes = {name: value for name, value in self.given().items() if name in names}
-        if self.toward is not None:
-            changes["toward"] = vector("--toward", self.toward)
-        if perspective:
-            changes["perspective"] = True
-        settings = check_settings(CameraSettings, frames.camera.model_dump() | changes, "--").turned(self.turn)
+        changes: dict[str, Any] = _pairs("--camera", self.camera, _CAMERA)
+        turn = _float("--camera turn", changes.pop("turn", "0"))
+        if "toward" in changes:
+            changes["toward"] = vector("--camera toward", changes["toward"])
+        if self.resolution is not None:
+            changes["resolution"] = self.resolution
+        settings = check_settings(CameraSettings, frames.camera.model_dump() | changes, "--camera ").turned(turn)
         if orthographic and settings.perspective:
             raise WlmError(f"{frames.path}: camera.perspective: expected false for six-way lightmaps, found true")
         return settings
 
 
 def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of `SmokeOptions`, which it takes as its parameter `options`."""
+    """Gives a command the options of `SmokeOptions`, which it receives as its parameter `options`."""
     signature = inspect.signature(command)
     names = [field.name for field in fields(SmokeOptions)]
 
@@ -125,8 +130,34 @@ def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
+    """Reads the values of a repeatable option NAME=VALUE.
+
+    Raises:
+        WlmError: A value has another form or an unknown name.
+    """
+    values = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not equals or name not in names:
+            raise WlmError(f"{option}: expected NAME=VALUE with a name of {', '.join(names)}, got {text!r}")
+        values[name] = value
+    return values
+
+
+def _float(option: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise WlmError(f"{option}: expected a number, got {text!r}") from None
+
+
 def vector(option: str, text: str) -> tuple[float, float, float]:
-    """Three finite numbers of an option's text."""
+    """Reads three finite numbers from the text of an option.
+
+    Raises:
+        WlmError: The text has another form.
+    """
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -136,8 +167,25 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
+    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples.
+
+    Raises:
+        WlmError: The text has another form.
+    """
+    place, colon, colour = text.partition(":")
+    values = [vector(option, place)]
+    if colon:
+        values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
+    return values
+
+
 def given_albedo(text: str | None) -> tuple[float, float, float] | None:
-    """The numbers of `--albedo`, one for all colours or three; None: it isn't given."""
+    """Reads the numbers of `--albedo`, one for all colours or three; None if it is not given.
+
+    Raises:
+        WlmError: The text has another form, or a number is outside 0 to 1.
+    """
     if text is None:
         return None
     values = vector("--albedo", text if "," in text else ",".join([text] * 3))
@@ -146,8 +194,28 @@ def given_albedo(text: str | None) -> tuple[float, float, float] | None:
     return values
 
 
+def check_white(white: float) -> None:
+    """Checks the value of `--white`.
+
+    Raises:
+        WlmError: It is not above 0.
+    """
+    if not 0 < white < float("inf"):
+        raise WlmError(f"--white: expected a number above 0, got {white}")
+
+
+def check_choice(option: str, value: str, choices: Sequence[str]) -> None:
+    """Checks a value that must be one of several words.
+
+    Raises:
+        WlmError: It is not one of them.
+    """
+    if value not in choices:
+        raise WlmError(f"{option}: expected one of {', '.join(choices)}, got {value!r}")
+
+
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> Callable[[int], Path]:
-    """Checks where results go, a file or for frames a folder; returns the file of a frame, ready to be written."""
+    """Checks the output, a file or for frames a folder, and returns a function for the file of a frame."""
     from wlm.smoke.data import NumberedFiles
 
     if single:
@@ -162,26 +230,13 @@ def _check_folder(smoke: Path, output: Path) -> None:
         raise WlmError(f"{output}: expected another folder than that of the frames")
 
 
-def place_and_colour(option: str, text: str) -> list[tuple[float, float, float]]:
-    """The numbers of `X,Y,Z[:R,G,B]`, or of `X,Y,Z[:E]` for a white light: one or two triples, not checked.
-
-    Raises:
-        WlmError: They aren't numbers.
-    """
-    place, colon, colour = text.partition(":")
-    values = [vector(option, place)]
-    if colon:
-        values.append(vector(option, colour if "," in colour else ",".join([colour] * 3)))
-    return values
-
-
 def march_frames(
     frames: "Frames",
     camera: "CameraSettings",
     output: Path,
     stem: str,
     make: "Callable[[int, Callable[[], Path], DensityVolume, Camera], None]",
-    settings: dict[str, Any],
+    settings: Mapping[str, Any],
     *,
     resume: bool,
 ) -> None:
@@ -189,13 +244,13 @@ def march_frames(
 
     Args:
         frames: The smoke.
-        camera: Before each frame.
+        camera: The camera of all frames.
         output: A file, or for frames a folder.
-        stem: Of the folder's files.
-        make: Makes one, of a frame's number, a volume and a camera; it gets the path from a function when there is
-            something to write.
-        settings: What results depend on beside smoke and camera, as JSON values.
-        resume: Whether to leave out the frames that an interrupted run of the same settings has made.
+        stem: First part of the names in the folder.
+        make: Makes an EXR of a frame's number, volume and camera; it calls a function for the path when it is about to
+            write.
+        settings: JSON values that the results depend on besides smoke and camera.
+        resume: Whether to keep the frames that an interrupted run of the same settings has made.
     """
     from wlm.smoke.data import NumberedFiles
 
@@ -209,15 +264,15 @@ def march_frames(
         smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
         scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
         views = {"scene": scene, "camera": camera.model_dump(mode="json")}
-        files = NumberedFiles(output, stem, ".exr", SHEET, run=settings | smoke | views, resume=resume)
+        run = {**settings, **smoke, **views}
+        files = NumberedFiles(output, stem, ".exr", SHEET, run=run, resume=resume)
         file, numbers, partial = files.file, [each for each in frames.numbers if each not in files.done], files.partial
         if resume:
             done = len(files.done)
-            note(f"{output}: {done} frames are there" if done else f"{partial}: there is nothing to resume")
+            note(f"{output}: {done} frames are finished" if done else f"{partial}: there is nothing to resume")
     with running(stem, partial, "frame", whole=False) as progress:
         for frame, volume in frames.volumes(numbers, progress):
-            for warning in volume.warnings:
-                note(f"warning: {warning}")
+            note_warnings(volume.warnings)
             make(frame, functools.partial(file, frame), volume, frames.view(camera, volume))
     if partial is not None:
         files.finish()
@@ -228,26 +283,25 @@ def write_lightmaps(
     camera: "CameraSettings",
     output: Path,
     make: "Callable[[DensityVolume, Camera], SixWay]",
-    settings: dict[str, Any],
+    settings: Mapping[str, Any],
     *,
     resume: bool,
     errors: bool = False,
 ) -> None:
-    """Makes lightmaps of each frame, writes them and shows a table; notes lightmaps that aren't bright where named.
+    """Makes and writes the lightmaps of each frame, shows a table, and notes lightmaps that are dark where lit.
 
     Args:
-        frames: The smoke.
-        camera: Before each.
-        output: A file, or for frames a folder.
-        make: Makes the lightmaps.
-        settings, resume: As for `march_frames`; with an "albedo" that isn't None the lightmaps have it already.
-        errors: Whether they come with the error of their step.
+        frames, camera, output, resume: Arguments of `march_frames`.
+        make: Makes the lightmaps of a volume.
+        settings: As for `march_frames`; an "albedo" other than None is part of the lightmaps already.
+        errors: Whether the lightmaps have the error of their step.
     """
     from wlm.smoke.camera import axis_faults
     from wlm.smoke.data import write_six_way
     from wlm.smoke.flipbook.shots import with_surface
 
-    rows = table(str(frames.path), ["file", "covered", "mean light", *(["largest error", "RMS error"] * errors)])
+    columns = ["file", "covered pixels", "mean light", *(["largest error", "RMS error"] * errors)]
+    rows = table(str(frames.path), columns)
 
     def write(frame: int, file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
         looks = frames.looks(frame)

@@ -1,13 +1,17 @@
-"""`wlm view`: a window that shows a file, or a picture or a movie of it."""
+"""`wlm view`: shows a file in a window, or writes a picture or an animation of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
-from wlm.cli.options import Original, SceneFile, Up
+from wlm.cli.options import Key, Original, SceneFile, Up
 from wlm.errors import WlmError
+
+_SLIDERS = ("hour", "frame", "turn", "height", "sigma", "exposure", "error")
+_SETTINGS = ("extinction", "block")
 
 
 def view(
@@ -15,47 +19,46 @@ def view(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="A .wlm, the folder of wlm atlas compress, an input of ours, or six-way EXRs, one a frame.",
+            help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr per frame).",
         ),
     ],
     mesh: SceneFile = None,
     original: Original = None,
-    key: Annotated[str | None, typer.Option(help="Which of a file's arrays of probes.")] = None,
-    view: Annotated[str | None, typer.Option(help="light or tiles; of probes balls, gaussians or volume.")] = None,
-    outside: Annotated[
-        bool, typer.Option("--outside", help="Draw a room's walls from outside too, where they hide it.")
-    ] = False,
-    flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap unwrapped, not on its mesh.")] = False,
-    hour: Annotated[float | None, typer.Option(help="Of lightmaps; half past six in the evening is 18.5.")] = None,
-    frame: Annotated[float | None, typer.Option(help="Of smoke, or of the walk; the first is 1.")] = None,
-    turn: Annotated[
-        float | None, typer.Option(help="Of smoke's light, degrees to the right; else of the camera.")
+    key: Key = None,
+    view: Annotated[
+        str | None, typer.Option(help="Drawing: light or tiles; for probes balls, gaussians or volume.")
     ] = None,
-    height: Annotated[float | None, typer.Option(help="Of smoke's light, degrees up.")] = None,
-    sigma: Annotated[float | None, typer.Option(help="How large Gaussians are drawn, in standard deviations.")] = None,
-    exposure: Annotated[float | None, typer.Option(help="Stops above or below what fits the light.")] = None,
-    error: Annotated[float | None, typer.Option(help="Factor on the error, 1 to 64.")] = None,
-    tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="What becomes of light above white.")] = "clamped",
+    outside: Annotated[bool, typer.Option("--outside", help="Also draw walls whose outside hides the room.")] = False,
+    flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
+    sliders: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or the walk; turn=DEGREES "
+            "and height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
+            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; extinction=PER_LENGTH of smoke at density 1; "
+            "block=SIDE of the finest blocks of the volume of probes.",
+        ),
+    ] = None,
+    tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",
     walk: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as wlm probe walk --path takes.")
+        Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as for wlm probe volume --path.")
     ] = None,
-    block: Annotated[
-        float | None, typer.Option(help="Side of the volume's finest blocks; default from the probes' spacing.")
-    ] = None,
-    extinction: Annotated[float | None, typer.Option(help="Of a volume of smoke, at density 1.")] = None,
     up: Up = "y",
-    rate: Annotated[float, typer.Option(help="Frames a second of a movie, and of frames that are played.")] = 24.0,
-    frames: Annotated[int | None, typer.Option(help="Pictures of a movie; default 48, or all frames.")] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of the window, pixels.")] = "1280x720",
+    rate: Annotated[float, typer.Option(help="Frames per second of an animation or of frames.")] = 24.0,
+    frames: Annotated[int | None, typer.Option(help="Pictures of an animation; default 48, or all frames.")] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write a picture; needs no display.")
     ] = None,
     movie: Annotated[
-        Path | None, typer.Option(metavar="OUT.gif", help="Write it played, .gif or .webp; needs no display.")
+        Path | None, typer.Option(metavar="OUT.gif", help="Write an animation, .gif or .webp; needs no display.")
     ] = None,
 ) -> None:
-    """Show a file in a window: its light at any hour, beside the original and the error, tiles, probes, smoke."""
+    """Show a file in a window: light at any hour beside the original and the error, tiles, probes, smoke."""
     pixels = _size(size)
+    values = _values(sliders or ())
     if not 0 < rate <= 1000:
         raise WlmError(f"--rate: expected a number above 0, at most 1000, got {rate:g}")
     if screenshot is not None:
@@ -63,26 +66,18 @@ def view(
     if movie is not None:
         check_output(movie, ".gif", ".webp")
     elif frames is not None:
-        raise WlmError("--frames: means nothing without --movie")
+        raise WlmError("--frames: has no meaning without --movie")
     quiet_warp()
     from wlm.view.opening import open_scene
     from wlm.view.rendering import import_pyvista
     from wlm.view.window import Window
 
     import_pyvista("view")
+    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "flat": flat, "up": up}
+    options |= {name: values.pop(name) for name in _SETTINGS if name in values}
     with running("view") as progress:
-        scene = open_scene(
-            files,
-            mesh=mesh,
-            original=original,
-            key=key,
-            walk=walk,
-            block=block,
-            extinction=extinction,
-            flat=flat,
-            up=up,
-            progress=progress if len(files) > 1 or files[0].is_dir() else None,
-        )
+        many = len(files) > 1 or files[0].is_dir()
+        scene = open_scene(files, **options, progress=progress if many else None)
     window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None or movie is not None)
     try:
         window.tone(tone)
@@ -91,14 +86,10 @@ def view(
         if view is not None or walk is not None:
             window.choose(view or "volume")
         window.look()
-        values = {"hour": hour, "frame": frame, "height": height, "sigma": sigma, "exposure": exposure, "error": error}
-        if turn is not None and "turn" not in window.sliders and not scene.flat:
-            window.turn(turn)
-        else:
-            values["turn"] = turn
+        if "turn" in values and "turn" not in window.sliders and not scene.flat:
+            window.turn(values.pop("turn"))
         for name, value in values.items():
-            if value is not None:
-                window.set(name, value)
+            window.set(name, value)
         if screenshot is None and movie is None:
             window.show()
             return
@@ -113,6 +104,19 @@ def view(
         show(rows)
     finally:
         window.close()
+
+
+def _values(texts: Sequence[str]) -> dict[str, float]:
+    values = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            values[name] = float(number)
+        except ValueError:
+            name = ""
+        if name not in (known := (*_SLIDERS, *_SETTINGS)):
+            raise WlmError(f"--set: expected NAME=NUMBER with a name of {', '.join(known)}, got {text!r}")
+    return values
 
 
 def _size(text: str) -> tuple[int, int]:

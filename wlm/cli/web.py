@@ -1,4 +1,4 @@
-"""`wlm web`: a page that shows a file in any browser."""
+"""`wlm web`: writes an HTML page that shows a compressed file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
-from wlm.cli.options import Original, SceneFile, Up, output_option
+from wlm.cli.options import Key, Original, SceneFile, Up, output_option
 
 
 def web(
@@ -14,18 +14,18 @@ def web(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="A .wlm of lightmaps or probes, the folder of wlm atlas compress, or six-way EXRs or their folder.",
+            help="A .wlm of lightmaps, meshes or probes; or six-way lightmaps (.exr, one per frame, or a folder).",
         ),
     ],
     output: Annotated[Path, output_option("PAGE.html", "The page to write.")],
     mesh: SceneFile = None,
     original: Original = None,
-    key: Annotated[str | None, typer.Option(help="Which of the original's arrays of probes.")] = None,
-    hours: Annotated[int, typer.Option(min=1, help="Most frames of the original set that the page carries.")] = 6,
-    rate: Annotated[float, typer.Option(help="Of smoke: frames a second.")] = 30.0,
+    key: Key = None,
+    hours: Annotated[int, typer.Option(min=1, help="Most lightmaps of the original set that the page contains.")] = 6,
+    rate: Annotated[float, typer.Option(help="Frames per second of smoke.")] = 30.0,
     up: Up = "y",
 ) -> None:
-    """Write one HTML file that shows the light, decoded by the browser's GPU; it needs no network."""
+    """Write one HTML file that decodes and shows the light on the GPU of a browser. It works without a network."""
     check_output(output, ".html")
     quiet_warp()
     from wlm.export import write_page

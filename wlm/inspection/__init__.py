@@ -1,9 +1,10 @@
-"""What files and folders hold, which command takes them, and what may be wrong with them: `inspect`."""
+"""Describes files and folders: their content, the command that reads them, and possible problems."""
 
 from wlm._facade import facade
 
 _PLACES = {
     "Finding": "wlm.inspection.finding",
+    "input_system": "wlm.inspection.folders",
     "inspect": "wlm.inspection.folders",
 }
 

@@ -1,10 +1,14 @@
-"""What a single file holds, told by its content and, where that doesn't tell, by its name."""
+"""Describes single files by their content and, where that is not enough, by their names.
+
+`_KINDS` is the one table of the kinds of files: `inspect` describes a file by it, and `wlm compress` finds the system
+of its input.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,17 +21,16 @@ from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
 from wlm.formats.unity_asset import read_lighting_data
-from wlm.inspection.finding import Finding, quoted
+from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
-from wlm.system import load
+from wlm.system import load, system_of
 
 _MAGIC = 16
-_VDB = b" BDV\0\0\0\0"
-BAKED = "lightmaps that wlm bake lightmaps made, with their noise and coverage"
-"""What is said of the folder of a bake."""
-ATLAS = "a compressed lightmap of a mesh"
-"""What is said of the folder of an atlas."""
+BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
+"""Description of the folder of a bake."""
+FRAMES = "frames of smoke that wlm smoke simulate wrote"
+"""Description of a folder of smoke."""
 
 # Exports that can be read back.
 _PROBE_EXPORTS = {
@@ -35,44 +38,73 @@ _PROBE_EXPORTS = {
     "wlm-unity-probes": "light probes for Unity",
     "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
 }
-# What says of itself in JSON that it is ours, and what to do with it.
+# `format` of our JSON documents and the description of the folders that they are in.
 _EXPORTS = _PROBE_EXPORTS | {
-    "wlm-atlas": ATLAS,
     "wlm-bake": BAKED,
-    "wlm-lightmap-export": "lightmaps over time for an engine: textures, weights and a shader",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
-    "wlm-atlas-scene": "the compressed lightmaps of a scene: wlm atlas evaluate and export take it",
-    "wlm-lightmap-layers-export": "layered lightmaps for an engine: a folder for each sheet",
-    "wlm-probe-export": "light probes for an engine: buffers and a shader",
-    "wlm-probe-volume": "a cascaded volume of probes for an engine: buffers and shaders",
+    "wlm-atlas": "a compressed lightmap of a mesh",
+    "wlm-atlas-scene": "the compressed lightmaps of a scene",
+    "wlm-lightmap-export": "lightmaps over time: textures, weights and a shader",
+    "wlm-lightmap-layers-export": "layered lightmaps: a folder for each sheet",
+    "wlm-probe-export": "light probes: buffers and a shader",
+    "wlm-probe-volume": "a cascaded volume of probes: buffers and shaders",
     "wlm-godot-light": "light probes for Godot",
-    "wlm-smoke-frames": "frames of smoke that wlm smoke simulate wrote",
+    "wlm-smoke-frames": FRAMES,
 }
+_MODELS = {
+    "lightmap": "compressed lightmaps over time",
+    "atlas": "compressed lightmaps of meshes",
+    "probe": "compressed light probes",
+    "smoke": "a network that predicts six-way lightmaps",
+}
+_MOST_NAMES = 8  # names that one line lists
+
+
+def kind_of(path: Path) -> str:
+    """Finds the kind of a file from its first bytes, its suffix, or the names inside it; reads no large part of it.
+
+    Returns:
+        A key of the table of kinds, "" if the kind is unknown.
+
+    Raises:
+        WlmError: The file cannot be read.
+    """
+    if picture_of(path) is not None:
+        return "picture"
+    with open_file(path, "the file") as file:
+        head = file.read(_MAGIC)
+    kind = next((kind for magic, kind in _BY_MAGIC.items() if head.startswith(magic)), None)
+    kind = kind or _BY_SUFFIX.get(path.suffix.lower(), "")
+    if kind == "arrays":
+        names = _names(path)
+        return "volume" if "density" in names else "probes" if _value_names(names) else "arrays"
+    return _kind_of_json(path) if kind == "json" else kind
 
 
 def inspect_file(path: Path) -> Finding:
-    """Says what a file holds; a damaged one is said to be that."""
+    """Describes a file. An unreadable file gives a finding, not an error."""
     try:
-        picture = picture_of(path)
-        if picture is not None:
-            return inspect_picture(path, picture)
-        with open_file(path, "the file") as file:
-            head = file.read(_MAGIC)
-        for magic, inspect in _BY_MAGIC.items():
-            if head.startswith(magic):
-                return inspect(path)
-        inspect = _BY_SUFFIX.get(path.suffix.lower())
-        if inspect is not None:
-            return inspect(path)
+        if kind := kind_of(path):
+            return _KINDS[kind].inspect(path)
     except WlmError as error:
-        return Finding(path, "can't be read", problems=(said(error, path),))
+        return Finding(path, UNREADABLE, problems=(said(error, path),))
     if path.suffix.lower() in (*SUFFIXES, ".png"):
-        return Finding(path, "can't be read", problems=(f"is called {path.suffix} and holds something else",))
-    return Finding(path, "no kind of file that is known here")
+        return Finding(path, UNREADABLE, problems=(f"its content does not match the suffix {path.suffix}",))
+    return Finding(path, "unknown kind of file")
+
+
+def file_system(path: Path) -> str:
+    """Returns the system that compresses a file, "" if there is none.
+
+    Raises:
+        WlmError: The file cannot be read.
+    """
+    kind = kind_of(path)
+    return _KINDS[kind].system if kind else ""
 
 
 def document_of(path: Path) -> str | None:
-    """What a JSON file says that it is, where it is one of ours; None of others and of what can't be read."""
+    """Returns the description of one of our JSON documents; None for other files and unreadable ones."""
     try:
         content = read_json_file(path, "the file")
     except WlmError:
@@ -80,7 +112,7 @@ def document_of(path: Path) -> str | None:
     return _EXPORTS.get(str(content.get("format"))) if isinstance(content, dict) else None
 
 
-def _npz(path: Path) -> Finding:
+def _names(path: Path) -> list[str]:
     names: list[str] = []
 
     def look(found: Sequence[str]) -> list[str]:
@@ -88,39 +120,43 @@ def _npz(path: Path) -> Finding:
         return []
 
     read_npz(path, look, numbers=0)
-    if "density" in names:
-        return _volume(path)
-    values = [name for name in names if name.startswith("sh")]
-    if "position" in names and values:
-        return _probes(path, values)
-    return Finding(
-        path, f"arrays: {', '.join(names[:8]) or 'none'}", problems=("neither probes nor a volume of smoke",)
-    )
+    return names
 
 
-def _probes(path: Path, keys: Sequence[str] = ()) -> Finding:
+def _value_names(names: Sequence[str]) -> list[str]:
+    """Returns the arrays of an .npz that hold probes; none if there are no positions."""
+    return [name for name in names if name.startswith("sh")] if "position" in names else []
+
+
+def _arrays(path: Path) -> Finding:
+    names = ", ".join(_names(path)[:_MOST_NAMES]) or "none"
+    return Finding(path, f"arrays: {names}", problems=("neither light probes nor a volume of smoke",))
+
+
+def _probes(path: Path) -> Finding:
     from wlm.probe.data import load as load_probes
 
+    keys = _value_names(_names(path)) if path.suffix.lower() == ".npz" else []
     key = keys[0] if len(keys) > 1 else None
     probes = load_probes(path, key=key)
     coefficients = probes.outputs // 3 if probes.outputs % 3 == 0 else 0
     form = f"{coefficients} RGB coefficients" if coefficients else f"{probes.outputs} numbers"
     what = f"{probes.probes:,} light probes of {form}, {int(probes.live.sum()):,} of them lit"
     if len(keys) > 1:
-        what += f", under the keys {', '.join(keys[:8])}"
-    option = "" if key is None else f" --key {key.removeprefix('sh_')}"
+        what += f", under the keys {', '.join(keys[:_MOST_NAMES])}"
     problems = list(probes.warnings)
     if coefficients:
-        # Of radiance that is nowhere negative, no other coefficient is beyond the first one by more than this.
+        # No coefficient of nonnegative radiance exceeds the first one by more than this factor.
         mean = probes.values[probes.live][:, :3]
         rest = np.abs(probes.values[probes.live][:, 3:]).reshape(len(mean), -1, 3)
         if rest.size and (wrong := int(np.count_nonzero((rest > 2.3 * np.abs(mean)[:, None]).any((1, 2))))):
-            problems.append(f"{wrong} have a coefficient beyond what light can: another order, or convention?")
-    return Finding(path, what, f"wlm probe compress {quoted(path)}{option} -o OUT.wlm", tuple(problems))
+            problems.append(f"{wrong} probes have coefficients too large for radiance: another order or convention?")
+    options = () if key is None else ("--key", key.removeprefix("sh_"))
+    return Finding(path, what, compress_command(path, *options), tuple(problems))
 
 
 def _lmbake(path: Path) -> Finding:
-    """Godot's probes, and the lightmap that some meshes read."""
+    """Describes the probes of a Godot bake and the lightmap of its meshes."""
     found = _probes(path)
     try:
         bake = read_users(path)
@@ -128,10 +164,9 @@ def _lmbake(path: Path) -> Finding:
         return replace(found, problems=(*found.problems, said(error, path)))
     if not bake.users:
         return found
-    textures = ", ".join(each.rsplit("/", 1)[-1] for each in bake.textures[:8])
+    textures = ", ".join(each.rsplit("/", 1)[-1] for each in bake.textures[:_MOST_NAMES])
     count = f"{len(bake.users)} mesh{'es' if len(bake.users) > 1 else ''}"
-    scene = f"wlm atlas compress SCENE.glb {quoted(path)} -o DIR takes it with its scene"
-    return replace(found, what=f"{found.what}; {count} with rectangles in {textures}: {scene}")
+    return replace(found, what=f"{found.what}; {count} with rectangles in {textures}, compressed with their scene")
 
 
 def _volume(path: Path) -> Finding:
@@ -143,16 +178,18 @@ def _volume(path: Path) -> Finding:
     what = f"a volume of smoke, {size} voxels of {volume.voxel:.3g}{hot}"
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
-        problems.append("no smoke in it")
-    up = ""
+        problems.append("its density is 0 everywhere")
+    options: tuple[str, ...] = ()
     if path.suffix.lower() != ".npz" and is_long_along_z(volume):
-        up = " --up z"
-        problems.append("longest along z, which is taken for up, as in Blender and Unreal: without --up z if y is")
-    return Finding(path, what, f"wlm smoke bake {quoted(path)}{up} -o OUT.exr", tuple(problems))
+        options = ("--volume", "up=z")
+        problems.append(
+            "it is longest along z, which is taken for up as in Blender and Unreal; leave --volume out if y is"
+        )
+    return Finding(path, what, command("smoke", "bake", path, *options, "-o", "OUT.exr"), tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
-    if path.suffix.lower() == ".obj":
+    if path.suffix.lower() not in (".glb", ".gltf"):
         mesh = read_geometry(path, with_uv=False)
         parts, sets, uvs = 1, "", []
         count = len(mesh.triangle)
@@ -173,70 +210,88 @@ def _mesh(path: Path) -> Finding:
         a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         area = float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2.0)
         if corners.min() < -1e-3 or corners.max() > 1.001:
-            problems.append("UVs beyond 0 to 1: of a repeated texture, not of a lightmap?")
+            problems.append("its UVs exceed 0 to 1: are they those of a repeated texture, not of a lightmap?")
         elif area > 1.0:
-            cause = "each mesh may have a lightmap of its own" if parts > 1 else "not of a lightmap?"
-            problems.append(f"its triangles have {area:.1f} times the UVs' square: they overlap; {cause}")
-    command = f"wlm atlas compress {quoted(path)} LIGHTMAP -o DIR" if uvs and not problems else ""
-    return Finding(path, what, command, tuple(problems))
+            cause = "each mesh may have its own lightmap" if parts > 1 else "are they those of a lightmap?"
+            problems.append(f"the triangles cover {area:.1f} times the UV square and overlap; {cause}")
+        what += "; compress it together with its lightmap"
+    return Finding(path, what, problems=tuple(problems))
 
 
 def _model(path: Path) -> Finding:
-    model = load(path)
-    if model.SYSTEM == "smoke-network":
-        what = "a network that predicts six-way lightmaps"
-        return Finding(path, what, f"wlm smoke predict SMOKE --network {quoted(path)} -o OUT.exr")
-    kind = {
-        "lightmap": "lightmaps over time",
-        "atlas": "a mesh's lightmap",
-        "atlas-scene": "the lightmaps of a scene",
-        "probe": "light probes",
-    }[model.SYSTEM]
-    command = "" if model.SYSTEM.startswith("atlas") else f"wlm web {quoted(path)} -o PAGE.html"
-    return Finding(path, f"{kind}, compressed: {model.name}", command)
+    model, system = load(path), system_of(path)
+    what = f"{_MODELS[system]}: {model.name}"
+    if system == "smoke":
+        return Finding(path, _MODELS[system], command("info", path))
+    if system == "probe" and not model.has_positions:
+        return Finding(path, f"{what}, without positions", command("info", path))
+    return Finding(path, what, command("web", path, "-o", "PAGE.html"))
 
 
-def _json(path: Path) -> Finding:
+def _kind_of_json(path: Path) -> str:
     content: Any = read_json_file(path, "the file", JSON_BYTES)
-    form = str(content.get("format")) if isinstance(content, dict) else ""
-    if form in _PROBE_EXPORTS:
-        found = _probes(path)
-        return replace(found, what=f"{_PROBE_EXPORTS[form]}: {found.what}")
+    if not isinstance(content, dict):
+        return "json"
+    form = str(content.get("format"))
     if form in _EXPORTS:
-        return Finding(path, _EXPORTS[form])
-    if isinstance(content, dict) and "lightmaps" in content:
-        return inspect_set(path)
-    if isinstance(content, dict) and ("probes" in content or "position" in content):
-        return _probes(path)
-    return Finding(path, "JSON that is nothing known here")
+        return "probe export" if form in _PROBE_EXPORTS else "export"
+    if "lightmaps" in content:
+        return "set"
+    return "probes" if "probes" in content or "position" in content else "json"
+
+
+def _probe_export(path: Path) -> Finding:
+    found = _probes(path)
+    return replace(found, what=f"{document_of(path)}: {found.what}")
 
 
 def _unity_asset(path: Path) -> Finding:
-    """Light probes and rectangles, where it is lighting data; reading it needs an extra."""
+    """Describes lighting data of Unity, which needs an extra to be read."""
     data = read_lighting_data(path)
-    places = f"{len(data.rectangles)} renderers' rectangles in lightmaps, without their names"
+    rectangles = f"{len(data.rectangles)} rectangles of renderers in lightmaps, without names"
     if not len(data.position):
-        return Finding(path, f"lighting data of Unity: no light probes, {places}")
+        return Finding(path, f"lighting data of Unity: no light probes, {rectangles}")
     found = _probes(path)
-    return replace(found, what=f"lighting data of Unity: {found.what}; {places}")
+    return replace(found, what=f"lighting data of Unity: {found.what}; {rectangles}")
 
 
-_BY_MAGIC: dict[bytes, Callable[[Path], Finding]] = {
-    b"RSRC": _lmbake,
-    b"RSCC": _lmbake,
-    b"glTF": _mesh,
-    b"NanoVDB": _volume,
-    _VDB: _volume,
+class _Kind(NamedTuple):
+    """A kind of file: the function that describes it, and the system that compresses it, "" for none."""
+
+    inspect: Callable[[Path], Finding]
+    system: str = ""
+
+
+_KINDS = {
+    "arrays": _Kind(_arrays),
+    "export": _Kind(lambda path: Finding(path, str(document_of(path)))),
+    "godot bake": _Kind(_lmbake, "probe"),
+    "json": _Kind(lambda path: Finding(path, "unknown JSON")),
+    "mesh": _Kind(_mesh, "atlas"),
+    "model": _Kind(_model),
+    "picture": _Kind(inspect_picture),
+    "probe export": _Kind(_probe_export, "probe"),
+    "probes": _Kind(_probes, "probe"),
+    "set": _Kind(inspect_set, "lightmap"),
+    "unity asset": _Kind(_unity_asset, "probe"),
+    "volume": _Kind(_volume, "smoke"),
 }
-_BY_SUFFIX: dict[str, Callable[[Path], Finding]] = {
-    ".npz": _npz,
-    ".lmbake": _lmbake,
-    ".glb": _mesh,
-    ".gltf": _mesh,
-    ".obj": _mesh,
-    ".nvdb": _volume,
-    ".vdb": _volume,
-    ".wlm": _model,
-    ".json": _json,
-    ".asset": _unity_asset,
+_BY_MAGIC = {
+    b"RSRC": "godot bake",
+    b"RSCC": "godot bake",
+    b"glTF": "mesh",
+    b"NanoVDB": "volume",
+    b" BDV\0\0\0\0": "volume",
+}
+_BY_SUFFIX = {
+    ".npz": "arrays",
+    ".lmbake": "godot bake",
+    ".glb": "mesh",
+    ".gltf": "mesh",
+    ".obj": "mesh",
+    ".nvdb": "volume",
+    ".vdb": "volume",
+    ".wlm": "model",
+    ".json": "json",
+    ".asset": "unity asset",
 }

@@ -1,20 +1,23 @@
-"""What is said of a file or a folder."""
+"""A description of a file or a folder, and the commands that it may name."""
 
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+UNREADABLE = "cannot be read"
+"""Description of unreadable files and folders."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A file, a folder, or files of a folder that belong together.
+    """Description of a file, of a folder, or of files in a folder that belong together.
 
     Attributes:
         path: The file or the folder.
-        what: What it holds, in a line.
-        command: What takes it, "" where nothing does.
-        problems: What is missing, damaged or looks wrong, a line each.
+        what: The content, in one line.
+        command: A command that reads it and works as written; "" where there is none.
+        problems: Missing or damaged files and suspicious values, one line each.
     """
 
     path: Path
@@ -23,10 +26,15 @@ class Finding:
     problems: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The finding as JSON values."""
-        return asdict(self) | {"path": str(self.path), "problems": list(self.problems)}
+        """Returns the finding as JSON values."""
+        return {"path": str(self.path), "what": self.what, "command": self.command, "problems": list(self.problems)}
 
 
-def quoted(path: Path) -> str:
-    """A path as a shell takes it."""
-    return shlex.quote(str(path))
+def command(*words: str | Path) -> str:
+    """Writes a `wlm` command, quoted for a shell."""
+    return shlex.join(["wlm", *map(str, words)])
+
+
+def compress_command(*words: str | Path) -> str:
+    """Writes the command that compresses inputs with some options."""
+    return command("compress", *words, "-o", "OUT.wlm")

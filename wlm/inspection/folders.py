@@ -1,8 +1,9 @@
-"""What a folder holds as a whole, and the files in it that belong to nothing else."""
+"""Describes folders: files that belong together, and the other files in them."""
 
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -11,32 +12,32 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import ATLAS, BAKED, document_of, inspect_file
-from wlm.inspection.finding import Finding, quoted
-from wlm.inspection.pictures import picture_of, said
-from wlm.inspection.sets import UNREADABLE, compress_command, inspect_set, named, together
+from wlm.inspection.files import BAKED, FRAMES, document_of, file_system, inspect_file, kind_of
+from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
+from wlm.inspection.pictures import Picture, picture_of, said
+from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
 from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders, time_of_name
 
 MOST = 256
-"""Findings that are told, and folders that are looked into."""
+"""Most findings of `inspect`, and most folders that it visits."""
 
 _DEEPEST = 4
-_ENTRIES = 20_000  # of one folder
-_DOCUMENTS = 64  # of one folder, that are read to see whether they are of all that is in it
-_SILENT = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
-# The channels of the two textures, as their names have them.
+_ENTRIES = 20_000  # most entries that are read of a folder
+_DOCUMENTS = 64  # most JSON files that are read of a folder
+_IGNORED = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
+# Channels of the two textures of a flip book, as they appear in file names, and the layout.
 _BOOKS = (("rlt", "bbf", "o3de"), ("tlr", "bbf", "embergen"), ("rtb", "lbf", "unity"), ("tlrb", "fb", "o3de-tlrb"))
-_SILENT_NAMES = ("license", "licence", "readme", "copying")
+_IGNORED_NAMES = ("license", "licence", "readme", "copying")
 
 
 def inspect(path: str | os.PathLike[str]) -> list[Finding]:
-    """Says what a file holds, or a folder and those in it, in 256 lines at most.
+    """Describes a file, or a folder and the folders inside it, in at most 256 findings.
 
     Args:
         path: The file or the folder.
 
     Raises:
-        WlmError: There is none, or a folder can't be read.
+        WlmError: It does not exist, or the folder cannot be read.
     """
     path = Path(path)
     if not path.exists():
@@ -54,11 +55,56 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
         found += findings
         if depth < _DEEPEST:
             waiting += [(each, depth + 1) for each in reversed(inside)]
-    return found or [Finding(path, "nothing that is known here")]
+    return found or [Finding(path, "no known kind of file")]
+
+
+def input_system(path: str | os.PathLike[str]) -> str:
+    """Finds the system that compresses an input, from names and headers alone.
+
+    Args:
+        path: The file or the folder.
+
+    Returns:
+        "lightmap", "atlas", "probe" or "smoke".
+
+    Raises:
+        WlmError: It does not exist or cannot be read, or it is not one of these inputs; the line says what to do.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise WlmError(f"{path}: no such file or folder")
+    found = _folder_system(path) if path.is_dir() else file_system(path)
+    if found in _REFUSED or not found:
+        reason = _REFUSED.get(found or ("" if path.is_dir() else kind_of(path)), "the kind of input is not clear")
+        raise WlmError(f"{path}: {reason}; see wlm inspect, or choose with wlm compress --system NAME")
+    return found
+
+
+_REFUSED = {
+    "model": "it is already compressed",
+    "picture": "one lightmap is compressed with its mesh: wlm compress MESH LIGHTMAP",
+    "meshes": "lightmaps of different sizes are compressed with their mesh: wlm compress MESH FOLDER",
+    "export": "it is an export, not an input",
+}
+
+
+def _folder_system(folder: Path) -> str:
+    """Returns the system of a folder, a key of `_REFUSED`, or ""."""
+    if (folder / SET_FILE).is_file() or state_folders(folder):
+        return "lightmap"
+    files = [entry for entry in _entries(folder) if entry.is_file()]
+    documents = [file for file in files if file.suffix.lower() == ".json"][:_DOCUMENTS]
+    if stated := next(filter(None, map(document_of, documents)), None):
+        return "smoke" if stated == FRAMES else "export"
+    pictures = _light(files)
+    if not pictures:
+        return ""
+    sizes = {picture.size for picture in pictures.values() if picture.width}
+    return "meshes" if len(sizes) > 1 else "lightmap"
 
 
 def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
-    """What is in a folder itself, so many findings at most, and the folders in it that belong to none of them."""
+    """Describes a folder in a number of findings; also returns the folders in it that belong to none of them."""
     findings: list[Finding] = []
     taken: set[Path] = set()
     try:
@@ -69,8 +115,8 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
                 findings.append(finding)
                 taken |= its
     except WlmError as error:
-        return [Finding(folder, "can't be read", problems=(said(error, folder),))], []
-    rest = (file for file in files if file not in taken and not _is_silent(file))
+        return [Finding(folder, UNREADABLE, problems=(said(error, folder),))], []
+    rest = (file for file in files if file not in taken and not _is_ignored(file))
     findings += map(inspect_file, islice(rest, max(most - len(findings), 0)))
     inside = [entry for entry in entries if entry not in taken and entry.is_dir() and not entry.is_symlink()]
     return findings[:most], inside
@@ -84,55 +130,51 @@ def _entries(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (natural(path.name), path.name))
 
 
-def _is_silent(file: Path) -> bool:
-    return file.suffix.lower() in _SILENT or file.name.lower().startswith(_SILENT_NAMES)
+def _is_ignored(file: Path) -> bool:
+    return file.suffix.lower() in _IGNORED or file.name.lower().startswith(_IGNORED_NAMES)
 
 
 _Found = list[tuple[Finding, set[Path]]]
 
 
 def _documents(folder: Path, files: Sequence[Path]) -> _Found:
-    """What a JSON of ours says that the folder is; a `set.json`."""
+    """Describes a folder by the JSON documents in it."""
     documents = [file for file in files if file.suffix.lower() == ".json"]
     for file in sorted(documents, key=lambda file: file.name != SET_FILE)[:_DOCUMENTS]:
         if file.name == SET_FILE:
             finding = inspect_set(file)
-            listed = set() if finding.what == UNREADABLE else {file, *named(file, files)}
+            listed = set() if finding.what == UNREADABLE_SET else {file, *named(file, files)}
             if any(document_of(each) == BAKED for each in documents):
                 listed = set(files)
             return [(finding, listed | {file})]
         stated = document_of(file)
         if stated is not None:
-            # All of it is that output's.
-            return [(Finding(folder, stated, _next(folder, stated)), set(files) | set(_entries(folder)))]
+            # All files of the folder belong to that output.
+            bake = command("smoke", "bake", folder, "-o", "DIR") if stated == FRAMES else ""
+            return [(Finding(folder, stated, bake), set(files) | set(_entries(folder)))]
     return []
 
 
-def _next(folder: Path, stated: str) -> str:
-    if stated == ATLAS:
-        return f"wlm web {quoted(folder)} -o PAGE.html"
-    return f"wlm smoke bake {quoted(folder)} -o DIR" if "frames of smoke" in stated else ""
-
-
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
-    """States of light as Unity bakes them, the folder's own or those of folders in it."""
+    """Describes states of light that Unity baked, in the folder itself or in folders inside it."""
     states = state_folders(folder)
     if not states or (folder / SET_FILE).is_file():
         return []
     held = {state: [entry for entry in _entries(state) if "_comp_" in entry.name.lower()] for state in states}
     times = [time_of_name(state.name) for state in states]
-    problems, option = [], ""
+    problems: list[str] = []
+    options: list[str] = []
     if len(states) > 1 and None in times:
-        option = f" --times {','.join(str(i) for i in range(len(states)))}"
-        problems.append(f"the hours of {', '.join(state.name for state in states[:8])} aren't known: say them")
+        options += ["--times", f"0:{len(states)}:1"]
+        problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
     stated: list[float] = [float(i) for i in range(len(states))]
-    layers = ""
     try:
         listing = list_set(folder, stated)
     except WlmError as error:
         problems.append(said(error, folder))
         shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
-        layers, listing = f" --layers {','.join(shared)}", list_set(folder, stated, shared)
+        options += ["--layers", ",".join(shared)]
+        listing = list_set(folder, stated, shared)
     sizes = []
     for atlas in listing.atlases:
         paths = [one[atlas.name, "light"].path for one in listing.states]
@@ -142,17 +184,17 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
-    what = f"{count_of(states, 'state')} of Unity's light, {maps}"
-    finding = Finding(folder, what, compress_command(folder, option + layers), tuple(problems))
+    what = f"{count_of(states, 'state')} of light from Unity, {maps}"
+    finding = Finding(folder, what, compress_command(folder, *options), tuple(problems))
     its = {path for paths in held.values() for path in paths}
     if states == [folder]:
         return [(finding, its)]
-    # What else lies in the states' folders is told here: they aren't looked into again.
+    # Other files in the folders of the states are described here, because these folders are not visited again.
     rest = [
         entry
         for state in states
         for entry in _entries(state)
-        if entry not in its and entry.is_file() and not _is_silent(entry)
+        if entry not in its and entry.is_file() and not _is_ignored(entry)
     ]
     return [(finding, set(states)), *((inspect_file(entry), set()) for entry in rest)]
 
@@ -166,7 +208,7 @@ def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:
-    """Bakes of Godot, with the textures that their meshes read by rectangles."""
+    """Describes bakes of Godot together with the textures that their meshes read."""
     found: _Found = []
     for file in files:
         if file.suffix.lower() != ".lmbake":
@@ -174,13 +216,13 @@ def _godot(folder: Path, files: Sequence[Path]) -> _Found:
         try:
             textures = {texture.rsplit("/", 1)[-1] for texture in read_users(file).textures}
         except WlmError:
-            continue  # told by itself
+            continue  # described by itself
         found.append((inspect_file(file), {file, *(each for each in files if each.name in textures)}))
     return found
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
-    """Pairs of textures of six-way lightmaps, as engines name them."""
+    """Describes pairs of textures that are named as engines name six-way lightmaps."""
     found: _Found = []
     for file in files:
         for first, second, layout in _BOOKS:
@@ -192,19 +234,24 @@ def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
             if other is None:
                 continue
             stated = re.search(r"(\d+)x(\d+)", file.stem)
-            cells = "ROWSxCOLUMNS" if stated is None else f"{stated[2]}x{stated[1]}"
-            book = f"{quoted(file)} --with {quoted(other)} --from {layout} --cells {cells}"
             what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
-            told = Finding(file, what, f"wlm smoke shade {book} -o DIR")
+            book = [file, "--with", other, "--from", layout]
+            problems: tuple[str, ...] = ()
+            words = ["smoke", "shade", *book]
             if not any(map(_may_have_alpha, (file, other))):
-                lacking = "no opacity: wlm smoke shade needs the texture that has it, by a second --with"
-                told = Finding(file, what, f"wlm smoke flipbook {book} -o OUT.png --layout unity", (lacking,))
-            found.append((told, {file, other}))
+                problems = ("no opacity: wlm smoke shade needs the texture that has it as a second --with",)
+                words = ["smoke", "flipbook", *book]
+            if stated is None:
+                problems += ("the name states no cells: wlm smoke shade needs --cells ROWSxCOLUMNS",)
+            else:
+                words += ["--cells", f"{stated[2]}x{stated[1]}", "-o", "OUT.png" if "flipbook" in words else "DIR"]
+            finding = Finding(file, what, "" if stated is None else command(*words), problems)
+            found.append((finding, {file, other}))
     return found
 
 
 def _may_have_alpha(file: Path) -> bool:
-    """Whether a texture has an alpha; true of one that can't be read, of which its reader says what is wrong."""
+    """Returns whether a texture has an alpha channel; True for an unreadable one, whose reader reports the problem."""
     try:
         head = picture_of(file)
         if head is not None and head.kind == "EXR":
@@ -215,42 +262,48 @@ def _may_have_alpha(file: Path) -> bool:
         return True
 
 
-def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
-    """Two or more pictures of light: times of one atlas, frames of smoke, or lightmaps of several meshes."""
-    heads = {}
+def _light(files: Sequence[Path]) -> dict[Path, Picture]:
+    """Reads the headers of all readable pictures of light, except reflection probes."""
+    found = {}
     for file in files:
         if file.suffix.lower() in SUFFIXES:
-            try:
-                heads[file] = picture_of(file)
-            except WlmError:
-                continue  # told by itself
-    heads = {file: head for file, head in heads.items() if head is not None and not head.is_cube and head.kind != "PNG"}
+            with suppress(WlmError):  # an unreadable file is described by itself
+                picture = picture_of(file)
+                if picture is not None and not picture.is_cube and picture.kind != "PNG":
+                    found[file] = picture
+    return found
+
+
+def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes pictures of light: lightmaps over time, frames of smoke, or lightmaps with their mesh."""
+    heads = _light(files)
     smoke = [file for file, head in heads.items() if head.is_six_way]
     if smoke:
         what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
-        return [(Finding(folder, what, f"wlm smoke flipbook {quoted(folder)} -o OUT.png"), set(smoke))]
+        return [(Finding(folder, what, command("smoke", "flipbook", folder, "-o", "OUT.png")), set(smoke))]
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]
+    meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+    if len(pictures) == len(meshes) == 1:
+        mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
+        if UNREADABLE not in (mesh.what, light.what):
+            what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
+            return [
+                (Finding(mesh.path, what, compress_command(mesh.path, light.path), problems), {mesh.path, light.path})
+            ]
     if len(pictures) < 2:
         return []
     problems, alike = together(pictures, [heads[file] for file in pictures])
     if not alike:
-        what = f"{count_of(pictures, 'lightmap')} of different atlases: no times of one"
-        command = f"wlm atlas compress MESH.glb {quoted(folder)} -o DIR"
-        meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+        what = f"{count_of(pictures, 'lightmap')} of different UV layouts, not times of one"
         if len(meshes) == 1:
-            # The charts tell which lightmap is whose.
-            command, what = command.replace("MESH.glb", quoted(meshes[0])), f"{what}, with {meshes[0].name}"
-        return [
-            (
-                Finding(folder, what, command, tuple(problems)),
-                {*pictures, *meshes} if len(meshes) == 1 else set(pictures),
-            )
-        ]
-    option = ""
+            # The charts show which lightmap belongs to which mesh of the scene.
+            words = compress_command(meshes[0], folder)
+            return [(Finding(folder, f"{what}, with {meshes[0].name}", words, tuple(problems)), {*pictures, *meshes})]
+        return [(Finding(folder, f"{what}; compress them with their meshes", problems=tuple(problems)), set(pictures))]
+    options: tuple[str, ...] = ()
     if any(time_of_name(file.stem) is None for file in pictures):
-        option = " --times ..."
-        problems.append("no hours in the names: are they one atlas at several times? then say them")
+        options = ("--times", f"0:{len(pictures)}:1")
+        problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
-    mask = folder / "mask.png"
-    taken = {*pictures, mask} & set(files)
-    return [(Finding(folder, what, compress_command(folder, option), tuple(problems)), taken)]
+    taken = {*pictures, folder / "mask.png"} & set(files)
+    return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]

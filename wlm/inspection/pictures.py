@@ -1,4 +1,4 @@
-"""What a picture holds: light, or data beside it, and whether its numbers can be light."""
+"""Describes pictures: radiance or other data, and whether the values are plausible radiance."""
 
 import struct
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.light import read_light
 from wlm.formats.limits import check_sides
 from wlm.formats.reading import open_file
-from wlm.inspection.finding import Finding, quoted
+from wlm.inspection.finding import Finding, command
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_FIRST = 80  # bytes, the sizes of all but EXR and Radiance among them
-_FACES = 6  # of a cube
+_FIRST = 80  # bytes that include the size, except in EXR and Radiance files
+_FACES = 6  # faces of a cube
 _GUIDE = {"light", "transparency", "depth"}
-# Of lit texels: shares and levels that light seldom has.
+# Share of values at 1, median radiance, and mean distance from 8-bit levels that suggest other data than radiance.
 _AT_ONE, _BRIGHT, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 255.0, 0.08
-_MANY = 1000  # texels, to say something of levels
+_MANY = 1000  # fewest texels for the test of levels
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What the head of a picture says.
+    """Facts from the header of a picture.
 
     Attributes:
         kind: "EXR", "Radiance", "KTX2", "DDS" or "PNG".
-        width, height: Texels; 0: not told by the head.
-        channels: Their names; empty: not told by it.
+        width, height: Size in texels; 0 if the beginning of the file does not state it.
+        channels: Names of the channels; empty if the beginning of the file does not state them.
     """
 
     kind: str
@@ -42,31 +42,31 @@ class Picture:
 
     @property
     def size(self) -> str:
-        """As a message has it."""
+        """The size as text."""
         return f"{self.width}x{self.height}"
 
     @property
     def is_cube(self) -> bool:
-        """Whether it is as long as the six faces of a cube in a row."""
+        """Whether the sides are those of the six faces of a cube in a row."""
         short, long = sorted((self.width, self.height))
         return short > 0 and long == _FACES * short
 
     @property
     def is_six_way(self) -> bool:
-        """Whether it has a channel for the light from each direction."""
+        """Whether there is a channel for the light from each of the six directions."""
         if len(self.channels) < _FACES:
             return False
-        # It brings torch, which takes seconds.
+        # This imports torch, which takes seconds.
         from wlm.smoke.camera import DIRECTIONS
 
         return set(DIRECTIONS) <= set(self.channels)
 
 
 def picture_of(path: Path) -> Picture | None:
-    """Reads the head of a picture; None where it is none.
+    """Reads the header of a picture; returns None for other files.
 
     Raises:
-        WlmError: It can't be read, or it is damaged.
+        WlmError: The file cannot be read or is damaged.
     """
     with open_file(path, "the file") as file:
         head = file.read(_FIRST)
@@ -88,68 +88,70 @@ def picture_of(path: Path) -> Picture | None:
     return None
 
 
-def inspect_picture(path: Path, picture: Picture) -> Finding:
-    """Says what a picture by itself is.
+def inspect_picture(path: Path) -> Finding:
+    """Describes a single picture.
 
     Raises:
-        WlmError: It can't be read.
+        WlmError: The file cannot be read.
     """
-    name = path.name.lower()
+    picture, name = picture_of(path), path.name.lower()
+    if picture is None:
+        raise WlmError(f"{path}: expected a picture")
     if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
-        return Finding(path, what, f"wlm smoke flipbook {quoted(path)} -o OUT.png")
+        return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))
     if _GUIDE <= set(picture.channels):
-        return Finding(path, f"a guiding map of smoke, {picture.size}: predict makes its own, of the volume")
+        return Finding(path, f"a guiding map of smoke, {picture.size}; wlm smoke predict makes its own from a volume")
     if picture.is_cube:
-        return Finding(path, f"a cube's six faces, {picture.size}: a reflection probe; nothing here takes it")
+        return Finding(path, f"six faces of a cube, {picture.size}: a reflection probe, which no command reads")
     if "_comp_dir" in name or "_comp_shadowmask" in name:
-        layer = "directions" if "_comp_dir" in name else "a shadow mask"
-        return Finding(path, f"{layer} of Unity, {picture.size}: read with the light beside it, by its folder")
+        layer = "light directions" if "_comp_dir" in name else "a shadow mask"
+        return Finding(path, f"{layer} of Unity, {picture.size}; read together with the light in its folder")
     if picture.kind == "PNG":
         pixels = read_channels(path)[0]
-        return Finding(path, f"a PNG of {picture.size}, {pixels.shape[2]} channels: a mask, or colours; no light")
+        return Finding(path, f"a PNG of {picture.size}, {pixels.shape[2]} channels: a mask or colours, no radiance")
     pixels, names = read_light(path)
     height, width = pixels.shape[:2]
-    what = f"a picture of light, {picture.kind}, {width}x{height}, {''.join(names)}"
-    return Finding(path, what, f"wlm atlas compress MESH.glb {quoted(path)} -o DIR", problems_of(pixels))
+    what = f"a lightmap, {picture.kind}, {width}x{height}, {''.join(names)}; compress it together with its mesh"
+    return Finding(path, what, problems=problems_of(pixels))
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
-    """What the numbers of light [H, W, 3 or 4] have that light seldom has."""
+    """Finds values in a picture [H, W, 3 or 4] that are unusual for radiance."""
     light = pixels[..., :3]
     problems = []
     finite = np.isfinite(light).all(-1)
     if broken := int(np.count_nonzero(~finite)):
-        problems.append(f"{broken} texels NaN or infinite")
+        problems.append(f"{broken} texels are NaN or infinite")
     used = light[finite] if pixels.shape[2] == 3 else light[finite & (pixels[..., 3] > 0)]
     if below := int(np.count_nonzero((used < 0).any(-1))):
-        problems.append(f"{below} texels negative")
+        problems.append(f"{below} texels are negative")
     used = used[(used > 0).any(-1)]
     if not len(used):
-        return (*problems, "no light at all")
+        return (*problems, "no texel is above 0")
     brightest, middle = float(used.max()), float(np.median(used.max(-1)))
     if brightest > HALF_MAX:
-        problems.append(f"up to {brightest:.3g}, beyond half floats: it is cut to 65,504")
+        problems.append(f"values up to {brightest:.3g} exceed half floats and are clamped to 65,504")
     if middle > _BRIGHT:
-        problems.append(f"half of it above {middle:.3g}: in lux, or multiplied for an encoding?")
+        problems.append(f"half of the texels exceed {middle:.3g}: are they in lux, or scaled for an encoding?")
     if brightest == 1.0 and np.count_nonzero(used == 1.0) > _AT_ONE * used.size:
-        problems.append("cut at 1: colours for a screen, not light?")
+        problems.append("values are clamped at 1: are they screen colours instead of radiance?")
     if len(used) >= _MANY and brightest <= 1.0 and _from_level(used) < _NEAR_LEVEL:
-        problems.append("in 256 levels: made of a picture of 8 bits?")
+        problems.append("values have 256 levels: were they converted from an 8-bit picture?")
     return tuple(problems)
 
 
 def _from_level(light: np.ndarray) -> float:
-    """How far light [N, 3] is from the nearest of 256 levels, on the mean, in levels."""
+    """Returns the mean distance of values [N, 3] from the nearest of 256 levels, in levels."""
     codes = light[:: max(1, len(light) // 65536)] * _LEVELS
     return float(np.abs(codes - np.rint(codes)).mean())
 
 
 def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The texels of a lightmap that have light, or a chart where its alpha says so; and its problems.
+    """Reads the texels of a lightmap that are inside charts or lit, bool [H, W], and the problems of its values.
 
     Raises:
-        WlmError: It can't be read.
+        WlmError: The file cannot be read.
     """
     pixels, names = read_light(path)
     alpha = pixels[..., 3] > 0 if "A" in names else None
@@ -160,5 +162,5 @@ def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def said(error: WlmError, path: Path) -> str:
-    """An error without the path in front."""
+    """Returns an error message without the path at its beginning."""
     return str(error).removeprefix(f"{path}: ")

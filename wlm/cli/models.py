@@ -1,0 +1,119 @@
+"""Steps that the verbs of all systems have in common: fit and save, load an input, export, describe."""
+
+import time
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from wlm.cli.console import (
+    check_output,
+    note_start,
+    note_warnings,
+    quiet_warp,
+    running,
+    show_facts,
+    show_files,
+    show_json,
+)
+from wlm.errors import WlmError
+
+
+def fit(
+    system: str,
+    load: Callable[[], Any],
+    output: Path,
+    profile: str,
+    settings: Mapping[str, Any],
+    *,
+    seed: int,
+    device: str,
+    resume: bool,
+    every: float,
+    **options: Any,
+) -> tuple[Any, Any, dict[str, Any]]:
+    """Compresses an input into a file, with progress, a checkpoint and notes of all warnings.
+
+    Args:
+        system: Name of the system, whose package has `Profile`, `compress` and `open_checkpoint`.
+        load: Reads the input, after the settings have been checked.
+        output: The `.wlm` to write.
+        profile: Name of the profile or path of a YAML file.
+        settings: Settings that replace those of the profile, by name.
+        seed, device, resume, every: Values of the options.
+        options: Further options of `compress`.
+
+    Returns:
+        The input, the model, and the first facts of the result's table.
+
+    Raises:
+        WlmError: An option, the input or the output is wrong.
+    """
+    check_output(output, ".wlm")
+    quiet_warp()
+    package = import_module(f"wlm.{system}")
+    checked = package.Profile.load(profile).override(settings, "--")
+    data = load()
+    note_warnings(data.warnings)
+    shared = {"seed": seed, "device": device}
+    checkpoint = package.open_checkpoint(output, data, checked, resume=resume, every=every, **shared)
+    note_start(checkpoint, resume, "at step 0")
+    start = time.perf_counter()
+    with running("fit", checkpoint.path) as progress:
+        model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **shared, **options)
+        seconds = time.perf_counter() - start
+        size = model.save(output)
+        checkpoint.remove()
+    return data, model, {"file": output, "bytes on disk": size, "seconds": f"{seconds:.1f}"}
+
+
+def export(
+    file: Path,
+    output: Path,
+    engine: str | None,
+    shader: str | None,
+    exact: bool,
+    device: str,
+    **options: Any,
+) -> None:
+    """Writes a model as a folder and shows the files. Options of a kit that are None are not given.
+
+    Raises:
+        WlmError: An option has no meaning for the engine, or the folder cannot be written.
+    """
+    for option, given in (("shader", shader), ("exact", exact)):
+        if given and engine is not None:
+            raise WlmError(f"--{option}: has no meaning with --engine {engine}, whose kit has its own shaders")
+    quiet_warp()
+    from wlm.export import export
+    from wlm.system import load
+
+    given = {name: value for name, value in options.items() if value is not None}
+    model = load(file)
+    show_files(output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given))
+
+
+def describe(file: Path, device: str, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]) -> Any:
+    """Shows what a file contains: its settings, its sizes, and the facts of its system.
+
+    Args:
+        file, device, as_json: Values of the options.
+        facts: Returns the facts of a model as JSON values by name.
+
+    Returns:
+        The model.
+    """
+    quiet_warp()
+    from wlm.formats.artifact import read_artifact
+    from wlm.system import load
+
+    artifact, model = read_artifact(file), load(file)
+    decoder = model.decoder(device)
+    shown = {"name": model.name, "system": artifact.system, **facts(model), "source": model.source}
+    shown |= {"bytes_on_disk": artifact.file_bytes, "device": decoder.device, "bytes_on_device": decoder.device_bytes}
+    parts = {"header": artifact.header_bytes} | artifact.parts
+    if as_json:
+        show_json(shown | {"parts": parts, "profile": model.profile.model_dump(mode="json")})
+    else:
+        show_facts(str(file), shown | {"profile": model.profile.name, "bytes": parts})
+    return model

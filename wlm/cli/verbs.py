@@ -1,0 +1,147 @@
+"""Commands that work on files of every system: `wlm compress`, `evaluate`, `decode`, `export` and `info`.
+
+Such a verb is one command. The kind of its first argument chooses the system, and the function of the verb's name in
+`wlm.cli.<system>` does the work. Each of these functions has its own options; a system without the function may name
+an alternative in its mapping `INSTEAD`.
+"""
+
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+from typer.core import TyperCommand
+from typer.models import OptionInfo
+
+from wlm.errors import WlmError
+
+SYSTEMS = ("lightmap", "atlas", "probe", "smoke")  # as in wlm.system, which takes long to import
+VERBS = ("compress", "evaluate", "decode", "export", "info")
+
+
+def _model_system(path: Path) -> str:
+    from wlm.system import system_of
+
+    return system_of(path)
+
+
+Detect = Callable[[Path], str]
+
+
+class Verb(TyperCommand):
+    """A command with the options of the system that its first argument belongs to."""
+
+    detect: Detect = staticmethod(_model_system)
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        words, system = _without_system(args)
+        if system is None:
+            first = first_argument(words, _value_options(str(self.name)))
+            system = None if first is None else self.detect(Path(first))
+        if system is None:
+            return super().make_context(info_name, args, parent, **extra)
+        return variant(str(self.name), system).make_context(info_name, words, parent, **extra)
+
+
+def register(
+    app: typer.Typer,
+    name: str,
+    help_text: str,
+    metavar: str = "FILE.wlm",
+    argument_help: str = "A compressed file.",
+    detect: Detect = _model_system,
+) -> None:
+    """Adds a verb to the command line.
+
+    Args:
+        app: The root.
+        name: One of `VERBS`.
+        help_text: Text that `--help` shows without a file.
+        metavar, argument_help: The first argument in that text.
+        detect: Returns the system of a file; raises WlmError with the next step if there is none.
+    """
+
+    def general(
+        file: Annotated[Path, typer.Argument(metavar=metavar, help=argument_help)],
+        system: Annotated[
+            str | None, typer.Option(metavar="|".join(SYSTEMS), help="Choose the system instead of detecting it.")
+        ] = None,
+    ) -> None:
+        """Only describes the verb; a call with a file runs the function of the file's system."""
+
+    kind = type(f"Verb{name.title()}", (Verb,), {"detect": staticmethod(detect)})
+    app.command(name, cls=kind, help=help_text)(general)
+
+
+def functions(verb: str) -> dict[str, Callable[..., None]]:
+    """Returns the functions of a verb by system, for the systems that have the verb."""
+    modules = {system: import_module(f"wlm.cli.{system}") for system in SYSTEMS}
+    return {system: getattr(module, verb) for system, module in modules.items() if hasattr(module, verb)}
+
+
+def variant(verb: str, system: str) -> Any:
+    """Builds the command that a verb runs for files of a system.
+
+    Raises:
+        WlmError: The system does not have the verb; the line names the alternative.
+    """
+    from wlm.cli.settings import command_of
+
+    function = functions(verb).get(system)
+    if function is None:
+        instead = getattr(import_module(f"wlm.cli.{system}"), "INSTEAD", {}).get(verb, "")
+        raise WlmError(f"wlm {verb}: does not apply to files of {system}" + (f"; use {instead}" if instead else ""))
+    return command_of(verb, function)
+
+
+def first_argument(words: Sequence[str], value_options: set[str]) -> str | None:
+    """Finds the first argument of a command line, the first word that is neither an option nor its value.
+
+    Args:
+        words: The command line after the verb.
+        value_options: Options that take a value. The values of other options, which are generated from settings, are
+            recognised because they name no file.
+
+    Returns:
+        The first such word that names an existing file or folder, else the first such word, else None.
+    """
+    found, is_value = [], False
+    for word in words:
+        if is_value:
+            is_value = False
+        elif word.startswith("-"):
+            is_value = word in value_options
+        else:
+            found.append(word)
+    return next((word for word in found if Path(word).exists()), found[0] if found else None)
+
+
+def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
+    """Removes `--system NAME` from a command line.
+
+    Raises:
+        WlmError: There is no such system.
+    """
+    words, system, rest = [], None, iter(args)
+    for word in rest:
+        if word == "--system" or word.startswith("--system="):
+            system = word.partition("=")[2] or next(rest, "")
+            if system not in SYSTEMS:
+                raise WlmError(f"--system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
+        else:
+            words.append(word)
+    return words, system
+
+
+def _value_options(verb: str) -> set[str]:
+    return {name for function in functions(verb).values() for name in _own_value_options(function)}
+
+
+def _own_value_options(function: Callable[..., None]) -> Iterator[str]:
+    for name, parameter in inspect.signature(function).parameters.items():
+        kind, *notes = get_args(parameter.annotation) or (parameter.annotation,)
+        for note in notes:
+            if isinstance(note, OptionInfo) and kind is not bool:
+                yield from note.param_decls or (f"--{name.replace('_', '-')}",)
