@@ -18,7 +18,7 @@ from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.sphere import sh_count
 
-_BANDS = 9  # coefficients that diffuse light needs
+_BANDS = 9  # coefficients for diffuse light
 _BUFFERS = ("gaussians", "network", "probes")
 
 _BETWEEN = """
@@ -77,8 +77,8 @@ def probe_page(
     The page holds the buffers of the model's bundle.
 
     Raises:
-        WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
-            can't be read, or is of other probes.
+        WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the original
+            cannot be read; or the original has other probes.
     """
     coefficients = sh_count(model.outputs)
     if coefficients is None:
