@@ -77,8 +77,8 @@ def probe_page(
     The page holds the buffers of the model's bundle.
 
     Raises:
-        WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the original
-            cannot be read; or the original has other probes.
+        WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the
+            original cannot be read; or the original has other probes.
     """
     coefficients = sh_count(model.outputs)
     if coefficients is None:
