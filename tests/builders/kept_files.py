@@ -67,7 +67,7 @@ def _atlas(kind: str, colour: str) -> Kept:
     from builders.atlas_meshes import sheet
     from builders.atlas_models import random_model, save_plainly
 
-    free = {"uv": "missing size", "lut": "sizes" if kind == "cascade" else ""}
+    free = {"uv": "missing size", "lut": "sizes" if kind == "cascade" else "", "mesh": "size"}
     ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv": (0, 1.5)}
     ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
     content = _written(lambda path: save_plainly(random_model(sheet(), kind, colour), path))

@@ -18,7 +18,7 @@ FRONT = View.of((0.2, 0.1, 1.0))
 def _shifted(mesh, by):
     """The lightmap and a number."""
     read = original(mesh)
-    return lambda uv, triangle, barycentric: read(uv, triangle, barycentric) + by
+    return lambda points, state: read(points, state) + by
 
 
 def test_a_view_shows_the_lightmap(device):
@@ -32,11 +32,11 @@ def test_a_view_shows_the_lightmap(device):
 def test_a_decoder_gets_the_corners_weights():
     mesh = charts()
 
-    def place(uv, number, weight):
-        corner = torch.from_numpy(mesh.uv[mesh.triangle].astype(np.float32))[number.long()]
-        interpolated = (corner * weight[:, :, None]).sum(1)
-        np.testing.assert_allclose(interpolated.numpy(), uv.numpy(), atol=1e-6)
-        return torch.ones(len(uv), 3)
+    def place(points, state):
+        corner = torch.from_numpy(mesh.sheets[0].uv[mesh.sheets[0].triangle].astype(np.float32))
+        interpolated = (corner[points.triangle.long()] * points.weight[:, :, None]).sum(1)
+        np.testing.assert_allclose(interpolated.numpy(), points.uv.numpy(), atol=1e-6)
+        return torch.ones(len(points.uv), 3)
 
     pictures, hit = draw(mesh, {"a": place}, FRONT, 48)
     assert (pictures["a"][hit] == 1).all() and hit.any()
