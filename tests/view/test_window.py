@@ -152,7 +152,7 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
-    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and grey.
+    # The last quarter is outside the mask: filled in the original, 0 in the decoded light, and grey.
     flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
     quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
     assert quarter[0].max() == 0 and quarter[1].min() > 50 and (quarter[2] == 77).all()
@@ -405,7 +405,7 @@ def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps
     pixels = np.asarray(texture.to_array()).reshape(256, 256, 3)
     grey = (pixels == 77).all(-1)
     assert grey[mask].sum() == 0 and grey[~mask].all()
-    assert "outside of the mask" in window.scene.tell_texel(50, 50, window.state)
+    assert "outside the mask" in window.scene.tell_texel(50, 50, window.state)
 
 
 def test_the_walls_of_a_room_are_left_out_from_outside(lightmaps, tmp_path, show):

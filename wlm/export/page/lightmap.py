@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +19,10 @@ from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.data import SheetFrames, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
-from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.model import SheetModel
 from wlm.lightmap.sheet import LIGHT, first_light
 from wlm.system import Meter, OnProgress
+from wlm.system import load as load_model
 from wlm.texels import exposure, fill_gaps
 
 _DESCRIBED = (
@@ -29,8 +32,7 @@ _DESCRIBED = (
 
 
 def lightmap_page(
-    model: LightmapModel,
-    file_bytes: int,
+    paths: Sequence[Path],
     *,
     mesh: str | os.PathLike[str] | None = None,
     original: str | os.PathLike[str] | None = None,
@@ -41,15 +43,15 @@ def lightmap_page(
     """Makes the page of the first sheet of light of a lightmap model.
 
     Args:
-        model: The model.
-        file_bytes: Size of its file.
+        paths: The model's file.
         mesh, original, hours, up, progress: As for `wlm.export.page.pages.make_page`.
 
     Raises:
         WlmError: The mesh or the set cannot be read, or the set has another size.
     """
-    sheet, others = first_light(model.sheets), len(model.sheets) - 1
-    whole, model = model, model.sheets[sheet]
+    whole, file_bytes = load_model(paths[0], "lightmap"), paths[0].stat().st_size
+    sheet, others = first_light(whole.sheets), len(whole.sheets) - 1
+    model = whole.sheets[sheet]
     bundle = sheet_bundle(sheet, model, whole.name, whole.source)
     textures = {name: texture for name, texture in bundle.textures.items() if name != "valid"}
     described = {name: bundle.document[name] for name in _DESCRIBED}
