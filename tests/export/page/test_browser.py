@@ -70,8 +70,8 @@ def figure(page, name: str) -> str:
 def lightmaps():
     """A dynamic, a static, a constant and an empty tile."""
     frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = small_sets.moving_light().frames
-    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, :128, :128] = small_sets.moving_light().light.frames
+    frames[:, :128, 128:] = small_sets.static_light().light.frames / 24.0
     frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
     mask = np.ones((256, 256), bool)
     mask[128:, 128:] = mask[50:60, 90:200] = mask[::16, ::8] = False
@@ -375,7 +375,7 @@ def test_atlases_read_as_in_python(kind, tmp_path, show):
 
 @pytest.mark.parametrize("outputs", [27, _long(12), _long(48)])
 def test_probes_decode_as_in_python(outputs, tmp_path, show):
-    model = probe_models.random_model(count=12, probes=40, outputs=outputs, positions=True)
+    model = probe_models.whole_model(count=12, probes=40, outputs=outputs, positions=True)
     model.save(tmp_path / "probe.wlm")
     position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]) + model.origin
     document, _ = document_from_arrays(position, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")
