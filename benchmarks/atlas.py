@@ -37,6 +37,7 @@ from benchmarks.rivals.rival import Rival
 from benchmarks.rows import MEAN, Row, read_json
 from benchmarks.runner import Bench, Note, exact_errors
 from wlm import interop
+from wlm.atlas.codec import sizes
 from wlm.atlas.data import Sheet, from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import Sampler, compare
@@ -265,7 +266,7 @@ class _AtlasBench(Bench):
             "ours",
             option,
             model.method,
-            bytes=fit.bytes,
+            bytes=fit.bytes - sizes(model)[1],
             bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
             compression_ratio=model.compression_ratio,
             encode_seconds=fit.seconds,

@@ -16,6 +16,7 @@ from benchmarks.rivals.scene_parts import scene_parts
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm import interop
+from wlm.atlas.codec import sizes
 from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.evaluation import SHARED_RESOLUTION, SHARED_VIEWS, Sampler, compare
 from wlm.atlas.fit import compress
@@ -92,7 +93,7 @@ class _SceneBench(Bench):
             "scene",
             profile.name,
             "separate tiles of each state" if model.later else "tiles shared by the states",
-            bytes=fit.bytes,
+            bytes=fit.bytes - sizes(model)[1],
             bpp=self._bpp(model.bits),
             compression_ratio=model.compression_ratio,
             encode_seconds=fit.seconds,

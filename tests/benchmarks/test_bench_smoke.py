@@ -71,7 +71,7 @@ def test_shares_of_the_copy(rows):
         ("float32, periodic", 32, 152),
         ("float32, all boundaries", 32, 153),
         ("float16, all boundaries", 32, 77),
-        ("float32, all boundaries, D3Q27 recursive", 32, 217),
+        ("float32, all boundaries, D3Q27", 32, 217),
         ("float16, all boundaries, 12³", 12, 77),
     ):
         row = lattice[option]
@@ -181,8 +181,8 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     assert {row.method for row in plotted(rows)} == {"guide", "six ways"}
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
-    command, _, options = check_command(monkeypatch, bench, rows, ["smoke", "--quick"], tmp_path)
+def test_the_command(given_rows, tmp_path, monkeypatch):
+    command, _, options = check_command(monkeypatch, bench, given_rows, ["smoke", "--quick"], tmp_path)
     assert command == "python -m benchmarks smoke --quick --device cpu" and options["quick"]
 
 

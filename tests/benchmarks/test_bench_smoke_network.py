@@ -156,15 +156,15 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     assert points[0].option == "step 4" and points[-3].option == "h 0.8, nodes 4"
 
 
-def test_the_command(rows, network, tmp_path, monkeypatch):
+def test_the_command(given_rows, network, tmp_path, monkeypatch):
     words = ["smoke-network", "--quick", "--network", network, "--profile", "paper"]
-    command, arguments, options = check_command(monkeypatch, bench, rows, words, tmp_path)
+    command, arguments, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
     expected = "smoke-network --quick --device cpu --network young.safetensors --profile paper"
     assert command == f"python -m benchmarks {expected}"
     assert arguments == ([network], ["paper"]) and options["quick"] and options["device"] == "cpu"
     # Without any, the network that ships; a profile alone stays alone.
     for words, expected in (([], ([shipped()], ())), (["--profile", "paper"], ([], ["paper"]))):
-        assert check_command(monkeypatch, bench, rows, ["smoke-network", *words], tmp_path)[1] == expected
+        assert check_command(monkeypatch, bench, given_rows, ["smoke-network", *words], tmp_path)[1] == expected
 
 
 def test_networks_or_profiles_are_needed(monkeypatch):

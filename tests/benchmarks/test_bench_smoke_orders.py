@@ -135,8 +135,8 @@ def test_rows_make_a_file_and_a_table(rows, tmp_path):
     assert "| learned mix |" in tables(rows)
 
 
-def test_the_command(rows, tmp_path, monkeypatch):
-    command, _, options = check_command(monkeypatch, bench, rows, ["smoke-orders", "--quick"], tmp_path)
+def test_the_command(given_rows, tmp_path, monkeypatch):
+    command, _, options = check_command(monkeypatch, bench, given_rows, ["smoke-orders", "--quick"], tmp_path)
     assert command == "python -m benchmarks smoke-orders --quick --device cpu" and options["quick"]
 
 

@@ -166,10 +166,10 @@ def _probe_files(folder: Path) -> None:
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
     with tempfile.TemporaryDirectory() as grid:
-        export(probe_models.random_model(count=3), Path(grid) / "out", "three", cells=2)
+        export(probe_models.whole_model(count=3), Path(grid) / "out", "three", cells=2)
         for name in ("grid.json", "grid.ktx2"):
             (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
-        export(probe_models.random_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
+        export(probe_models.whole_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
         for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
             (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)

@@ -42,7 +42,7 @@ def test_lightmaps_of_two_profiles(tmp_path):
 
 def test_probes(tmp_path):
     for seed in (0, 1):
-        probe_models.random_model(positions=True, seed=seed).save(tmp_path / f"{seed}.wlm")
+        probe_models.whole_model(positions=True, seed=seed).save(tmp_path / f"{seed}.wlm")
     both = compare(tmp_path / "0.wlm", tmp_path / "1.wlm")
     assert np.isfinite(both.apart) and both.apart < 40.0
     assert ("PSNR of B against A, dB", "", f"{both.apart:.2f}") in both.rows()
@@ -64,8 +64,8 @@ def test_atlases(tmp_path):
 
 
 def test_what_cannot_be_compared(tmp_path):
-    probe_models.random_model().save(tmp_path / "probe.wlm")
-    probe_models.random_model(probes=100).save(tmp_path / "fewer.wlm")
+    probe_models.whole_model().save(tmp_path / "probe.wlm")
+    probe_models.whole_model(probes=100).save(tmp_path / "fewer.wlm")
     for files, said in (
         ((FILES / "lightmap.wlm", tmp_path / "probe.wlm"), "expected a model of lightmap"),
         ((tmp_path / "probe.wlm", tmp_path / "fewer.wlm"), "expected 200 probes"),

@@ -189,8 +189,10 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
     """The parts, of the types and shapes that the settings ask for."""
     shared, method = header.method == "shared", header.method
     texels, second = tuple(header.texels), header.block_texels
+    if len(header.sizes) != len(header.sheets):
+        raise ValueError(f"setting sizes: expected {len(header.sheets)}, one for each sheet, found {len(header.sizes)}")
     height, width = header.sizes[0]
-    if len(header.sizes) != len(header.sheets) or not (shared or len(header.sheets) == len(header.states) == 1):
+    if not (shared or len(header.sheets) == len(header.states) == 1):
         raise ValueError("setting sheets: expected one sheet and one state, or shared tiles")
     if {each.sheet for each in header.objects} != set(range(len(header.sheets))):
         raise ValueError(f"setting objects: expected a node for each of {len(header.sheets)} sheets")

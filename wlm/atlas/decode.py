@@ -37,10 +37,9 @@ class Decoder:
         self.model, self.device = model, interop.check_device(device)
         if model.method in ("tiles", "shared"):
             # As stored: two bytes per number.
-            self._texels, self._blocks = (
-                wp.array(np.ascontiguousarray(each), dtype=wp.vec3h, device=self.device)
-                for each in (model.texels, model.block_texels if model.colour == "mixed" else model.texels)
-            )
+            self._texels = self._blocks = self._halves(model.texels)
+            if model.colour == "mixed":
+                self._blocks = self._halves(model.block_texels)
             self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
             self._sheets = wp.array(model.table(), dtype=int, device=self.device)
         else:
@@ -51,6 +50,15 @@ class Decoder:
         self._tail = None
         if len(model.tail):
             self._tail = Tail(model.tail, *model.sheets[0].size, tail_codec(model.colour), self.device)
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory that textures, tables and UVs take on the device, in bytes."""
+        arrays = {id(each): each for each in vars(self).values() if isinstance(each, wp.array)}
+        return sum(each.capacity for each in arrays.values()) + self._corner.nbytes + self.model.tail.nbytes
+
+    def _halves(self, texels: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
         """Factors of a state for shared tiles, float32 [C, 3]; between two states, 0.5 for example, they are mixed.

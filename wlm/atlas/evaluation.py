@@ -149,8 +149,8 @@ class Report(Score):
     Attributes:
         method: The model's method.
         profile: Name of its settings.
-        bytes: Size of its file without triangles and masks.
-        geometry_bytes: Size of the triangles and masks in the file.
+        bytes: Size of its file.
+        geometry_bytes: Part of it that holds the triangles and masks.
         gpu_bytes: Size of its textures and tables on a GPU.
         cr: Compression ratio of the textures (eq. 9).
         cr_disk: Compression ratio of the file without triangles and masks.
@@ -199,7 +199,7 @@ def evaluate(
         **vars(score),
         method=model.method,
         profile=model.profile.name,
-        bytes=whole - geometry,
+        bytes=whole,
         geometry_bytes=geometry,
         gpu_bytes=-(-model.bits // 8),
         cr=model.compression_ratio,

@@ -20,7 +20,8 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bake, compare, doctor, inspect, probe, smoke, verbs, view, web
+from wlm.cli import atlas, bake, compare, doctor, inspect, smoke, verbs, view, web
+from wlm.cli import probe_volume as probe
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 

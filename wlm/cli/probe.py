@@ -1,312 +1,272 @@
-"""`wlm probe`: compress light probes, decode them anywhere, score them, walk through them, export them."""
+"""The verbs for light probes: compress, evaluate, decode, export, info."""
 
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from wlm.cli import models
 from wlm.cli.console import (
     check_output,
     escape,
     exclusive,
     note,
-    note_start,
+    note_warnings,
     number,
     quiet_warp,
     running,
     show,
-    show_json,
+    show_facts,
     table,
     write_json,
 )
 from wlm.cli.options import (
     AsJson,
-    CheckpointEveryIfKept,
+    CheckpointEvery,
     Device,
+    Engine,
+    ExactShader,
+    Key,
     ModelFile,
     PageFile,
+    Profile,
     ReportFile,
     Resume,
+    SceneFile,
     Seed,
+    ShaderLanguage,
     output_option,
-    seconds_between,
 )
-from wlm.cli.probe_export import given_positions
-from wlm.cli.probe_export import register as register_export
-from wlm.cli.probe_volume import register, score_seen, show_seen, show_walk_scores, walk_scores
+from wlm.cli.settings import with_settings
 
 if TYPE_CHECKING:
     import numpy as np
 
     from wlm.probe import ProbeModel, ProbeSet, Report
 
-app = typer.Typer(
-    help="Light probes: 3D Gaussians and a small network, or principal components; a cascaded volume of both."
-)
-
-_Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
-_Convention = Annotated[
-    str | None, typer.Option(help="Of the numbers: threejs, godot, unreal or unity; default as PROBES says.")
-]
-
 _Probes = Annotated[
     Path, typer.Argument(metavar="PROBES", help="Probe file: .npz, .json, Godot's .lmbake or Unity's .asset.")
 ]
-
-_Original = Annotated[
+_CONVENTIONS = "threejs, godot, unreal or unity"
+_Convention = Annotated[
+    str | None, typer.Option(help=f"SH convention of the numbers: {_CONVENTIONS}; default as PROBES states.")
+]
+_At = Annotated[
     Path | None,
-    typer.Option(metavar="PROBES", help="The probes that were compressed, if the file stores no positions."),
+    typer.Option(metavar="PROBES", help="File with the positions of the probes, for a FILE.wlm that stores none."),
 ]
 
 
-@app.command()
+@with_settings("wlm.probe:Profile")
 @exclusive
 def compress(
-    probes_path: _Probes,
+    probes: _Probes,
     output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
-    profile: Annotated[
-        str, typer.Option(help="standard, compact, small, paper, pca, or a YAML file of settings.")
-    ] = "standard",
-    ratio: Annotated[float | None, typer.Option(help="Number of Gaussians as a share of the live probes.")] = None,
-    latent: Annotated[int | None, typer.Option(help="Length of the latent vector of a Gaussian.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Number of training steps.")] = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    resume: Resume = False,
-    checkpoint_every: CheckpointEveryIfKept = None,
+    settings: dict[str, Any],
+    profile: Profile = "standard",
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
     ] = False,
-    key: _Key = None,
+    key: Key = None,
     convention: _Convention = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    resume: Resume = False,
+    checkpoint_every: CheckpointEvery = 30.0,
 ) -> None:
     """Compress light probes into one file: Gaussians and a small network, or principal components for small sets.
 
     The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
     continue exactly.
     """
-    check_output(output, ".wlm")
-    quiet_warp()
-    from wlm.interop import check_device
-    from wlm.probe import Profile, compress, open_checkpoint
 
-    settings = Profile.load(profile).override({"ratio": ratio, "latent": latent, "steps": steps}, "--")
-    device = check_device(device)
-    probes = _load(probes_path, key, convention)
-    options = {"seed": seed, "device": device}
-    every = seconds_between(checkpoint_every)
-    checkpoint = open_checkpoint(output, probes, settings, resume=resume, every=every, **options)
-    note_start(checkpoint, resume, "at step 0")
-    start = time.perf_counter()
-    with running("fit", checkpoint.path) as progress:
-        model = compress(probes, settings, progress=progress, checkpoint=checkpoint, positions=positions, **options)
-        seconds = time.perf_counter() - start
-        size = model.save(output)
-        checkpoint.remove()
-    cells = {
-        "file": escape(str(output)),
-        "bytes": f"{size:,}",
-        "of float32": f"{size / probes.float_bytes:.2%}",
-        "bits per probe": f"{size * 8 / probes.probes:.2f}",
-        "GPU bytes": f"{model.content.nbytes:,}",
+    def load() -> "ProbeSet":
+        from wlm.probe import load
+
+        return load(probes, key=key, convention=convention)
+
+    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
+    data, model, facts = models.fit("probe", load, output, profile, settings, **options)
+    size = facts["bytes on disk"]
+    facts |= {
+        "share of float32": f"{size / data.float_bytes:.2%}",
+        "bits per probe": f"{size * 8 / data.probes:.2f}",
+        "method": model.method,
+        **model.content.facts(),
     }
-    cells |= {name: str(value) for name, value in model.content.facts().items()}
-    cells["seconds"] = f"{seconds:.1f}"
-    rows = table(model.name, list(cells))
-    rows.add_row(*cells.values())
-    show(rows)
-    note(model.choice)
+    show_facts(model.name, facts)
+    if model.choice:
+        note(model.choice)
 
 
-@app.command()
-def decode(
-    file: ModelFile,
-    output: Annotated[Path, output_option("OUT", "The .npz or .json file to write.")],
-    positions: Annotated[
-        Path | None,
-        typer.Option(metavar="PROBES", help="Where: a .npz, .json or .lmbake file, of which `position` is taken."),
-    ] = None,
-    convention: Annotated[str, typer.Option(help="Of the numbers: threejs, godot, unreal or unity.")] = "threejs",
-    original: _Original = None,
-    device: Device = "cpu",
-) -> None:
-    """Decode the light at the stored positions, or at any others.
-
-    Positions as many as the file has probes, and in the same box, are taken for those probes in their order: the dead
-    ones among them decode to zero. Anywhere else there is no telling who is dead.
-    """
-    check_output(output, ".npz", ".json")
-    quiet_warp()
-    from wlm.probe import save_probes
-    from wlm.system import load
-
-    model = load(file, "probe")
-    position, at_probes = _positions(model, positions)
-    decoder = model.decoder(device, position=position if at_probes else given_positions(model, original))
-    values = decoder.decode_probes() if at_probes else decoder.decode(position)
-    save_probes(output, position, values, convention=convention)
-    rows = table(str(file), ["file", "positions", "of", "zero", "mean", "largest"], text=["of"])
-    rows.add_row(
-        escape(str(output)),
-        f"{len(position):,}",
-        "its probes" if at_probes else "other points",
-        f"{int(model.dead.sum()) if at_probes else 0:,}",
-        f"{values.mean():.4g}",
-        f"{values.max():.4g}",
-    )
-    show(rows)
-
-
-@app.command()
 def evaluate(
     file: ModelFile,
     probes_path: _Probes,
     json_path: ReportFile = None,
     html_path: PageFile = None,
     volume: Annotated[
-        bool, typer.Option("--volume", help="Score what is read through the cascaded volume along a walk.")
+        bool, typer.Option("--volume", help="Also score the light sampled from the cascaded volume along a walk.")
     ] = False,
-    views: Annotated[int, typer.Option(help="Score so many pictures of balls and of --mesh under the light.")] = 0,
-    mesh: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The scene, .glb, .gltf or .obj, for the pictures.")
-    ] = None,
+    views: Annotated[
+        int, typer.Option(help="Number of pictures of balls, and of --mesh, under the light to score; 0 for none.")
+    ] = 0,
+    mesh: SceneFile = None,
     hold_out: Annotated[
-        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again, and score the light at the others.")
+        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again and score the light at the others.")
     ] = False,
-    device: Device = "cpu",
-    key: _Key = None,
+    key: Key = None,
     convention: _Convention = None,
+    device: Device = "cpu",
 ) -> None:
-    """Compare the decoded probes with the input: PSNR of coefficients and of irradiance, and bits per probe."""
+    """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes."""
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from wlm.probe import evaluate
-    from wlm.system import load
+    from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
+    from wlm.probe import evaluate, load
+    from wlm.system import load as load_model
 
-    model = load(file, "probe")
-    probes = _load(probes_path, key, convention)
+    model = load_model(file, "probe")
+    probes = load(probes_path, key=key, convention=convention)
+    note_warnings(probes.warnings)
     with running("evaluate") as progress:
         size = file.stat().st_size
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
     if not probes.source.startswith(model.source):
-        note(f"warning: {probes_path}: not what {file} was made of; another key, convention or file?")
+        note(f"warning: {probes_path}: not the input of {file}; another key, convention or file?")
     if html_path is not None:
         from wlm.view.reports import probe_report
 
         probe_report(html_path, model, probes, report)
-    seen = score_seen(model, probes, views, mesh, device) if views or mesh is not None else []
-    walked = walk_scores(model, probes, device) if volume else {}
+    pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
+    walks = score_walks(model, probes, device) if volume else {}
     if json_path is not None:
-        content = report.to_json() | ({"volume": walked} if walked else {})
-        write_json(json_path, content | ({"views": [score.to_json() for score in seen]} if seen else {}))
-    _show_report(file, model.profile.name, report)
-    show_walk_scores(walked)
-    show_seen(seen)
+        content = report.to_json() | ({"volume": walks} if walks else {})
+        write_json(json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {}))
+    _show_report(file, model, report)
+    show_walks(walks)
+    show_pictures(pictures)
 
 
-@app.command()
-def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
-    """Say what a file holds, and what memory it takes on a device, without decoding it."""
+def decode(
+    file: ModelFile,
+    output: Annotated[Path, output_option("OUT", "The .npz or .json file to write.")],
+    positions: Annotated[
+        Path | None,
+        typer.Option(metavar="PROBES", help="File with the positions to decode at; default those stored in FILE.wlm."),
+    ] = None,
+    convention: Annotated[str, typer.Option(help=f"SH convention of the output: {_CONVENTIONS}.")] = "threejs",
+    original: _At = None,
+    device: Device = "cpu",
+) -> None:
+    """Decode the light at the stored positions or at others.
+
+    Positions of the same number and the same box as the file's probes are taken for these probes in their order: dead
+    probes then decode to zero. Other positions have no dead probes.
+    """
+    check_output(output, ".npz", ".json")
     quiet_warp()
-    from wlm import system
-    from wlm.formats.artifact import read_artifact
-    from wlm.probe import codec
+    from wlm.probe import load_positions, save_probes
+    from wlm.system import load
 
-    artifact = read_artifact(file, "probe")
-    model = system.decode(file, artifact, codec.decode)
-    decoder = model.decoder(device)
-    facts: dict[str, Any] = {
-        "name": model.name,
-        "method": model.method,
-        "bytes": artifact.file_bytes,
-        "probes": model.probes,
-        "dead": int(model.dead.sum()),
-        "outputs": model.outputs,
-        "bits_per_probe": artifact.file_bytes * 8 / model.probes,
-        "positions": model.has_positions,
-        "source": model.source,
-        "parts": {"header": artifact.header_bytes} | artifact.parts,
-        "device": decoder.device,
-        "device_bytes": decoder.device_bytes,
-        "profile": model.profile.model_dump(mode="json"),
-    }
-    facts |= model.content.facts() | {"gpu_bytes": model.content.nbytes}
-    facts |= {"origin": model.origin.tolist(), "size": (model.extent * model.size).tolist()}
-    if as_json:
-        show_json(facts)
-        return
-    rows = table(str(file), ["", "value"])
-    rows.add_row("name", escape(model.name))
-    rows.add_row("method", model.method)
-    rows.add_row("bytes", f"{artifact.file_bytes:,}")
-    rows.add_row("probes", f"{model.probes:,}, {facts['dead']:,} of them dead")
-    rows.add_row("numbers of a probe", str(model.outputs))
-    rows.add_row("bits per probe", f"{facts['bits_per_probe']:.2f}")
-    for name, value in model.content.facts().items():
-        rows.add_row(name, str(value))
-    rows.add_row("box", " x ".join(f"{side:.4g}" for side in facts["size"]))
-    rows.add_row("positions", "stored" if facts["positions"] else "not stored")
-    rows.add_row("source", escape(model.source))
-    rows.add_row("profile", escape(model.profile.name))
-    rows.add_section()
-    for part, count in facts["parts"].items():
-        rows.add_row(f"bytes of {part}", f"{count:,}")
-    rows.add_section()
-    rows.add_row("bytes for a GPU", f"{model.content.nbytes:,}")
-    rows.add_row(f"bytes on {decoder.device}", f"{decoder.device_bytes:,}")
-    show(rows)
+    model = load(file, "probe")
+    position = model.stored_positions() if positions is None else load_positions(positions)
+    own = positions is None or model.has_probes_at(position)
+    given = position if own and positions is not None else own_positions(model, original)
+    decoder = model.decoder(device, position=given)
+    values = decoder.decode_probes() if own else decoder.decode(position)
+    save_probes(output, position, values, convention=convention)
+    facts = {"file": output, "positions": len(position), "positions are": "the probes" if own else "other points"}
+    zero = int((~model.live).sum()) if own else 0
+    show_facts(str(file), facts | {"dead probes": zero, "mean": float(values.mean()), "largest": float(values.max())})
 
 
-def _load(path: Path, key: str | None, convention: str | None) -> "ProbeSet":
-    """Reads a set and notes what was repaired in it."""
-    from wlm.probe.data import load
+def export(
+    file: ModelFile,
+    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    engine: Engine = None,
+    shader: ShaderLanguage = None,
+    exact: ExactShader = False,
+    original: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PROBES",
+            help="File with the positions of the probes, for a FILE.wlm that stores none; for Godot also the bake of "
+            "which all other content is kept.",
+        ),
+    ] = None,
+    cells: Annotated[
+        int | None,
+        typer.Option(help="Cells of the grid of three, godot or unreal along the longest side; default 24."),
+    ] = None,
+    mirror: Annotated[
+        Literal["x", "y", "z"] | None, typer.Option(help="Axis that becomes left-handed for unity; default none.")
+    ] = None,
+    device: Device = "cpu",
+) -> None:
+    """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes in its own format."""
+    options = {"original": original, "cells": cells, "mirror": mirror}
+    models.export(file, output, engine, shader, exact, device, **options)
 
-    probes = load(path, key=key, convention=convention)
-    for warning in probes.warnings:
-        note(f"warning: {warning}")
-    return probes
+
+def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
+    """Show what a file of light probes contains, and its memory on a device."""
+
+    def facts(model: "ProbeModel") -> dict[str, Any]:
+        return {
+            "method": model.method,
+            "probes": model.probes,
+            "dead_probes": int((~model.live).sum()),
+            "numbers_per_probe": model.outputs,
+            "bits_per_probe": file.stat().st_size * 8 / model.probes,
+            "positions_stored": model.has_positions,
+            "GPU_bytes": model.content.nbytes,
+            **model.content.facts(),
+        }
+
+    models.describe(file, device, as_json, facts)
 
 
-def _positions(model: "ProbeModel", path: Path | None) -> "tuple[np.ndarray, bool]":
-    """The positions to decode at, float64 [M, 3], and whether they are those of the model's own probes."""
+def own_positions(model: "ProbeModel", original: Path | None) -> "np.ndarray | None":
+    """Reads the positions of the model's own probes from another file; None if there is none.
+
+    Raises:
+        WlmError: They are not those of the model's probes.
+    """
+    from wlm.errors import WlmError
     from wlm.probe import load_positions
 
-    if path is None:
-        return model.stored_positions(), True
-    position = load_positions(path)
-    return position, model.has_probes_at(position)
+    if original is None:
+        return None
+    position = load_positions(original)
+    if not model.has_probes_at(position):
+        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
+    return position
 
 
-def _show_report(file: Path, profile: str, report: "Report") -> None:
-    columns = ["", "PSNR dB", "live dB", "irradiance dB", "bytes", "of float32", "bits a probe"]
-    rows = table(str(file), columns)
+def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
+    columns = ["PSNR, dB", "live probes, dB", "irradiance, dB", "bytes on disk", "share of float32", "bits per probe"]
+    rows = table(str(file), ["", *columns])
     psnr = (number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
     sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")
-    rows.add_row(f"wlm {escape(profile)}", *psnr, *sizes)
+    rows.add_row(f"wlm {escape(model.profile.name)}", *psnr, *sizes)
     if report.psnr_by_band is not None:
         rows.add_section()
-        for band, psnr in enumerate(report.psnr_by_band):
-            rows.add_row(f"band {band}", number(psnr, ".2f"))
+        for band, value in enumerate(report.psnr_by_band):
+            rows.add_row(f"SH band {band}", number(value, ".2f"))
+    rows.add_section()
     if report.between_psnr is not None:
-        rows.add_section()
         rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
     if report.held_out is not None:
         held = report.held_out
-        rows.add_row(f"{held.probes:,} probes held out", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
-        rows.add_row("  by the nearest uncompressed", number(held.nearest, ".2f"))
-        rows.add_row("  by distance, of 8 uncompressed", number(held.distance, ".2f"))
+        rows.add_row(f"{held.probes:,} probes left out of a fit", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
+        rows.add_row("  nearest uncompressed probe there", number(held.nearest, ".2f"))
+        rows.add_row("  8 uncompressed probes by distance", number(held.distance, ".2f"))
     show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe
         place = ", ".join(f"{x:.4g}" for x in worst["position"])
-        note(f"worst: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
-    for warning in report.warnings:
-        note(f"warning: {warning}")
-
-
-register_export(app)
-register(app)
+        note(f"worst probe: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
+    note_warnings(report.warnings)

@@ -1,12 +1,12 @@
-"""`wlm probe walk` and `volume`: the light of probes as a viewer gets it."""
+"""`wlm probe volume`: the cascaded lighting volume around a viewer, and its scores for `wlm evaluate`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli.console import check_output, escape, number, quiet_warp, running, show, table, write_json
-from wlm.cli.options import Device, ModelFile, ReportFile, output_option
+from wlm.cli.console import check_output, number, quiet_warp, running, show, show_files, table, write_json
+from wlm.cli.options import Device, Key, ModelFile, ReportFile
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -15,63 +15,106 @@ if TYPE_CHECKING:
     from wlm.probe import Decoder, ProbeModel, ProbeSet, Volume
     from wlm.probe.views import ViewScore
 
-_Block = Annotated[float | None, typer.Option(help="Side of the finest blocks; default from the probes' spacing.")]
-_Key = Annotated[str | None, typer.Option(help="Name of the values in PROBES; default the only ones.")]
 _AXES = ("x", "y", "z")
+_DECIBELS = {
+    "sampled near the viewer, dB": "psnr",
+    "decoded at the same points, dB": "light_psnr",
+    "sampled farther away, dB": "far_psnr",
+}
+
+app = typer.Typer(help="Light probes: the cascaded volume that a renderer samples.")
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the commands of the volume to those of probes."""
-    app.command()(walk)
-    app.command()(volume)
+@app.callback()
+def _group() -> None:
+    """Light probes: the cascaded volume that a renderer samples."""
 
 
-def walk(
+@app.command()
+def volume(
     file: ModelFile,
     probes_path: Annotated[
         Path | None,
-        typer.Argument(metavar="PROBES", help="What was compressed, to compare with; default the places in FILE.wlm."),
+        typer.Argument(metavar="PROBES", help="The original probes, to compare with; default the stored positions."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Write the volume at --at instead of walking.")
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Viewer of --output; default the middle of the probes.")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Frames of a loop through the scene; default a tenth of a block each.")
+        int | None, typer.Option(help="Frames of the walk through the scene; default a step of a tenth of a block.")
     ] = None,
     path: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints: a JSON list of x, y, z, or `position` of a .npz.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Viewpoints of the walk: a JSON list of x, y, z, or `position` of a .npz."),
     ] = None,
-    block: _Block = None,
+    block: Annotated[
+        float | None, typer.Option(help="Side of the finest blocks; default from the distances of the probes.")
+    ] = None,
     eye: Annotated[
-        float | None, typer.Option(help="Height of the eyes above the ground; default an 80th of the scene's length.")
+        float | None, typer.Option(help="Height of the eyes; default 1/80 of the length of the scene.")
     ] = None,
-    up: Annotated[str, typer.Option(help="The axis that points up: x, y or z.")] = "y",
-    budget: Annotated[int | None, typer.Option(help="Blocks decoded in a frame; default 64.")] = None,
-    key: _Key = None,
+    up: Annotated[str, typer.Option(help="Axis that points up: x, y or z.")] = "y",
+    budget: Annotated[int | None, typer.Option(help="Blocks decoded per frame; default 64.")] = None,
+    key: Key = None,
     json_path: ReportFile = None,
     device: Device = "cpu",
 ) -> None:
-    """Walk through the scene with a cascaded lighting volume: what a frame costs, covers and gets wrong.
+    """Walk through the scene with a cascaded volume and report cost, coverage and error per frame.
 
-    With PROBES the light that is read is scored against theirs, and walls keep light apart where PROBES have normals.
+    With PROBES the sampled light is compared with theirs, and normals of PROBES keep light from passing through walls.
+    With --output the volume around one viewer is written instead: buffers and an index, with shaders that read them.
     """
     if json_path is not None:
         check_output(json_path, ".json")
     if up not in _AXES:
         raise WlmError(f"--up: expected x, y or z, got {up}")
+    if at is not None and output is None:
+        raise WlmError("--at: has no meaning without --output")
     quiet_warp()
-    from wlm.probe import load_positions
-    from wlm.probe.volume.walk import STEP, camera_path, loop_frames, settle, summary, walk
+    from wlm.probe.volume.walk import settle
     from wlm.system import load
 
     model = load(file, "probe")
     decoder = model.decoder(device)
-    volume, original = _volume(file, model, decoder, probes_path, key, block, budget)
-    position = volume.position
-    if path is None:
-        axis, lit = _AXES.index(up), position[volume.numbers]
-        if frames is None:
-            frames = loop_frames(lit, STEP * volume.sizes[0], axis)
-        viewpoints = camera_path(lit, frames, eye, axis)
-    else:
-        viewpoints = load_positions(path)
+    made, original = _volume(file, model, decoder, probes_path, key, block, budget)
+    lit = made.position[made.numbers]
+    if output is not None:
+        from wlm.export import export
+        from wlm.probe.volume.bundle import volume_bundle
+
+        settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
+        show_files(output, export(volume_bundle(made), output))
+        return
+    viewpoints = _viewpoints(path, lit, frames, eye, _AXES.index(up), made)
+    _walk(file, model, decoder, made, viewpoints, original, json_path)
+
+
+def _viewpoints(
+    path: Path | None, lit: "np.ndarray", frames: int | None, eye: float | None, axis: int, volume: "Volume"
+) -> "np.ndarray":
+    from wlm.probe import load_positions
+    from wlm.probe.volume.walk import STEP, camera_path, loop_frames
+
+    if path is not None:
+        return load_positions(path)
+    frames = loop_frames(lit, STEP * volume.sizes[0], axis) if frames is None else frames
+    return camera_path(lit, frames, eye, axis)
+
+
+def _walk(
+    file: Path,
+    model: "ProbeModel",
+    decoder: "Decoder",
+    volume: "Volume",
+    viewpoints: "np.ndarray",
+    original: "np.ndarray | None",
+    json_path: Path | None,
+) -> None:
+    from wlm.probe.volume.walk import settle, summary, walk
+
     first = settle(volume, viewpoints[0])
     peak = None if original is None else float(original.max()) - float(original.min())
     with running("walk") as progress:
@@ -81,36 +124,6 @@ def walk(
         settings = {"device": decoder.device, "sizes": list(volume.sizes), "side": volume.side, "budget": volume.budget}
         write_json(json_path, {"name": model.name} | settings | figures)
     _show_walk(file, figures)
-
-
-def volume(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    probes_path: Annotated[
-        Path | None, typer.Argument(metavar="PROBES", help="What was compressed; default the places in FILE.wlm.")
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Where the viewer stands; default the middle of the probes.")
-    ] = None,
-    block: _Block = None,
-    key: _Key = None,
-    device: Device = "cpu",
-) -> None:
-    """Write the cascaded volume round a viewer as buffers and a page table, with shaders that read them."""
-    quiet_warp()
-    from wlm.export import export
-    from wlm.probe.volume.bundle import volume_bundle
-    from wlm.probe.volume.walk import settle
-    from wlm.system import load
-
-    model = load(file, "probe")
-    made, _ = _volume(file, model, model.decoder(device), probes_path, key, block, None)
-    lit = made.position[made.numbers]
-    settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
-    rows = table(str(output), ["file", "bytes"])
-    for path in export(volume_bundle(made), output):
-        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
-    show(rows)
 
 
 def _point(text: str) -> "np.ndarray":
@@ -134,66 +147,64 @@ def _volume(
     block: float | None,
     budget: int | None,
 ) -> "tuple[Volume, np.ndarray | None]":
-    """A volume of a model's probes, and the light that was compressed, where it is given."""
+    """Makes the volume of a model's probes; also returns the original light, if it is given."""
     from wlm.probe.places import probes_of
     from wlm.probe.volume.cascade import BUDGET, Volume
 
     if probes_path is None:
-        live = ~model.dead if len(model.dead) else None
-        position, original, normal = model.stored_positions(), None, None
+        position, original, live, normal = model.stored_positions(), None, model.live, None
     else:
         position, original, live, normal = probes_of(model, probes_path, key)
-    if probes_path is not None and not model.has_probes_at(position):
-        raise WlmError(f"{probes_path}: expected the {model.probes} probes that {file} was made of, in their order")
+        if not model.has_probes_at(position):
+            raise WlmError(f"{probes_path}: expected the {model.probes} probes of {file}, in their order")
     budget = BUDGET if budget is None else budget
     light = decoder.light(position)
     return Volume(position, light, live=live, normal=normal, block=block, budget=budget), original
 
 
-def walk_scores(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
-    """What is read along a walk, from the probes as they were and from the model's."""
+def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
+    """Scores the light sampled from the volume along a walk, for the original and the decoded probes."""
     from wlm.probe.volume.light import StoredLight
     from wlm.probe.volume.walk import score_volume
 
-    decoder = model.decoder(device)
+    decoder = model.decoder(device, position=probes.position)
     lights = {
-        "lossless": StoredLight(probes.values, decoder.device),
+        "original": StoredLight(probes.values, decoder.device),
         "decoded": decoder.light(probes.position),
     }
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
 
 
-def show_walk_scores(walked: dict[str, dict[str, Any]]) -> None:
-    """Shows the scores of walks; nothing without any."""
-    if not walked:
+def show_walks(walks: dict[str, dict[str, Any]]) -> None:
+    """Shows the scores of walks, if there are any."""
+    if not walks:
         return
-    columns = ["light", "read near, dB", "decoded there, dB", "read farther away, dB", "blocks a frame"]
-    rows = table("through the volume", columns)
-    for name, figures in walked.items():
-        decibels = (number(figures[key], ".2f") for key in ("psnr", "light_psnr", "far_psnr"))
+    rows = table("sampled from the cascaded volume", ["light", *_DECIBELS, "blocks decoded per frame"])
+    for name, figures in walks.items():
+        decibels = (number(figures[key], ".2f") for key in _DECIBELS.values())
         rows.add_row(name, *decibels, number(figures["updated"]["mean"], ".1f"))
     show(rows)
 
 
-def score_seen(
+def score_pictures(
     model: "ProbeModel", probes: "ProbeSet", views: int, mesh: Path | None, device: str
 ) -> "list[ViewScore]":
-    """Scores pictures under the decoded light, 50 of them where no number is given."""
+    """Scores pictures under the decoded light; 50 of them if `views` is 0."""
     from wlm.formats.geometry import read_geometry
     from wlm.probe.views import VIEWS, score_views
 
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
-    decoded = model.decoder(device).decode_probes(probes.position)
+    decoded = model.decoder(device, position=probes.position).decode_probes()
     with running("views") as progress:
         return score_views(probes, decoded, geometry, views=views or VIEWS, device=device, progress=progress)
 
 
-def show_seen(scores: "list[ViewScore]") -> None:
-    """Shows the scores of pictures; nothing without any."""
+def show_pictures(scores: "list[ViewScore]") -> None:
+    """Shows the scores of pictures, if there are any."""
     if not scores:
         return
-    rows = table("pictures under the light", ["", "light", "views", "MSE", "PSNR dB", "SSIM", "FLIP"])
+    rows = table("pictures under the light", ["drawn", "light", "views", "MSE", "PSNR, dB", "SSIM", "FLIP"])
     for score in scores:
         figures = (number(score.mse, ".3g"), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
         rows.add_row(score.drawn, score.light, str(score.views), *figures, number(score.flip, ".4f"))
@@ -208,20 +219,20 @@ def _show_walk(file: Path, figures: dict[str, Any]) -> None:
         "blocks waiting": "left",
         "probes": "probes",
     }
-    times = {"update ms": "update_ms", "read ms": "read_ms"}
-    for names, form in ((counts, ".1f"), (times, ".3f"), ({"error": "rmse", "light": "rms"}, ".4g")):
+    times = {"update, ms": "update_ms", "sampling, ms": "read_ms"}
+    errors = {"error, RMS": "rmse", "light, RMS": "rms"}
+    for names, form in ((counts, ".1f"), (times, ".3f"), (errors, ".4g")):
         for name, key in names.items():
             values = figures[key] or {}
             rows.add_row(name, *(number(values.get(part), form) for part in ("mean", "p95", "max")))
         rows.add_section()
     coverage = figures["coverage"] or {}
-    rows.add_row("covered", *(number(coverage.get(part), ".2%") for part in ("mean", "p5", "min")))
+    rows.add_row("points inside the volume", *(number(coverage.get(part), ".2%") for part in ("mean", "p5", "min")))
     rows.add_section()
-    names = {"read near, dB": "psnr", "decoded there, dB": "light_psnr", "read farther away, dB": "far_psnr"}
-    for name, key in names.items():
+    for name, key in _DECIBELS.items():
         if key in figures:
             rows.add_row(name, number(figures[key], ".2f"))
-    rows.add_row("frames until all is there", str(figures["first_frames"]))
+    rows.add_row("frames until the volume is complete", str(figures["first_frames"]))
     rows.add_row("volume, bytes", f"{figures['volume_bytes']:,}")
     rows.add_row("model, bytes", f"{figures['model_bytes']:,}")
     show(rows)

@@ -18,10 +18,17 @@ Shapes = dict[str, list[int]]
 """The shapes of the parts that are stored as frames, by name: a setting of the artifact."""
 
 
-def compress(data: bytes) -> bytes:
-    """Packs bytes into one frame that states its size."""
-    level = _LEVEL if len(data) <= _FAST_BYTES else _FAST_LEVEL
-    return zstandard.ZstdCompressor(level=level).compress(data)
+def compress(*pieces: bytes) -> bytes:
+    """Packs pieces of data, one after another, into one frame that states its size.
+
+    Each piece has blocks of its own, so that zstd models pieces with different statistics separately.
+    """
+    size = sum(map(len, pieces))
+    packer = zstandard.ZstdCompressor(level=_LEVEL if size <= _FAST_BYTES else _FAST_LEVEL).compressobj(size=size)
+    frame = b""
+    for piece in pieces:
+        frame += packer.compress(piece) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+    return frame + packer.flush()
 
 
 def decompress(frame: bytes, size: int, name: str) -> bytes:
