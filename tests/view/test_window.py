@@ -396,10 +396,10 @@ def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps
     window = show(lightmaps / "four.wlm", original=tmp_path / "set")
     model, masked = wlm.load(lightmaps / "four.wlm"), wlm.lightmap.load(tmp_path / "set")
     report = wlm.lightmap.evaluate(model, masked, metrics=("psnr",))
-    for hour, score in zip(report.time_values, report.psnr_by_time, strict=True):
+    for hour, score in zip(report.times, report.light.psnr_by_time, strict=True):
         window.set("hour", hour)
         assert f"PSNR {score:.2f} dB" in caption(window)
-    before, after = report.time_values[1:3]
+    before, after = report.times[1:3]
     window.set("hour", 0.5 * (before + after))
     assert f"original interpolated from {before:g} and {after:g}" in caption(window)
     texture = window.canvas._drawn[2, "mesh"][0].texture
@@ -512,7 +512,7 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
     monkeypatch.delenv("DISPLAY", raising=False)
     for options, said in (
         ([], "expected a display"),
-        (["--set", "turn=3", "--set", "frame=2", *out], "frame has no meaning"),
+        (["--set", "frame=2", *out], "frame has no meaning"),
         (["--set", "hour=nan", *out], "hour: expected a finite number"),
         (["--mesh", str(lightmaps / "quad.glb"), "--set", "turn=inf", *out], "turn: expected a finite number"),
         (["--view", "volume", *out], "--view: expected light or tiles"),
