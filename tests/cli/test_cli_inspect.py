@@ -16,10 +16,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
-from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
-from wlm.export import export as export_model
-from wlm.export.engines.atlas import export_atlas
+from wlm.export import export
 from wlm.formats.exr import write_exr
 from wlm.inspection import files, inspect
 from wlm.inspection.folders import MOST
@@ -69,7 +67,8 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     (tmp_path / "other" / "smoke.vdb").write_bytes(b" BDV\0\0\0\0")
     shutil.copy(FILES / "lightmap.wlm", tmp_path / "other" / "map.wlm")
     mesh = atlas_meshes.sheet()
-    wlm.atlas.export(wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0)), tmp_path / "atlas", mesh)
+    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
+    model.save(tmp_path / "other" / "atlas.wlm")
     text = told(tmp_path)
     for said in (
         "unity: 2 states of light from Unity, 1 map of 64x64, with light, dir -> "
@@ -84,11 +83,11 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "wlm compress HERE/other/two.npz --key 9 -o OUT.wlm",
         "smoke.vdb: cannot be read",
         "map.wlm: compressed lightmaps over time",
-        "atlas: a compressed lightmap of a mesh -> ",
+        "atlas.wlm: compressed lightmaps of meshes",
     ):
         assert said in text, said
     assert "LICENSE" not in text and text.count("set") < 20
-    export_atlas(read_folder(tmp_path / "atlas"), tmp_path / "engine", "unity")
+    export(model, tmp_path / "engine", "unity")
     # No command takes it.
     assert told(tmp_path / "engine").endswith(" -> ")
 
@@ -109,7 +108,7 @@ def test_probes_of_exports_can_be_read_back(tmp_path):
         ("unity", "probes.json", "light probes for Unity: 20 light probes"),
     ):
         folder = tmp_path / name.removesuffix(".json")
-        export_model(model, folder, engine, **({} if engine == "unity" else {"cells": 2}))
+        export(model, folder, engine, **({} if engine == "unity" else {"cells": 2}))
         (finding,) = inspect(folder / name)
         assert finding.what.startswith(f"{what} of 9 RGB coefficients")
         assert finding.command == f"wlm compress {folder / name} -o OUT.wlm"

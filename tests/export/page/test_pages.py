@@ -96,7 +96,6 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
         ([], {}, "found none"),
         ([tmp_path / "absent.wlm"], {}, "absent.wlm"),
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
-        ([FILES / "atlas-tiles.wlm"], {}, "expected the folder"),
         ([FILES / "lightmap.wlm", FILES / "lightmap.wlm"], {}, "expected one file"),
         ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
         ([FILES / "lightmap.wlm"], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
@@ -173,9 +172,9 @@ def test_frames_of_smoke_are_of_one_size(tmp_path):
 
 def test_the_command_writes_a_page_of_a_folder(tmp_path):
     mesh = atlas_meshes.sheet()
-    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0))
-    wlm.atlas.export(model, tmp_path / "sheet", mesh)
-    result = CliRunner().invoke(app, ["web", str(tmp_path / "sheet"), "-o", str(tmp_path / "page.html")])
+    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
+    model.save(tmp_path / "sheet.wlm")
+    result = CliRunner().invoke(app, ["web", str(tmp_path / "sheet.wlm"), "-o", str(tmp_path / "page.html")])
     assert result.exit_code == 0, result.output
     manifest, _ = parts(tmp_path / "page.html")
     assert manifest["kind"] == "atlas" and dict(manifest["figures"])["profile"] == "tiny"
