@@ -26,7 +26,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from importlib import import_module
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -34,10 +35,6 @@ from pydantic import Field
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
 from wlm.texels import check_size
-
-if TYPE_CHECKING:
-    from wlm.atlas.data import LightmappedScene
-    from wlm.atlas.stored import StoredScene
 
 SOURCE_BITS = 48
 """Bits per texel of a lightmap: three half floats (eq. 9)."""
@@ -272,7 +269,7 @@ class AtlasModel(Model):
     later: tuple[SheetPlace, ...] = ()
     tail: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
     uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
-    stored: "StoredScene | None" = None
+    stored: Any = None
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -327,16 +324,15 @@ class AtlasModel(Model):
         return 1.0 - file_bytes * 8 / self.source_bits
 
     @cached_property
-    def scene(self) -> "LightmappedScene":
-        """The scene without lightmaps, read from the stored triangles and masks.
+    def scene(self) -> Any:
+        """The `LightmappedScene` without lightmaps, read from the stored triangles and masks.
 
         Raises:
             WlmError: The stored triangles are damaged.
             ValueError: The model has none.
         """
-        from wlm.atlas.stored import restore
-
-        return restore(self)
+        # `stored` is above this module.
+        return import_module("wlm.atlas.stored").restore(self)
 
     def table(self) -> np.ndarray:
         """The table of sheets as kernels and shaders read it, int32 [rows, 7].
@@ -353,12 +349,6 @@ class AtlasModel(Model):
         kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
         sheets, later = (tuple(replace(row, smaller=0) for row in rows) for rows in (self.sheets, kept))
         return replace(self, sheets=sheets, levels=(), later=later, tail=self.tail[:0])
-
-    def bundle(self, device: str = "cpu") -> Any:
-        """The textures, shader and mesh of this model, see `wlm.atlas.bundles`."""
-        from wlm.atlas.bundles import bundle
-
-        return bundle(self, device=device)
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
