@@ -40,6 +40,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -132,8 +133,8 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
-    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.probe.export_grid`).
-    - `light.json` with its textures, `probes.json`: exports of `wlm.probe.export_unreal` and `export_unity`.
+    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.export.export(..., "three")`).
+    - `light.json` with its textures, `probes.json`: exports for Unreal and for Unity.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
     - `.lmbake`: a lightmap bake of Godot 4.
@@ -306,19 +307,18 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
     """Returns positions, values and convention of an export for an engine; None for other content."""
     form = content.get("format") if isinstance(content, dict) else None
-    if form == THREE_GRID:
-        from wlm.probe.engines.three import read_grid
+    if form not in _EXPORTS:
+        return None
+    module, function, convention = _EXPORTS[form]
+    return *getattr(import_module(module), function)(path, content), convention
 
-        return *read_grid(path, content), CANONICAL
-    if form == UNREAL_LIGHT:
-        from wlm.probe.engines.unreal import read_unreal
 
-        return *read_unreal(path, content), "unreal"
-    if form == UNITY_PROBES:
-        from wlm.probe.engines.unity import read_unity
-
-        return *read_unity(path, content), "unity"
-    return None
+# By `format` of an index: module and function that read it, and the convention of its coefficients.
+_EXPORTS = {
+    THREE_GRID: ("wlm.probe.engines.three", "read_grid", CANONICAL),
+    UNREAL_LIGHT: ("wlm.probe.engines.unreal", "read_unreal", "unreal"),
+    UNITY_PROBES: ("wlm.probe.engines.unity", "read_unity", "unity"),
+}
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:
