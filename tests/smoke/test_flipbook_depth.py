@@ -82,7 +82,7 @@ def test_the_command(tmp_path):
     assert "wlm_smoke_depth" not in (tmp_path / "d" / "smoke.glsl").read_text()
     assert not (tmp_path / "d" / "depth.png").exists()
     line = fails("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "e.png", "--depth", tmp_path / "none")
-    assert "none: expected the flip book's smoke, found none" in line
+    assert "none: expected the smoke of the flip book, found none" in line
     with pytest.raises(WlmError, match=r"expected frame_0099.npz, of the flip book's frame 1"):
         frames_depth(frames, (99,), cameras[:1])
     book = ("--with", tmp_path / "b_2.png", "--cells", "2x2", "--depth", folder)
