@@ -463,7 +463,7 @@ def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
 def test_the_command_writes_a_picture_and_a_movie(lightmaps, tmp_path, show):
     del show  # only for its check of OpenGL
     out, movie = tmp_path / "out.png", tmp_path / "out.webp"
-    options = ["--hour", "18.5", "--exposure", "1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
+    options = ["--set", "hour=18.5", "--set", "exposure=1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
     outputs = ["--screenshot", str(out), "--movie", str(movie), "--frames", "2"]
     result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options, *outputs])
     assert result.exit_code == 0, result.output
@@ -512,9 +512,9 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
     monkeypatch.delenv("DISPLAY", raising=False)
     for options, said in (
         ([], "expected a display"),
-        (["--turn", "3", "--frame", "2", *out], "--frame means nothing"),
-        (["--hour", "nan", *out], "--hour: expected a finite number"),
-        (["--mesh", str(lightmaps / "quad.glb"), "--turn", "inf", *out], "--turn: expected a finite number"),
+        (["--set", "turn=3", "--set", "frame=2", *out], "frame has no meaning"),
+        (["--set", "hour=nan", *out], "hour: expected a finite number"),
+        (["--mesh", str(lightmaps / "quad.glb"), "--set", "turn=inf", *out], "turn: expected a finite number"),
         (["--view", "volume", *out], "--view: expected light or tiles"),
         (["--outside", *out], "--outside: expected the mesh of a room"),
         (["--size", "10", *out], "--size: expected a width and a height"),
