@@ -47,7 +47,7 @@ bench: $(STAMP)
 	$(BIN)/python -m benchmarks probe --quick --json out/bench.json
 	$(BIN)/python -m benchmarks atlas --quick --json out/bench.json
 	$(BIN)/python -m benchmarks smoke --quick --json out/bench.json
-	$(BIN)/python -m benchmarks smoke-network --quick --profile 16 --json out/bench.json
+	$(BIN)/python -m benchmarks smoke-network --quick --profile fast --json out/bench.json
 	for system in lightmap probe atlas smoke smoke-network; do \
 		$(BIN)/python -m benchmarks plot out/bench.json --system $$system -o out/bench-$$system.png; done
 

@@ -269,7 +269,7 @@ def smoke_network(
 
 @app.command("smoke-ablation")
 def smoke_ablation(
-    profile: Annotated[str, typer.Option(metavar="NAME", help="The profile or YAML file to vary.")] = "24",
+    profile: Annotated[str, typer.Option(metavar="NAME", help="The profile or YAML file to vary.")] = "fast",
     quick: Annotated[bool, typer.Option("--quick", help="Use small images and few steps, for a CPU.")] = False,
     device: Device = "cpu",
     rounds: Annotated[int | None, typer.Option(min=1, help="Rounds of each training, with new samples.")] = None,

@@ -219,7 +219,7 @@ def _load_ms(model: SheetModel) -> float | None:
     if not numbers:
         return None
     packed = [(number, encoding_of(model.kind[number])) for number in numbers]
-    frames = [(number, encoding, zstd.compress(encoding.pack(model, number))) for number, encoding in packed]
+    frames = [(number, encoding, zstd.compress(*encoding.pack(model, number))) for number, encoding in packed]
     seconds = []
     for number, encoding, frame in frames * max(1, _LOADS // len(frames)):
         start = time.perf_counter()

@@ -49,7 +49,8 @@ def bake(out: Path, device: str) -> Path:
 
 
 def _means(lightmaps: LightmapSet) -> list[float]:
-    return [float(frame[lightmaps.mask].mean()) for frame in lightmaps.frames]
+    light = lightmaps.light
+    return [float(frame[light.mask].mean()) for frame in light.frames]
 
 
 def run(out: Path, data: Path, device: str) -> dict[str, float]:
@@ -71,7 +72,8 @@ def run(out: Path, data: Path, device: str) -> dict[str, float]:
     lap("evaluate them")
     decoder = model.decoder(device)
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
-    before_after_error(out / "cornell.png", lightmaps.frames, decoded, lightmaps.mask, lightmaps.times)
+    light = lightmaps.light
+    before_after_error(out / "cornell.png", light.frames, decoded, light.mask, light.times)
     lap("draw")
     probes = wlm.probe.load(data / "probes.npz", key=KEY)
     path = out / "cornell_probes.wlm"

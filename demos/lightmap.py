@@ -58,7 +58,8 @@ def run(out: Path, device: str) -> dict[str, float]:
     atomic_write(out / "report.json", (json.dumps(report.to_json(), indent=1) + "\n").encode())
     lap("evaluate")
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
-    before_after_error(out / "city.png", lightmaps.frames, decoded, lightmaps.mask, lightmaps.times)
+    light = lightmaps.light
+    before_after_error(out / "city.png", light.frames, decoded, light.mask, light.times)
     lap("draw")
     _check(lightmaps, report, out)
     return {
@@ -75,7 +76,7 @@ def run(out: Path, device: str) -> dict[str, float]:
 
 def _half_bytes(lightmaps: LightmapSet) -> int:
     """Bytes of the input as half-float RGB."""
-    return lightmaps.frames.size * 2
+    return lightmaps.light.frames.size * 2
 
 
 def _check(lightmaps: LightmapSet, report: Report, out: Path) -> None:
@@ -90,10 +91,9 @@ def _check(lightmaps: LightmapSet, report: Report, out: Path) -> None:
         raise WlmError(f"demo: expected a file {LEAST_RATIO:g} times smaller than its input, got {ratio:.1f}")
     # Halfway between 18.45 and 18.55 in time is halfway in light: half of the lamps' strength.
     between, _ = read_exr(out / "city_18_50h.exr")
-    before, after = (
-        lightmaps.frames[i][lightmaps.mask].mean() for i in (_index(lightmaps, 18.45), _index(lightmaps, 18.55))
-    )
-    mean = float(between[lightmaps.mask].mean())
+    light = lightmaps.light
+    before, after = (light.frames[_index(lightmaps, stamp)][light.mask].mean() for stamp in (18.45, 18.55))
+    mean = float(between[light.mask].mean())
     half = 0.5 * float(before + after)
     if not 0.97 * half <= mean <= 1.03 * half:
         raise WlmError(f"demo: the mean at {BETWEEN:g} h is {mean:.4f}; expected {half:.4f}, half-way")

@@ -36,17 +36,18 @@ def crop(lightmaps: LightmapSet, out: Path, y: int, x: int, height: int, width: 
         Bytes written.
 
     Raises:
-        WlmError: The rectangle is not inside the map or holds no valid texel, two times share a file's name,
-            or a file can't be written.
+        WlmError: The rectangle is not inside the map or has no valid texel, two times share a file's name,
+            or a file cannot be written.
     """
-    rows, columns = lightmaps.mask.shape
+    light = lightmaps.light
+    rows, columns = light.mask.shape
     place = f"{width}x{height} at row {y}, column {x}"
     if min(y, x) < 0 or min(height, width) < 1 or y + height > rows or x + width > columns:
         raise WlmError(f"crop: {place} is not inside the map of {columns}x{rows}")
     window = (slice(y, y + height), slice(x, x + width))
-    mask = lightmaps.mask[window]
+    mask = light.mask[window]
     if not mask.any():
-        raise WlmError(f"crop: {place} holds no valid texel")
+        raise WlmError(f"crop: {place} has no valid texel")
     names = [f"lightmap_{time:05.2f}h.exr".replace(".", "_", 1) for time in lightmaps.times]
     if len(set(names)) < len(names):
         raise WlmError("crop: two times are closer than 0.01, which the names of the files cannot tell apart")
@@ -55,7 +56,7 @@ def crop(lightmaps: LightmapSet, out: Path, y: int, x: int, height: int, width: 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WlmError(f"{out}: cannot make the folder: {error.strerror or error}") from error
-    for name, frame in zip(names, lightmaps.frames, strict=True):
+    for name, frame in zip(names, light.frames, strict=True):
         # Nobody reads the gaps; zeros cost no bytes.
         write_exr(out / name, np.where(mask[..., None], frame[window], 0.0), half=True)
     with atomic_path(out / "mask.png") as temporary:

@@ -16,8 +16,6 @@ from wlm.formats.artifact import read_artifact, write_artifact
 MODELS = (
     "lightmap",
     "lightmap-frames",
-    "lightmap-video",
-    "lightmap-levels",
     "lightmap-layers",
     "probe",
     "atlas-tiles",
@@ -143,15 +141,21 @@ def test_weird_settings_are_one_line(name, path):
             refused(kept, path, f"expected finite numbers, found {text}")
 
 
+def _sized(*size) -> dict:
+    """The settings of a lightmap's file with one sheet of this size."""
+    sheet = {"name": "random", "atlas": "0", "layer": "light", "channels": ["R", "G", "B"], "encoding": "radiance"}
+    return {"sheets": [sheet | {"size": list(size)}]}
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
-        ("lightmap", {"size": [1e300, 1]}, "setting size.0: expected a valid integer"),
-        ("lightmap", {"size": [128]}, "setting size"),
-        ("lightmap", {"size": [128, 128, 3]}, "setting size"),
-        ("lightmap", {"size": [True, 128]}, "setting size.0"),
-        ("lightmap", {"size": [128, -128]}, "found 128x-128"),
-        ("lightmap", {"size": [10**12, 10**12]}, "size: expected at least 1x1 texels, at most 65536 along a side"),
+        ("lightmap", _sized(1e300, 1), "setting sheets.0.size.0: expected a valid integer"),
+        ("lightmap", _sized(128), "setting sheets.0.size"),
+        ("lightmap", _sized(128, 128, 3), "setting sheets.0.size"),
+        ("lightmap", _sized(True, 128), "setting sheets.0.size.0"),
+        ("lightmap", _sized(128, -128), "setting size: expected width and height"),
+        ("lightmap", _sized(10**12, 10**12), "of all sheets"),
         ("lightmap", {"period": -5}, "setting period: expected greater than 0, got -5"),
         ("lightmap", {"period": 1e-320}, "part times: expected 0 to 9.99989e-321, the period, found 0 to 19"),
         ("lightmap", {"profile": {"name": "a", "hidden": 9999}}, "setting profile.hidden"),
@@ -183,27 +187,27 @@ def test_tables_in_place_of_lists(path):
     refused(kept, path, "part times is float32 (2, 2), expected float32 or float64 (any)")
     for wrong in (lambda v: v.reshape(2, 2), lambda v: v.astype(np.float32)):
         written(path, "lightmap")
-        rewrite(path, tensors={"kind": wrong})
+        rewrite(path, tensors={"0.kind": wrong})
         refused(kept, path, "part kind is ", "expected uint8 (4)")
 
 
 def test_a_few_bytes_that_claim_a_large_lightmap(path):
     """Of empty tiles alone; the largest that is read takes no memory for them either."""
     kept = written(path, "lightmap")
-    parts = {name: GONE for name in read_artifact(path).tensors if name not in ("kind", "times")}
-    rewrite(path, {"size": [32768, 32768]}, parts | {"kind": np.zeros(65536, np.uint8)})
-    refused(kept, path, "size: expected at least 1x1 texels, at most 65536 along a side and 268435456 in all")
-    rewrite(path, {"size": [16384, 16384]}, {"kind": np.zeros(16384, np.uint8)})
-    assert wlm.load(path).width == 16384
+    parts = {name: GONE for name in read_artifact(path).tensors if name not in ("0.kind", "times")}
+    rewrite(path, _sized(32768, 32768), parts | {"0.kind": np.zeros(65536, np.uint8)})
+    refused(kept, path, "at most 268435456 texels of all sheets, found 1073741824")
+    rewrite(path, _sized(16384, 16384), {"0.kind": np.zeros(16384, np.uint8)})
+    assert wlm.load(path).atlases == {"0": (16384, 16384)}
 
 
 def test_a_few_bytes_that_claim_many_frames(path):
     kept = written(path, "lightmap-frames")
     kind, times = np.full(16384, 4, np.uint8), np.arange(8, dtype=np.float64)
     ranges, sizes = np.zeros((16384, 8, 2, 3), np.float16), np.zeros(16384, np.uint32)
-    parts = {"kind": kind, "times": times, "mask": GONE, "ranges": ranges, "frame_sizes": sizes}
-    rewrite(path, {"size": [16384, 16384]}, parts | {"frames": np.zeros(0, np.uint8)})
-    refused(kept, path, "part frames: expected at most 256 times its 0 bytes")
+    parts = {"0.kind": kind, "times": times, "0.mask": GONE, "0.ranges": ranges, "0.tile_sizes": sizes}
+    rewrite(path, _sized(16384, 16384), parts | {"0.tiles": np.zeros(0, np.uint8)})
+    refused(kept, path, "the file: expected at most 256 times its")
 
 
 def test_a_few_bytes_that_claim_a_large_atlas(path):
@@ -222,7 +226,7 @@ def test_a_few_bytes_that_claim_a_large_network(path):
     refused(kept, path, "part encoder.5.2.weight is missing")
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("smoke", "lightmap-layers")])
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("smoke",)])
 def test_a_name_does_not_reach_the_terminal_as_orders(name, path):
     written(path, name)
     profile = read_artifact(path).settings["profile"] | {"name": "p\x9b2J"}
@@ -241,9 +245,10 @@ def test_a_source_that_is_no_word(path):
 def test_writing_holds_what_reading_asks(tmp_path):
     """A fit that diverged leaves no file."""
     model = wlm.load(_good(tmp_path, "lightmap"))
-    model.net = model.net.copy()
-    model.net[0, 3] = np.nan
-    with pytest.raises(WlmError, match=r"new.wlm: not written: .*part net: expected finite numbers"):
+    (sheet,) = model.sheets.values()
+    sheet.constant = sheet.constant.copy()
+    sheet.constant[0, 0] = np.nan
+    with pytest.raises(WlmError, match=r"new.wlm: not written: .*part 0.constant: expected finite numbers"):
         model.save(tmp_path / "new.wlm")
     assert not (tmp_path / "new.wlm").exists()
 

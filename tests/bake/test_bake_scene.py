@@ -27,7 +27,6 @@ from wlm.formats.gltf import read_gltf, vertex_normals
 from wlm.formats.parts import Part
 from wlm.inspection import inspect
 from wlm.lightmap import load
-from wlm.lightmap.layers.data import load as load_layers
 from wlm.probe.data import load as load_probes
 
 
@@ -200,7 +199,7 @@ def test_what_is_written_is_a_set(tmp_path):
     baked = BakedLightmaps((6.5, 18.0), light, light * 0.01, mask, mask * 1.0, mask * 0.0, geometry)
     files = write_lightmaps(tmp_path / "set", task, baked)
     assert {path.name for path in files} == {path.name for path in (tmp_path / "set").iterdir()}
-    lightmaps = load(tmp_path / "set")
+    lightmaps = load(tmp_path / "set").light
     assert lightmaps.times.tolist() == [6.5, 18.0] and lightmaps.period == 24.0 and (lightmaps.mask == mask).all()
     assert (lightmaps.frames == light).all() and lightmaps.mesh.is_file()
     assert baked.error == pytest.approx([0.01, 0.01], rel=0.01)
@@ -210,7 +209,7 @@ def test_what_is_written_is_a_set(tmp_path):
     write_lightmaps(tmp_path / "set", task, replace(baked, direction=direction))
     told = inspect(tmp_path / "set")
     assert len(told) == 1 and "dir" in told[0].what and told[0].command.startswith("wlm lightmap compress")
-    layers = load_layers(tmp_path / "set").sheets
+    layers = load(tmp_path / "set").sheets
     shown = {(sheet.layer, sheet.channels): own.frames for sheet, own in layers.items()}
     assert (shown["light", ("R", "G", "B")] == light).all()
     assert (shown["dir", ("R", "G", "B")] == direction[..., :3]).all()

@@ -14,6 +14,7 @@ import pytest
 from builders.bake_rooms import ROOM, quad
 from builders.gltf_scene import Thing, write_scene
 
+import wlm
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, Material
 from wlm.bake.lightmaps import _directions, bake_lightmaps, write_lightmaps
@@ -22,7 +23,6 @@ from wlm.bake.settings import BakeScene, Daylight, Lamp, ProbeSettings, Sky
 from wlm.bake.texels import place_texels
 from wlm.bake.work import open_checkpoint, open_task
 from wlm.errors import WlmError
-from wlm.lightmap.layers.data import load as load_layers
 
 DEVICE = os.environ.get("WLM_BAKE_DEVICE", "cpu")
 
@@ -160,7 +160,7 @@ def test_a_directional_bake_is_a_set_with_layers(tmp_path):
     task = open_task(tmp_path / "floor.yaml", directional=True)
     baked = bake_lightmaps(task, device=DEVICE)
     write_lightmaps(tmp_path / "set", task, baked)
-    read = load_layers(tmp_path / "set")
+    read = wlm.lightmap.load(tmp_path / "set")
     light, toward = (read.sheets[sheet].frames[0] for sheet in read.sheets if sheet.channels == ("R", "G", "B"))
     (alpha,) = (read.sheets[sheet].frames[0][..., 0] for sheet in read.sheets if sheet.channels == ("A",))
     assert light.shape == toward.shape and read.warnings == ()

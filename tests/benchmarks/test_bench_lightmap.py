@@ -14,7 +14,7 @@ from benchmarks.lightmap import PANELS, _quick_times, run, run_rivals, run_rows
 from benchmarks.rivals.lightmap import FEW, usual
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
-from wlm.lightmap.model import Profile
+from wlm.lightmap.profile import Profile
 from wlm.metrics import evaluate_frame, summarise
 
 TIMES = [6.0, 9.0, 12.0, 21.0]
@@ -49,10 +49,10 @@ def test_every_row_has_its_figures(rows):
     fits = [("fit", "M 60 steps"), ("fit in plain torch", "M 10 steps")]
     assert keys(rows) == [("ours", "M"), ("texture", "M"), *ways, *rivals, *fits]
     scored, weighed, timed = {"psnr", "ssim", "flip"}, {"disk_bytes", "disk_bpp", "encode_seconds"}, {"decode_ms"}
-    held = {"bytes", "bpp"}
+    memory = {"bytes", "bpp"}
     for row in rows:
         assert row.system == "lightmap" and row.scene == "three" and row.notes
-        measured = (scored | weighed | timed | held) & row.figures.keys()
+        measured = (scored | weighed | timed | memory) & row.figures.keys()
         if row.method.startswith("fit"):
             assert measured == {"encode_seconds"} and row["step_ms"] == 1e3 * row["encode_seconds"] / row["steps"]
             continue
@@ -64,7 +64,7 @@ def test_every_row_has_its_figures(rows):
             assert measured == {"psnr", "decode_ms"}
             continue
         streamed = row.method == "AV1"
-        assert measured == scored | weighed | timed | (set() if streamed else held)
+        assert measured == scored | weighed | timed | (set() if streamed else memory)
         assert ("no random access" in row.notes) is streamed
         # There are no gaps and no mesh.
         assert 10.0 < row["worst_seen"] < row["seen"] < 70.0 and row["worst_between"] < row["between"]
@@ -108,9 +108,9 @@ def test_the_command(given_rows, tmp_path, monkeypatch):
 
 
 def test_the_score_is_that_of_the_times_asked_for(rows, lightmaps):
-    frames = lightmaps.frames
+    frames = lightmaps.light.frames
     flat = [np.broadcast_to(frame.mean((0, 1)), frame.shape) for frame in frames]
-    worst = summarise([evaluate_frame(a, b, lightmaps.mask) for a, b in zip(frames[1:], flat[1:], strict=True)])
+    worst = summarise([evaluate_frame(a, b, lightmaps.light.mask) for a, b in zip(frames[1:], flat[1:], strict=True)])
     ours = next(row for row in rows if row.method == "ours")
     assert "scored at 9, 12, 21;" in ours.notes
     assert [ours[f"{kind}_tiles"] for kind in ("dynamic", "static", "constant")] == [1, 1, 1]
@@ -128,12 +128,11 @@ def test_a_codec_without_its_package_says_so(lightmaps, monkeypatch):
     assert eight["psnr"] > 40.0
 
 
-@pytest.mark.parametrize(("name", "changes"), [("frames", {}), ("video", {"video_speed": 8}), ("levels", {})])
-def test_images_have_nothing_to_fit(lightmaps, name, changes):
-    rows = run_rows(lightmaps, [Profile.load(name).override(changes)], device="cpu", chosen=[0], repeats=1)
-    assert keys(rows) == [("ours", name), ("texture", name)]
-    assert [rows[0].get(figure) for figure in (f"{name}_tiles", "constant_tiles", "steps")] == [2, 1, None]
-    assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0
+def test_frames_have_nothing_to_fit(lightmaps):
+    rows = run_rows(lightmaps, [Profile.load("frames")], device="cpu", chosen=[0], repeats=1)
+    assert keys(rows) == [("ours", "frames"), ("texture", "frames")]
+    assert [rows[0].get(figure) for figure in ("frames_tiles", "constant_tiles", "steps")] == [2, 1, None]
+    assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0 and rows[0]["load_ms"] > 0.0
 
 
 def test_what_is_refused(lightmaps, tmp_path):
@@ -153,19 +152,6 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
         run(quick=quick, device="cpu", set_path="set")
     run(quick=False, device="cpu", set_path="set", rivals=False)
     assert calls == [FEW, usual("cpu"), ()]
-
-
-def test_qualities_of_video_are_profiles_of_their_own(monkeypatch):
-    calls = []
-    monkeypatch.setattr(bench, "load", lambda path: from_arrays(np.ones((1, 8, 8, 3)), [12.0]))
-    monkeypatch.setattr(bench, "run_rows", lambda lightmaps, profiles, **options: calls.append(profiles))
-    run(quick=False, device="cpu", qualities=(75, 50))
-    run(quick=False, device="cpu", names=["M"], qualities=(75,))
-    names = [[(p.name, p.frames, p.video_quality) for p in profiles] for profiles in calls]
-    assert names[0] == [("video 75", "video", 75), ("video 50", "video", 50)]
-    assert [name for name, *_ in names[1]] == ["M", "video 75"]
-    with pytest.raises(WlmError, match="video_quality"):
-        run(quick=False, device="cpu", qualities=(106,))
 
 
 def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):

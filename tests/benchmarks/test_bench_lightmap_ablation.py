@@ -19,7 +19,7 @@ from wlm.metrics import evaluate_frame, summarise
 @pytest.fixture(scope="module")
 def lightmaps():
     """The first tile has a pattern whose strength alone changes; of the second, the map has 64 x 50 texels."""
-    parts = [static_light(64, 128), moving_light(64, 50)]
+    parts = [static_light(64, 128).light, moving_light(64, 50).light]
     frames = np.concatenate([part.frames for part in parts], axis=2)
     return from_arrays(frames, parts[0].times, period=24.0, name="two")
 
@@ -52,10 +52,10 @@ def test_every_row_has_its_figures(made, lightmaps):
 
 def test_scores_are_those_of_the_dynamic_tile(made, lightmaps):
     """A fit knows more than its mean; the static tile, which it would score as black, doesn't count."""
-    inside = np.zeros_like(lightmaps.mask)
+    inside = np.zeros_like(lightmaps.light.mask)
     inside[:, 128:] = True
-    means = [np.broadcast_to(frame[inside].mean(0), frame.shape) for frame in lightmaps.frames]
-    flat = summarise([evaluate_frame(a, b, inside) for a, b in zip(lightmaps.frames, means, strict=True)])
+    means = [np.broadcast_to(frame[inside].mean(0), frame.shape) for frame in lightmaps.light.frames]
+    flat = summarise([evaluate_frame(a, b, inside) for a, b in zip(lightmaps.light.frames, means, strict=True)])
     for row in made[0]:
         if row.option != KERNELS:  # its maps are smaller here
             assert row["psnr"] > flat.psnr - 3.0, row.option

@@ -34,6 +34,10 @@ def _assert_same(x: Any, y: Any, name: str) -> None:
         assert x == {key: value for key, value in y.items() if key != "seconds"}
     elif dataclasses.is_dataclass(x) and type(x).__eq__ is object.__eq__:
         assert_same(x, y)
+    elif isinstance(x, dict) and any(dataclasses.is_dataclass(part) for part in x.values()):
+        assert list(x) == list(y), name
+        for key, part in x.items():
+            _assert_same(part, y[key], f"{name} {key}")
     elif isinstance(x, tuple) and any(isinstance(part, np.ndarray) for part in x):
         for mine, other in zip(x, y, strict=True):
             _assert_same(mine, other, name)

@@ -57,21 +57,20 @@ def _lightmap() -> Subject:
         small_sets.moving_light,
         lambda data, **options: wlm.lightmap.compress(data, profile, **options),
         lambda model, data: wlm.lightmap.evaluate(model, data, metrics=("psnr", "seen")),
-        lambda model, data, folder: wlm.lightmap.export(model, folder),
+        lambda model, data, folder: wlm.export.export(model, folder),
         checkpoint,
     )
 
 
 def _layers() -> Subject:
     def decode(model: Any) -> dict[str, np.ndarray]:
-        frame = model.decoder().frame(18.5)
         return {
             f"{atlas}_{layer}": values[:24:2, :24:2]
-            for atlas, layers in frame.items()
+            for atlas, layers in model.decoder().frames(18.5).items()
             for layer, values in layers.items()
         }
 
-    return Subject("lightmap-layers", FILES / "lightmap-layers.wlm", decode, FILES / "lightmap-layers.npz")
+    return Subject("lightmap", FILES / "lightmap-layers.wlm", decode, FILES / "lightmap-layers.npz")
 
 
 def _probe() -> Subject:

@@ -47,7 +47,7 @@ def turning_directions(height=128, width=128, hours=HOURS) -> np.ndarray:
 
 def small_layers(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet:
     """Light, directions and a mask of three channels, of which one is zero and two are equal."""
-    light, directions = moving_light(height, width, hours).frames, turning_directions(height, width, hours)
+    light, directions = moving_light(height, width, hours).light.frames, turning_directions(height, width, hours)
     mask = np.zeros((len(hours), height, width, 3), np.float32)
     mask[..., 1] = mask[..., 2] = light[..., 0] / light.max()
     layers = [

@@ -10,7 +10,6 @@ import subprocess
 import numpy as np
 import pytest
 import texture2ddecoder
-from PIL import Image
 
 ES = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n"
 ES += "precision highp usampler2D;\nprecision highp sampler2DArray;\n"
@@ -228,11 +227,8 @@ def read_dds_levels(path):
     fmt, dimension, _, layers = struct.unpack_from("<4I", data, 128)
     assert dimension == 3
     payload = data[148:]
-    if fmt == 49:
-        return np.frombuffer(payload, np.uint8).reshape(layers, height, width, 2) / 255.0
-    if fmt == 24:
-        words = np.frombuffer(payload, "<u4").reshape(layers, height, width, 1)
-        return np.concatenate([words >> shift & 1023 for shift in (0, 10, 20)], 3) / 1023.0
+    if fmt in (49, 61):
+        return np.frombuffer(payload, np.uint8).reshape(layers, height, width, -1) / 255.0
     assert fmt == 98
     size = len(payload) // layers
     slices = [texture2ddecoder.decode_bc7(payload[i * size : (i + 1) * size], width, height) for i in range(layers)]
@@ -250,13 +246,10 @@ def lightmap_uniforms(folder):
     """The textures of an exported folder, as an engine uploads them; `hour` gives the table of a stored one."""
     made = {}
     for path in folder.glob("*.dds"):
-        levels = read_dds_levels(path)
-        bits = np.float32(levels) if path.stem == "video" else np.uint8(np.rint(levels * 255.0))
-        made[f"wlm_lightmap_{path.stem}"] = bits if path.stem in ("frames", "video") else bits[0]
+        levels = np.uint8(np.rint(read_dds_levels(path) * 255.0))
+        made[f"wlm_lightmap_{path.stem}"] = levels if path.stem == "frames" else levels[0]
     if (folder / "networks.bin").exists():
         made["wlm_lightmap_networks"] = rows_of_floats(np.fromfile(folder / "networks.bin", "<f4"))
-    with Image.open(folder / "valid.png") as image:
-        made["wlm_lightmap_valid"] = np.asarray(image).astype(np.uint8)[..., None] * 255
-    document = json.loads((folder / "weights.json").read_text())
+    document = json.loads((folder / "bundle.json").read_text())
     tables = np.fromfile(folder / "hours.bin", "<f4").reshape(len(document["times"]), document["hour_fours"], 4)
     return made, lambda i: {"wlm_lightmap_hour": rows_of_floats(tables[i])}

@@ -27,21 +27,12 @@ from .reader import Reader, check_digest, check_finite, stored
 def _lightmap(path: Path) -> None:
     model = wlm.load(path, "lightmap")
     check_digest(path)
-    check_finite(**model.parts, times=model.times)
-    frame = model.decoder().frame(float(model.times.mean()))
-    check_finite(frame=frame)
-    assert frame.shape == (model.height, model.width, 3) and (frame >= 0).all(), "decodes to another size, or below 0"
-
-
-def _layers(path: Path) -> None:
-    model = wlm.load(path, "lightmap-layers")
-    check_digest(path)
-    for own in model.sheets.values():
+    for sheet, own in model.sheets.items():
         check_finite(**own.parts, times=own.times)
-    for sheet in model.sheets:
-        values = model.decoder().layer(float(model.times.mean()), sheet.layer, sheet.atlas)
+        values = model.decoder().frame(float(model.times.mean()), sheet.layer, sheet.atlas)
         check_finite(values=values)
         assert values.shape[:2] == model.atlases[sheet.atlas], "decodes to another size"
+        assert sheet.linear or (values >= 0).all(), "decodes to light below 0"
 
 
 def _probe(path: Path) -> None:
@@ -293,18 +284,10 @@ READERS = (
     Reader(
         "lightmap",
         "a.wlm",
-        stored(
-            "lightmap.wlm",
-            "lightmap-packed.wlm",
-            "lightmap-coded.wlm",
-            "lightmap-frames.wlm",
-            "lightmap-video.wlm",
-            "lightmap-levels.wlm",
-        ),
+        stored("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm"),
         vary_artifact,
         _lightmap,
     ),
-    Reader("lightmap-layers", "a.wlm", stored("lightmap-layers.wlm"), vary_artifact, _layers),
     Reader(
         "probe",
         "a.wlm",

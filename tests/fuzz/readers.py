@@ -246,8 +246,10 @@ def _set(draw: Random, data: bytes) -> bytes:
 
 def _lightmap_set(path: Path) -> None:
     lightmaps = wlm.lightmap.load(path.parent)
-    check_finite(frames=lightmaps.frames, times=lightmaps.times)
-    assert (lightmaps.frames >= 0).all() and (np.diff(lightmaps.times) > 0).all(), "negative, or times out of order"
+    for sheet, own in lightmaps.sheets.items():
+        check_finite(frames=own.frames, times=own.times)
+        assert (own.frames >= 0).all() and (np.diff(own.times) > 0).all(), "negative, or times out of order"
+        assert not sheet.linear or (own.frames <= 1).all(), "levels beyond their range"
 
 
 def _layers() -> Sequence[bytes]:
@@ -265,13 +267,6 @@ def _layers() -> Sequence[bytes]:
         json.dumps(content).encode()
         for content in (one | {"atlases": {"0": atlas}}, two | {"atlases": {"0": {"mask": "all"}, "1": {}}})
     )
-
-
-def _layered_set(path: Path) -> None:
-    lightmaps = wlm.lightmap.load(path.parent)
-    for sheet, own in lightmaps.sheets.items():
-        check_finite(frames=own.frames, times=own.times)
-        assert (own.frames >= 0).all() and (not sheet.linear or (own.frames <= 1).all()), "levels beyond their range"
 
 
 def _frames(path: Path) -> None:
@@ -358,24 +353,8 @@ def _scene_figures(scene: Scene) -> None:
     assert 1 <= scene.steps, f"accepted with {scene.steps} steps a frame"
 
 
-def _contest() -> Sequence[bytes]:
-    light, masks = ({"0": f"{name}.bin_0", "590": f"{name}.bin_0"} for name in ("light", "mask"))
-    size = {"width": 3, "height": 2}
-    return (
-        json.dumps({"lightmap_list": [{"id": 1, "resolution": size, "lightmaps": light, "masks": masks}]}).encode(),
-    )
-
-
 _ALL = (
     *models.READERS,
-    Reader(
-        "lightmap-contest",
-        "config.json",
-        _contest,
-        _json,
-        _lightmap_set,
-        lambda: {"light.bin_0": np.arange(18, dtype="<f4").tobytes(), "mask.bin_0": b"\x7f\xff" * 3},
-    ),
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
     Reader(
@@ -452,7 +431,7 @@ _ALL = (
         "set.json",
         _layers,
         _json,
-        _layered_set,
+        _lightmap_set,
         lambda: {
             "a.exr": corpus("light.exr")()[0],
             "b.exr": corpus("zip.exr")()[0],

@@ -8,7 +8,7 @@ import warp as wp
 from reference import temporal as reference
 
 from wlm import interop
-from wlm.lightmap.model import Profile, TimeAxis, encode_time
+from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.targets import Targets
 from wlm.lightmap.trainer import Trainer
 from wlm.ops import plain
@@ -78,7 +78,7 @@ class Case:
             affine.append([random.uniform(0.7, 1.0, 3), random.uniform(0.3, 0.6, 3)])
             weight.append(random.uniform(0.5, 2.0, (times, 3)))
         f32 = [np.array(values, np.float32) for values in (colour, scale, affine, weight)]
-        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], 2.2, 0.0)
+        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], self.profile())
         if self.emphasis != 0.0:
             result.weight, result.emphasis = f32[3], self.emphasis
         return result

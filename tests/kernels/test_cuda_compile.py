@@ -17,6 +17,7 @@ from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fie
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
+from wlm_kernels.lightmap.frames import KERNELS as FRAMES
 from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum, optimiser
 from wlm_kernels.probe import network as probe_network
@@ -113,6 +114,11 @@ def test_strip_decode(hidden: int, shared: bool, tmp_path: Path):
 def test_matrix_decode(hidden: int, shared: bool, tmp_path: Path):
     """Decoding on matrix units, which a GPU alone has."""
     _compile_all(vars(matrix_decode.matrix_kernels(hidden, shared)).values(), tmp_path)
+
+
+def test_frames(tmp_path: Path):
+    """Decoding tiles that are stored as an image for each time."""
+    _compile_all(FRAMES, tmp_path)
 
 
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))

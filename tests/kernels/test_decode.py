@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from builders.synthetic import random_model
+from builders.synthetic import random_sheet
 from reference import temporal as reference
 
 from kernels.compare import array, close, exact
 from kernels.stepping import TILE, Case, draw, trainer
 from wlm.formats.bc7 import decode_image
-from wlm.lightmap.decode import Decoder, TimeTable
-from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings.maps import MapTiles
+from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import StripDecoder
 from wlm.lightmap.tiles import TileKind
 
@@ -25,10 +26,10 @@ SHAPES = [
 ]
 
 
-def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> LightmapModel:
+def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> SheetModel:
     """A random model whose colours use most of the 8 bits: a scale of about 1 and a bound of about 1.3."""
     random = np.random.default_rng(hidden)
-    model = random_model(
+    model = random_sheet(
         KINDS,
         period=24.0 if periodic else None,
         hidden=hidden,
@@ -44,8 +45,8 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> Lightma
     return dataclasses.replace(model, scale=scale, peak=peak, affine=affine)
 
 
-def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
-    """Colour in gamma space, float64 [128, 128, 3], from the bytes that the model holds; between times by eq. 2."""
+def _reference_colour(model: SheetModel, number: int, time: float, gelu: str) -> np.ndarray:
+    """Colour in gamma space, float64 [128, 128, 3], from the stored bytes; between times by eq. 2."""
     if model.profile.interpolation == "network":
         return _network_colour(model, number, time, gelu)
     before, after, share = model.axis.neighbours(time)
@@ -54,7 +55,7 @@ def _reference_colour(model: LightmapModel, number: int, time: float, gelu: str)
     return ((1.0 - share) * early + share * late) ** (1.0 / gamma)
 
 
-def _network_colour(model: LightmapModel, number: int, time: float, gelu: str) -> np.ndarray:
+def _network_colour(model: SheetModel, number: int, time: float, gelu: str) -> np.ndarray:
     """What the network makes of one time."""
     row = int((model.kind[:number] >= TileKind.STATIC).sum())
     of_kind = int((model.kind[:number] == model.kind[number]).sum())
@@ -95,7 +96,7 @@ def _network_colour(model: LightmapModel, number: int, time: float, gelu: str) -
 def test_exact_against_reference(device: str, hidden: int, gelu: str, periodic: bool):
     """Radiance and 8-bit colour of dynamic and static tiles at stored times and between."""
     model = _model(hidden, gelu, periodic)
-    decoder = Decoder(model, device)
+    decoder = SheetDecoder(model, device)
     numbers = [2, 0, 1]
     for time in (*STORED, *BETWEEN, float(model.times[-1])):
         radiance = decoder.tiles(numbers, time)
@@ -115,17 +116,17 @@ def test_extreme_sizes(device: str, resolution: int, slices: int, columns: int, 
     """Maps of one cell on each axis, and maps as fine as the tile, by both paths."""
     sizes = {"uvt_resolution": resolution, "uvt_slices": slices, "plane_columns": columns, "plane_rows": rows}
     model = _model(16, "tanh", **sizes)
-    radiance = Decoder(model, device).tiles([2], BETWEEN[1])[0]
+    radiance = SheetDecoder(model, device).tiles([2], BETWEEN[1])[0]
     close(radiance, _reference_colour(model, 2, BETWEEN[1], "tanh") ** model.profile.gamma, 2e-5)
     _hold_strip(model, device, BETWEEN)
 
 
-def _hold_strip(model: LightmapModel, device: str, times: tuple[float, ...]) -> None:
+def _hold_strip(model: SheetModel, device: str, times: tuple[float, ...]) -> None:
     """The runtime path: within one code of the plain path, and equal in 99 of 100.
 
     Between stored times, which it mixes after each was rounded, within two.
     """
-    strip, decoder = StripDecoder(model, device), Decoder(model, device)
+    strip, decoder = StripDecoder(model, device), SheetDecoder(model, device)
     for time in times:
         strip.set_time(time)
         strip.decode()
@@ -146,11 +147,11 @@ def test_strip_against_exact(device: str, hidden: int, gelu: str):
     _hold_strip(_model(hidden, gelu), device, STORED + BETWEEN)
 
 
-def _stored(fit, case: Case) -> LightmapModel:
+def _stored(fit, case: Case) -> SheetModel:
     """A trainer's tiles as the file holds them, with random scales."""
     parts, n = fit.quantised(), fit.tiles
     kind = TileKind.DYNAMIC if case.temporal else TileKind.STATIC
-    base = random_model([int(kind)] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
+    base = random_sheet([int(kind)] * n, columns=n, times=tuple(fit.axis.times), hidden=case.hidden)
     random = np.random.default_rng(1)
     if not case.temporal:
         parts["net_static"] = parts.pop("net")
@@ -185,12 +186,13 @@ def test_file_is_what_was_trained(device: str, temporal: bool, periodic: bool):
     net.forward(hidden, output, array(features, net.vec_in, device), answer)
     y = answer.numpy()
 
-    decoder = Decoder(model, device)
+    decoder = SheetDecoder(model, device)
+    tiles = MapTiles(model, TileKind.DYNAMIC if temporal else TileKind.STATIC, device, case.gelu)
     wrong = total = 0
     levels = set()
     for k, time in enumerate(model.times):
         codes, _ = decoder.tiles_8bit(list(range(fit.tiles)), time)
-        state = TimeTable(model, device).at(time)
+        state = tiles.state(time)
         for n in range(fit.tiles):
             chosen = place[n, :, 2] == k
             shift, spread, scale = (v.numpy()[n] for v in (state.shift, state.spread, state.scale))

@@ -425,7 +425,7 @@ def test_plain_folder_with_a_name_that_tells_no_hour(tmp_path, odd):
 def test_from_arrays_checks_shapes():
     frames = _frames()
     assert "[T, H, W, 3]" in error_of(from_arrays, frames[..., :2], TIMES)
-    assert "[T, H, W, 3]" in error_of(from_arrays, frames[:0], [])
+    assert "none of them 0" in error_of(from_arrays, frames[:0], [])
     assert "3 times" in error_of(from_arrays, frames, [0, 1])
     assert "mask" in error_of(from_arrays, frames, TIMES, np.ones((WIDTH, HEIGHT), bool))
 

@@ -1,4 +1,4 @@
-"""Scores: those of the protocol, over what a model holds."""
+"""Scores: those of the protocol, over the tiles that a model has."""
 
 import json
 import math
@@ -10,19 +10,20 @@ from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 import wlm
 from wlm.errors import WlmError
+from wlm.lightmap.codec import part_bytes
 from wlm.lightmap.data import from_arrays
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light, part_bytes
+from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light
 from wlm.lightmap.fit import compress
+from wlm.lightmap.sheet import LIGHT
 from wlm.metrics import evaluate_frame, summarise
 
-NAMES = ("psnr", "ssim", "flip", "bpp", "bytes", "tiles", "times", "device", "seconds")
+NAMES = ("psnr", "ssim", "flip", "bpp", "bytes", "sheets", "times", "device", "seconds")
 SUFFIXED = [f"{name}_by_{what}" for name in ("psnr", "ssim", "flip") for what in ("tile", "time")]
 
 
 def four_tiles():
     """Dynamic, static, constant and empty, in a map that ends inside its last row and column."""
-    moving, static = moving_light(128, 128), static_light(128, 100)
+    moving, static = moving_light(128, 128).light, static_light(128, 100).light
     frames = np.zeros((5, 200, 228, 3), np.float32)
     frames[:, :128, :128], frames[:, :128, 128:] = moving.frames, static.frames
     frames[:, 128:, :128] = 0.5
@@ -47,58 +48,62 @@ def report(fitted):
 
 def test_the_scores_are_those_of_the_protocol(fitted, report):
     lightmaps, model, _ = fitted
-    decoder = Decoder(model)
+    decoder, light, found = model.decoder(), lightmaps.light, report.light
     frames = [
-        evaluate_frame(ref, decoder.frame(stamp), lightmaps.mask)
-        for ref, stamp in zip(lightmaps.frames, lightmaps.times, strict=True)
+        evaluate_frame(ref, decoder.frame(stamp), light.mask)
+        for ref, stamp in zip(light.frames, light.times, strict=True)
     ]
     expected = summarise(frames)
     assert math.isfinite(report.psnr)
     for name in ("psnr", "ssim", "flip", "worst_psnr", "max_abs_error", "psnr_unlimited"):
-        assert getattr(report, name) == getattr(expected, name)
+        assert getattr(found, name) == getattr(expected, name)
+    assert (report.psnr, report.ssim, report.flip) == (found.psnr, found.ssim, found.flip)
     for name in SUFFIXED:
-        np.testing.assert_array_equal(getattr(report, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     time, row, column = expected.worst_tile
-    assert report.worst_tile == {
-        "time": lightmaps.times[time],
+    assert found.worst_tile == {
+        "time": light.times[time],
         "tile": row * 2 + column,
         "row": row,
         "column": column,
     }
 
 
-def test_what_is_held_and_left_out_is_counted(fitted, report):
+def test_what_is_scored_and_left_out_is_counted(fitted, report):
     _, model, size = fitted
-    assert report.kinds == {"empty": 1, "constant": 1, "static": 1, "dynamic": 1, "frames": 0, "video": 0, "levels": 0}
-    assert (report.tiles, report.times, report.bytes) == (3, 5, size)
-    assert report.not_scored == {"empty": 5, "not_held": 0, "few_texels": 0, "zero_range": 5}
-    assert report.scored == 10
+    light = report.light
+    assert light.kinds == {"empty": 1, "constant": 1, "static": 1, "dynamic": 1, "frames": 0}
+    assert (light.tiles, len(report.times), report.bytes) == (3, 5, size)
+    assert light.not_scored == {"empty": 5, "not_held": 0, "few_texels": 0, "zero_range": 5}
+    assert light.scored == 10
     assert report.bpp == size * 8 / (200 * 228 * 5)
     assert sum(report.parts.values()) == size == sum(part_bytes(model, size).values())
-    assert 0 < report.parts["uv"] < 2 * 16384 and report.parts["constant"] == 2 * 3 * 5
+    assert 0 < report.parts["tiles"] < 2 * 20000 and report.parts["constant"] == 2 * 3 * 5
     assert report.warnings == [] and report.profile == "tiny"
 
 
 def test_the_report_is_json_without_nan(report):
     document = report.to_json()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
-    assert set(NAMES) <= set(document) and set(SUFFIXED) <= set(document)
+    (sheet,) = document["sheets"]
+    assert set(NAMES) <= set(document) and set(SUFFIXED) <= set(sheet)
     # The empty tile and the constant one have no PSNR.
-    assert document["psnr_by_tile"][1] == [None, None]
-    assert all(isinstance(value, float) for value in document["psnr_by_tile"][0])
-    assert len(document["flip_by_time"]) == document["times"] == len(document["time_values"])
+    assert sheet["psnr_by_tile"][1] == [None, None]
+    assert all(isinstance(value, float) for value in sheet["psnr_by_tile"][0])
+    assert len(sheet["flip_by_time"]) == len(document["times"])
 
 
-def test_only_the_held_tiles_are_scored(fitted):
+def test_only_the_tiles_of_the_file_are_scored(fitted):
     lightmaps, whole, _ = fitted
     model = compress(lightmaps, tiny_profile(steps=60), tiles=[1, 2])
     report = evaluate(model, lightmaps, file_bytes=50_000)
-    assert report.not_scored == {"empty": 5, "not_held": 5, "few_texels": 0, "zero_range": 5}
-    assert report.tiles == 2 and "1 tiles with valid texels" in report.warnings[0]
-    assert math.isnan(report.psnr_by_tile[0, 0]) and math.isfinite(report.psnr_by_tile[0, 1])
+    light = report.light
+    assert light.not_scored == {"empty": 5, "not_held": 5, "few_texels": 0, "zero_range": 5}
+    assert light.tiles == 2 and "1 tiles with valid texels" in report.warnings[0]
+    assert math.isnan(light.psnr_by_tile[0, 0]) and math.isfinite(light.psnr_by_tile[0, 1])
     # The part of the map that tiles 1 and 2 cover.
     assert report.bpp == 50_000 * 8 / ((128 * 100 + 72 * 128) * 5)
-    assert bits_per_texel(whole, lightmaps.mask, 50_000) == 50_000 * 8 / (200 * 228 * 5)
+    assert bits_per_texel(whole.sheets[LIGHT], lightmaps.light.mask, 50_000) == 50_000 * 8 / (200 * 228 * 5)
 
 
 def test_metrics_not_asked_for_are_null(fitted, monkeypatch):
@@ -113,7 +118,8 @@ def test_metrics_not_asked_for_are_null(fitted, monkeypatch):
 
 def test_another_source_is_scored_with_a_warning(fitted):
     lightmaps, model, _ = fitted
-    other = from_arrays(lightmaps.frames * 1.5, lightmaps.times, lightmaps.mask, 24.0)
+    light = lightmaps.light
+    other = from_arrays(light.frames * 1.5, light.times, light.mask, 24.0)
     report = evaluate(model, other, metrics=("psnr",))
     assert model.source in report.warnings[0] and other.source in report.warnings[0]
     assert report.psnr < evaluate(model, lightmaps, metrics=("psnr",)).psnr
@@ -121,7 +127,7 @@ def test_another_source_is_scored_with_a_warning(fitted):
 
 def test_a_set_that_does_not_fit_is_one_line(fitted):
     lightmaps, model, _ = fitted
-    frames, times, mask = lightmaps.frames, lightmaps.times, lightmaps.mask
+    frames, times, mask = lightmaps.light.frames, lightmaps.times, lightmaps.light.mask
     for other, says in (
         (from_arrays(frames[:, :-1], times, mask[:-1]), "is 228x199, but the file four holds 228x200"),
         (from_arrays(frames[:3], times[:3], mask), "has 3 times, but the file four holds 5"),
@@ -141,7 +147,7 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
 def test_a_firefly_that_is_lost_is_said():
     """By the fit's own look at the few tiles that may have one, and by the evaluation; of the times that hold it."""
     plain = moving_light(128, 150)
-    frames = plain.frames.copy()
+    frames = plain.light.frames.copy()
     frames[2, 60, 60] = 1e4
     lightmaps = from_arrays(frames, plain.times, period=24.0, name="fly")
     model = compress(lightmaps, tiny_profile(steps=60))
@@ -154,7 +160,7 @@ def test_a_firefly_that_is_lost_is_said():
 
 def test_each_hour_is_scored_on_its_own_texels():
     """An object that is there at one hour alone: it is fitted, and no other hour is blamed for it."""
-    lightmaps = moving_light(128, 128)
+    lightmaps = moving_light(128, 128).light
     mask = np.ones(lightmaps.frames.shape[:3], bool)
     mask[:, 40:80, 40:80] = False
     mask[2] = True
@@ -163,10 +169,10 @@ def test_each_hour_is_scored_on_its_own_texels():
     model = compress(differing, tiny_profile(steps=200))
     report = evaluate(model, differing, metrics=["psnr"])
     decoded = model.decoder().frame(HOURS[2])
-    inside = np.abs(decoded - differing.frames[2])[40:80, 40:80]
-    assert inside.mean() < 0.1 * np.ptp(differing.frames[2])
+    inside = np.abs(decoded - differing.light.frames[2])[40:80, 40:80]
+    assert inside.mean() < 0.1 * np.ptp(differing.light.frames[2])
     expected = [
-        evaluate_frame(differing.frames[i], model.decoder().frame(hour), mask[i], metrics=["psnr"]).psnr
+        evaluate_frame(differing.light.frames[i], model.decoder().frame(hour), mask[i], metrics=["psnr"]).psnr
         for i, hour in enumerate(HOURS)
     ]
-    np.testing.assert_allclose(report.psnr_by_time, np.ravel(expected), rtol=1e-6)
+    np.testing.assert_allclose(report.light.psnr_by_time, np.ravel(expected), rtol=1e-6)

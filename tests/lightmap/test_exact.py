@@ -9,7 +9,7 @@ from builders.synthetic import random_sheet
 
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
-from wlm.lightmap.decode import Decoder
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 
 TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
@@ -28,7 +28,7 @@ TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
 )
 def test_the_decoder_agrees(settings, device):
     model = random_sheet(**settings)
-    decoder = Decoder(model, device)
+    decoder = SheetDecoder(model, device)
     for time in TIMES:
         tiles = decoder.tiles(range(4), time)
         codes, bounds = decoder.tiles_8bit(range(4), time)

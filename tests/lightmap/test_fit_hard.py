@@ -10,21 +10,22 @@ from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
-from wlm.lightmap.decode import Decoder
+from wlm.lightmap.decode import Decoder, SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, evaluate
 from wlm.lightmap.fit import compress
-from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.profile import Profile, TimeAxis
+from wlm.lightmap.sheet import LIGHT
 
 PROFILE = tiny_profile()
 
 
 def through_file(tmp_path, lightmaps, profile=PROFILE, **options):
-    """Compresses, saves and loads; the file's decoder, which gives finite light that isn't negative."""
+    """Compresses, saves and loads a set; returns the decoder of its sheet, of finite light that is not negative."""
     compress(lightmaps, profile, **options).save(tmp_path / "a.wlm")
-    decoder = wlm.load(tmp_path / "a.wlm").decoder()
+    decoder = SheetDecoder(wlm.load(tmp_path / "a.wlm").sheets[LIGHT])
     for stamp in lightmaps.times:
         frame = decoder.frame(stamp)
-        assert frame.shape == lightmaps.frames.shape[1:]
+        assert frame.shape == lightmaps.light.frames.shape[1:]
         assert np.isfinite(frame).all() and (frame >= 0).all()
     return decoder
 
@@ -70,7 +71,7 @@ def test_a_constant_below_what_half_floats_hold_is_kept(tmp_path, level):
     assert only(decoder, "constant") and decoder.model.constant.dtype == np.float32
     np.testing.assert_allclose(decoded(decoder), frames, rtol=1e-3)
     plain = compress(from_arrays(np.full_like(frames, 1e-3), (0.0, 1.0)), PROFILE)
-    assert plain.constant.dtype == np.float16
+    assert plain.sheets[LIGHT].constant.dtype == np.float16
 
 
 def test_a_fit_that_diverged_keeps_nothing():
@@ -93,7 +94,7 @@ def test_a_static_tile_stores_no_temporal_maps_and_follows_the_brightness(tmp_pa
     assert only(decoder, "static")
     assert model.uvt.size == model.ut.size == model.vt.size == model.net.size == 0
     out = decoded(decoder)
-    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.frames.mean((1, 2)), rtol=0.1)
+    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.light.frames.mean((1, 2)), rtol=0.1)
     # One pattern: any two times differ by a factor alone.
     np.testing.assert_allclose(out[3] / out[3].mean((0, 1)), out[1] / out[1].mean((0, 1)), rtol=1e-3, atol=1e-4)
 
@@ -105,9 +106,9 @@ def test_one_valid_texel(tmp_path):
     decoder = through_file(tmp_path, lightmaps)
     # A texel alone is a constant at every time, whatever the light does.
     assert only(decoder, "constant")
-    np.testing.assert_allclose(decoded(decoder)[:, 77, 3], lightmaps.frames[:, 77, 3], rtol=2**-10)
-    report = evaluate(decoder.model, lightmaps)
-    assert report.scored == 0 and report.to_json()["psnr"] is None
+    np.testing.assert_allclose(decoded(decoder)[:, 77, 3], lightmaps.light.frames[:, 77, 3], rtol=2**-10)
+    report = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps)
+    assert report.light.scored == 0 and report.to_json()["psnr"] is None
 
 
 def test_two_valid_texels_are_fitted(tmp_path):
@@ -143,8 +144,8 @@ def test_two_hundred_times(tmp_path):
     for follow in (False, True):
         profile = tiny_profile(steps=300, uvt_slices=12, plane_rows=24, follow_times=follow)
         compress(days, profile).save(tmp_path / "days.wlm")
-        decoder = wlm.load(tmp_path / "days.wlm").decoder()
-        wrong = (decoder.frame(hour) - days.frames[hour] for hour in range(0, 200, 7))
+        decoder = SheetDecoder(wlm.load(tmp_path / "days.wlm").sheets[LIGHT])
+        wrong = (decoder.frame(hour) - days.light.frames[hour] for hour in range(0, 200, 7))
         errors.append(np.mean([np.square(frame).mean() for frame in wrong]))
     assert decoder.model.profile.uvt_slices == decoder.model.profile.plane_rows == 64
     assert errors[1] < 0.85 * errors[0]
@@ -159,7 +160,7 @@ def test_charts_of_one_texel_and_across_borders(tmp_path):
         mask[chart] = True
     lightmaps = moving_light(128, 256, mask=mask)
     decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=500, samples=512, uvt_resolution=16))
-    error = np.square(decoded(decoder) - lightmaps.frames).mean((0, -1))
+    error = np.square(decoded(decoder) - lightmaps.light.frames).mean((0, -1))
     alone = np.s_[4:124:6, 4:60:6]
     for part in (alone, across, along, np.s_[30:90, 127:129]):
         assert error[part].mean() < 2.0 * error[within].mean() < 5e-3
@@ -177,26 +178,26 @@ def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
     assert decoder.tile(0, 3.0, border=4).shape == (136, 136, 3)
     pixels, peak = decoder.frame_8bit(3.0)
     assert pixels.shape == (height, width, 4) and peak.shape == (tiles,)
-    report = evaluate(decoder.model, lightmaps, metrics=("psnr",))
+    report = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps, metrics=("psnr",))
     assert report.bytes == (tmp_path / "a.wlm").stat().st_size
     assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
 
 
 def test_light_up_to_60000(tmp_path):
     lightmaps = moving_light(gain=60_000 / 1.2)
-    assert lightmaps.frames.max() > 50_000
+    assert lightmaps.light.frames.max() > 50_000
     decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=60))
     out = decoded(decoder)
     assert out.max() > 10_000
-    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.frames.mean((1, 2)), rtol=0.3)
+    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.light.frames.mean((1, 2)), rtol=0.3)
     # The scale is the same path for any brightness: the fit is as good as that of the dim set.
     dim = evaluate(compress(moving_light(), tiny_profile(steps=60)), moving_light(), metrics=("psnr",))
-    bright = evaluate(decoder.model, lightmaps, metrics=("psnr",))
+    bright = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps, metrics=("psnr",))
     assert bright.psnr == pytest.approx(dim.psnr, abs=2.0)
 
 
 def test_dark_and_bright_tiles_side_by_side(tmp_path):
-    frames = moving_light(128, 256).frames.copy()
+    frames = moving_light(128, 256).light.frames.copy()
     frames[:, :, :128] *= 1e-4
     frames[:, :, 128:] *= 2e4
     lightmaps = from_arrays(frames, HOURS, period=24.0)
@@ -206,7 +207,7 @@ def test_dark_and_bright_tiles_side_by_side(tmp_path):
 
 
 def test_nan_texels_take_their_neighbours_light(tmp_path):
-    frames = moving_light().frames.copy()
+    frames = moving_light().light.frames.copy()
     broken = frames.copy()
     broken[2, 40:43, 50] = np.nan
     broken[3, 7, 7, 1] = np.inf
@@ -222,7 +223,7 @@ def test_an_empty_mask_is_one_line():
 
 
 def test_a_channel_that_is_black_at_one_time_stays_black(tmp_path):
-    frames = moving_light().frames.copy()
+    frames = moving_light().light.frames.copy()
     frames[1, ..., 2] = 0.0
     frames[3] = 0.0
     decoder = through_file(tmp_path, from_arrays(frames, HOURS, period=24.0))
@@ -234,7 +235,7 @@ def test_a_channel_that_is_black_at_one_time_stays_black(tmp_path):
 
 
 def test_a_channel_that_is_always_black(tmp_path):
-    frames = moving_light().frames.copy()
+    frames = moving_light().light.frames.copy()
     frames[..., 1] = 0.0
     out = decoded(through_file(tmp_path, from_arrays(frames, HOURS, period=24.0)))
     assert not out[..., 1].any() and out[..., 0].mean() > 0.05
@@ -267,17 +268,17 @@ def test_one_seed_gives_one_file_and_another_seed_another(tmp_path):
 @pytest.mark.parametrize("make", [moving_light, static_light])
 def test_a_tile_alone_is_the_tile_of_a_batch(make):
     narrow, lightmaps = make(128, 128), make(128, 256)
-    frames = lightmaps.frames.copy()
-    frames[:, :, :128] = narrow.frames
+    frames = lightmaps.light.frames.copy()
+    frames[:, :, :128] = narrow.light.frames
     frames[:, :, 128:] = frames[:, :, 128:] * 0.01 + frames[:, :, :128].mean((1, 2))[:, None, None]
     lightmaps = from_arrays(frames, HOURS, period=24.0)
-    batch = compress(lightmaps, PROFILE, seed=5)
-    alone = compress(lightmaps, PROFILE, seed=5, tiles=[0])
+    batch = compress(lightmaps, PROFILE, seed=5).sheets[LIGHT]
+    alone = compress(lightmaps, PROFILE, seed=5, tiles=[0]).sheets[LIGHT]
     assert len(batch.uv) == 2
     for name in ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "scale_static", "peak", "affine"):
         # A part that the tile hasn't is empty in both.
         np.testing.assert_array_equal(getattr(batch, name)[:1], getattr(alone, name)[:1], err_msg=name)
-    np.testing.assert_array_equal(Decoder(batch).tile(0, 9.0), Decoder(alone).tile(0, 9.0))
+    np.testing.assert_array_equal(SheetDecoder(batch).tile(0, 9.0), SheetDecoder(alone).tile(0, 9.0))
 
 
 # Not the paper's axis over a day: it is clamped at midnight, and the jump there is its own.

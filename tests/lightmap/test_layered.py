@@ -1,4 +1,4 @@
-"""Layers and atlases in one file: what is fitted, stored, decoded, scored and exported."""
+"""Layers and atlases in one file: fits, files, decoders, scores and bundles."""
 
 import json
 
@@ -8,31 +8,26 @@ from builders.checks import assert_same, error_of
 from builders.layered_sets import SHEETS, random_layers, small_layers, turning_directions
 from builders.resigned import GONE, rewrite
 from builders.running import report_always
-from builders.shader_runs import read_dds_levels
-from builders.small_sets import HOURS, tiny_profile
-from builders.synthetic import random_model
-from wlm.lightmap.layers import codec
-from wlm.lightmap.layers.data import LayerArrays, from_layers
-from wlm.lightmap.layers.model import LayeredModel
+from builders.small_sets import HOURS, moving_light, tiny_profile
 
 import wlm
+from wlm.export.files import decode_texture
 from wlm.export.page.pages import make_page
 from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import Pace
-from wlm.formats.exr import read_exr
-from wlm.lightmap import survey
+from wlm.lightmap import Layer, fit, from_layers
 from wlm.lightmap.tiles import TileKind
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A set of three layers and a model of it: networks of a moment."""
+    """A set of three layers and a model of it."""
     lightmaps = small_layers(hours=HOURS[:3])
     return lightmaps, wlm.lightmap.compress(lightmaps, tiny_profile(steps=200, samples=256))
 
 
 def directions_set(frames: np.ndarray, hours=HOURS, **options):
-    return from_layers([LayerArrays(frames, "dir", encoding="signed")], hours, period=24.0, **options)
+    return from_layers([Layer(frames, "dir", encoding="signed")], hours, period=24.0, **options)
 
 
 def test_what_is_written_comes_back(tmp_path):
@@ -67,51 +62,39 @@ def test_files_that_claim_too_much_are_one_line(tmp_path):
     def changed(number, **values):
         return {"sheets": [item | values if i == number else item for i, item in enumerate(sheets)]}
 
-    large = [item | {"settings": item["settings"] | {"size": [16384, 16384]}} for item in sheets]
+    large = [item | {"size": [16384, 16384]} for item in sheets]
     refused({"sheets": large}, {}, "at most 268435456 texels of all sheets, found 1073741824")
     refused({"sheets": sheets[:1] * 2000}, {}, "setting sheets")
     refused({"sheets": [*sheets, sheets[0]]}, {}, "each of them once")
     refused({"sheets": sheets[:3]}, {}, "part 3.")
     refused(changed(2, channels=["G"]), {}, "each channel of a layer once")
-    refused(changed(1, settings=sheets[1]["settings"] | {"size": [119, 107]}), {}, "expected one size")
+    refused(changed(1, size=[119, 107]), {}, "expected one size")
     refused(changed(1, encoding="srgb"), {}, "setting sheets.1.encoding")
-    refused(changed(1, settings=sheets[1]["settings"] | {"period": 30.0}), {}, "expected one period")
-    refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected it with sheet 0")
+    refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected it with the first sheet of that atlas")
     refused({}, {"00.kind": stored.tensors["0.kind"]}, "part 00.kind is none of the file's")
     refused({}, {"0.times": stored.tensors["times"], "times": GONE}, "times")
-
-
-def test_video_of_all_sheets_together_is_bounded(tmp_path, monkeypatch):
-    model = LayeredModel("video", "0123456789abcdef", {SHEETS[i]: random_model((5,), 1, seed=i) for i in (0, 3)})
-    model.save(tmp_path / "a.wlm")
-    assert len(wlm.load(tmp_path / "a.wlm").sheets) == 2
-    monkeypatch.setattr(codec, "VIDEO_GROWTH", 1)
-    monkeypatch.setattr(codec, "VIDEO_BYTES", 300_000)
-    text = error_of(wlm.load, tmp_path / "a.wlm")
-    assert "the file's video and levels: expected at most" in text
-    assert "found a size of 524288" in text, "of either 262,144"
 
 
 def test_signed_values_keep_their_sign(fitted):
     _, model = fitted
     decoder = model.decoder()
     original = turning_directions(hours=HOURS[:3])
-    decoded = np.stack([decoder.layer(hour, "dir") for hour in HOURS[:3]])
+    decoded = np.stack([decoder.frame(hour, "dir") for hour in HOURS[:3]])
     assert decoded.shape == original.shape and decoded.min() < -0.8
     assert np.sqrt(np.square(decoded - original).mean()) < 0.06
     # Half-way between two hours the values are mixed, not their levels in a gamma space.
-    middle = decoder.layer((HOURS[1] + HOURS[2]) / 2, "dir")
-    ends = decoder.layer(HOURS[1], "dir") + decoder.layer(HOURS[2], "dir")
+    middle = decoder.frame((HOURS[1] + HOURS[2]) / 2, "dir")
+    ends = decoder.frame(HOURS[1], "dir") + decoder.frame(HOURS[2], "dir")
     np.testing.assert_allclose(middle, ends / 2, atol=1e-5)
-    everything = decoder.frame(HOURS[0])
+    everything = decoder.frames(HOURS[0])
     assert list(everything) == ["0"] and list(everything["0"]) == ["light", "dir", "shadow"]
-    np.testing.assert_array_equal(everything["0"]["dir"], decoder.layer(HOURS[0], "dir", "0"))
-    assert "expected one of 0/light, 0/dir, 0/shadow, got 1/any layer" in error_of(decoder.layer, 0.0, atlas="1")
+    np.testing.assert_array_equal(everything["0"]["dir"], decoder.frame(HOURS[0], "dir", "0"))
+    assert "expected one of 0/light, 0/dir, 0/shadow, got 1/any layer" in error_of(decoder.frame, 0.0, atlas="1")
 
 
 def test_zero_and_equal_channels_cost_no_error(fitted):
     lightmaps, model = fitted
-    shadow = model.decoder().layer(HOURS[2], "shadow")
+    shadow = model.decoder().frame(HOURS[2], "shadow")
     assert not shadow[..., 0].any(), "a channel of zeros is one of zeros"
     original = list(lightmaps.sheets.values())[2].frames[2]
     assert np.abs(shadow - original).mean() < 0.04
@@ -122,7 +105,7 @@ def test_zero_and_equal_channels_cost_no_error(fitted):
     model = wlm.lightmap.compress(directions_set(frames, (0.0, 5.0)), tiny_profile())
     first, second = model.sheets.values()
     assert first.kind.tolist() == [TileKind.CONSTANT] * 2 and second.kind.tolist() == [1, 3]
-    decoded = model.decoder().layer(2.5)
+    decoded = model.decoder().frame(2.5)
     assert not decoded[..., :3].any() and (decoded[:, :128] == [0, 0, 0, -1, 0]).all()
 
 
@@ -130,11 +113,11 @@ def test_levels_of_8_bits_that_flicker_are_constant_and_others_are_not():
     """A tile of one value and its neighbour, and one with a single texel that means something."""
     levels = np.full((1, 128, 256, 3), 128.0) + np.random.default_rng(0).integers(0, 2, (1, 128, 256, 3))
     levels[0, 5, 200] = 200.0
-    layer = LayerArrays(levels / 255.0, "dir", encoding="unit")
+    layer = Layer(levels / 255.0, "dir", encoding="unit")
     model = wlm.lightmap.compress(from_layers([layer], [0.0]), tiny_profile())
     (own,) = model.sheets.values()
     assert own.kind.tolist() == [TileKind.CONSTANT, TileKind.STATIC]
-    assert np.abs(model.decoder().layer(0.0)[:, :128] - 128.5 / 255.0).max() < 1e-3
+    assert np.abs(model.decoder().frame(0.0)[:, :128] - 128.5 / 255.0).max() < 1e-3
 
 
 def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
@@ -145,11 +128,11 @@ def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
     light, directions, _ = report.sheets.values()
     # Of values in [-1, 1]: the peak is 2, wherever the tile's own values are.
     expected = [
-        10 * np.log10(4.0 / np.square(decoder.layer(h, "dir") - o).mean()) for h, o in zip(hours, original, strict=True)
+        10 * np.log10(4.0 / np.square(decoder.frame(h, "dir") - o).mean()) for h, o in zip(hours, original, strict=True)
     ]
     np.testing.assert_allclose(directions.psnr_by_time, expected, atol=1e-3)
     assert report.psnr_by_layer["dir"] == pytest.approx(np.mean(expected), abs=1e-3)
-    worst = max(np.abs(decoder.layer(h, "dir") - o).max() for h, o in zip(hours, original, strict=True))
+    worst = max(np.abs(decoder.frame(h, "dir") - o).max() for h, o in zip(hours, original, strict=True))
     assert directions.max_abs_error == pytest.approx(worst, rel=1e-4)
     assert np.isnan(directions.flip) and 0 < light.flip < 1 and directions.views == 0
     assert min(directions.seen, directions.between) > 25 and not report.warnings
@@ -158,84 +141,66 @@ def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
     assert report.bpp == pytest.approx(8 * size / (128 * 128 * 3))
     text = json.loads(json.dumps(report.to_json(), allow_nan=False))
     assert text["sheets"][1]["layer"] == "dir" and text["sheets"][1]["psnr"] == pytest.approx(directions.psnr)
-    other = from_layers([LayerArrays(original, "dir", encoding="unit")], hours, period=24.0, name="other")
+    other = from_layers([Layer(original, "dir", encoding="unit")], hours, period=24.0, name="other")
     assert "expected the sheets of the file" in error_of(wlm.lightmap.evaluate, model, other)
-    plain = next(iter(lightmaps.sheets.values()))
-    assert "has layers, but this set has none" in error_of(wlm.lightmap.evaluate, model, plain)
 
 
 def test_a_layer_of_light_alone_is_fitted_as_without_layers(tmp_path):
-    lightmaps = next(iter(small_layers().sheets.values()))
-    alone = wlm.lightmap.compress(lightmaps, tiny_profile())
-    layered = from_layers([LayerArrays(lightmaps.frames)], lightmaps.times, period=24.0)
-    (own,) = wlm.lightmap.compress(layered, tiny_profile()).sheets.values()
+    lightmaps = small_layers()
+    light = lightmaps.light
+    (alone,) = wlm.lightmap.compress(moving_light(), tiny_profile()).sheets.values()
+    own = next(iter(wlm.lightmap.compress(lightmaps, tiny_profile()).sheets.values()))
+    np.testing.assert_array_equal(light.frames, moving_light().light.frames)
     for name, part in alone.parts.items():
         np.testing.assert_array_equal(own.parts[name], part)
 
 
-@pytest.mark.parametrize("stage", ["sheet 2 of 3, tiles", "sheet 2 of 3"])
-def test_a_stopped_fit_goes_on_in_its_sheet_to_the_same_bytes(stage, tmp_path, monkeypatch):
+def test_a_stopped_fit_goes_on_in_its_sheet_to_the_same_bytes(tmp_path, monkeypatch):
     report_always(monkeypatch)
-    monkeypatch.setattr(survey, "_LOOK", 1)
+    monkeypatch.setattr(fit, "_LOOK", 1)
     # Nothing is written before the fit is stopped.
     monkeypatch.setattr(Pace, "affordable", lambda self: False)
     data, profile, output = small_layers(40, 24), tiny_profile(steps=20), tmp_path / "part.wlm"
-    stages = []
-    wlm.lightmap.compress(data, profile, progress=lambda done: stages.append(done.stage)).save(tmp_path / "whole.wlm")
-    assert {"sheet 1 of 3", "sheet 2 of 3", "sheet 3 of 3"} <= set(stages)
+    reports = []
+    wlm.lightmap.compress(data, profile, progress=reports.append).save(tmp_path / "whole.wlm")
+    assert {report.stage for report in reports} == {"tiles", "fit"}
 
     def stop(progress):
-        if progress.stage == stage and progress.done:
+        if progress.stage == "fit" and progress.done > 25:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         checkpoint = wlm.lightmap.open_checkpoint(output, data, profile)
         wlm.lightmap.compress(data, profile, progress=stop, checkpoint=checkpoint)
     checkpoint = wlm.lightmap.open_checkpoint(output, data, profile, resume=True)
-    stages.clear()
-    wlm.lightmap.compress(data, profile, progress=lambda done: stages.append(done.stage), checkpoint=checkpoint).save(
-        output
-    )
-    assert checkpoint.resumed and "sheet 1 of 3" not in stages, "the first sheet isn't fitted again"
+    reports.clear()
+    wlm.lightmap.compress(data, profile, progress=reports.append, checkpoint=checkpoint).save(output)
+    done = [report.done for report in reports if report.stage == "fit"]
+    assert checkpoint.resumed and min(done) > 25, "the first sheet is not fitted again"
     assert output.read_bytes() == (tmp_path / "whole.wlm").read_bytes()
 
 
-def test_an_export_has_a_folder_for_each_sheet(tmp_path):
-    folder = tmp_path / "engine"
+def test_a_bundle_has_a_part_for_each_sheet():
     model = random_layers()
-    written = wlm.lightmap.export(model, folder)
-    index = json.loads((folder / "sheets.json").read_text())
-    assert written[-1] == folder / "sheets.json" and {path for path in folder.rglob("*") if path.is_file()} == {
-        *written
-    }
-    assert [(item["layer"], item["channels"]) for item in index["sheets"]] == [
+    bundle = model.bundle()
+    listed = bundle.document["sheets"]
+    assert [(item["layer"], item["channels"]) for item in listed] == [
         (sheet.layer, list(sheet.channels)) for sheet in SHEETS
     ]
-    light, directions = (folder / item["folder"] for item in index["sheets"][:2])
-    assert (index["sheets"][1]["least"], index["sheets"][1]["greatest"]) == (-1.0, 1.0)
-    shader = (directions / "decode.glsl").read_text()
-    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * wlm_colour(texel);" in shader and "wlm_radiance" not in shader
-    assert "wlm_radiance" in (light / "decode.glsl").read_text()
-    # By what the files say alone: a texel of the tile of frames, at the first time.
-    document = json.loads((directions / "weights.json").read_text())
-    (tile,) = document["tiles"]
-    level = read_dds_levels(directions / "frames.dds")[0, ..., :3]
+    assert list(bundle.parts) == [item["part"] for item in listed] and not bundle.textures
+    light, directions = (bundle.parts[item["part"]] for item in listed[:2])
+    assert directions.document["values"] == [-1.0, 1.0]
+    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * wlm_colour(texel);" in directions.shader
+    assert "wlm_radiance" not in directions.shader and "wlm_radiance" in light.shader
+    # By the bundle alone: the texels of the tile of frames at the first time.
+    (tile,) = directions.document["tiles"]
+    level = decode_texture(directions.textures["frames"])[0, ..., :3] / 255.0
     colour = tile["least"][0] + level * (np.array(tile["greatest"][0]) - tile["least"][0])
-    low, high = document["values"]
-    frame = read_exr(directions / "frame.exr")[0]
-    valid = model.sheets[SHEETS[1]].mask
-    np.testing.assert_allclose(frame[valid], (low + (high - low) * colour)[:108, :119][valid], atol=1e-5)
-    np.testing.assert_allclose(frame, model.decoder().layer(0.0, "dir")[..., :3], atol=1e-6)
-
-    (folder / "notes.txt").write_text("mine")
+    frame, valid = directions.reference["frame"], model.sheets[SHEETS[1]].mask
+    np.testing.assert_allclose(frame[valid], (2.0 * colour - 1.0)[:108, :119][valid], atol=1e-5)
+    np.testing.assert_allclose(frame, model.decoder().frame(0.0, "dir")[..., :3], atol=1e-6)
     model.sheets = dict(list(model.sheets.items())[:1])
-    assert set(wlm.lightmap.export(model, folder)) == {path for path in written if "sheet_00" in str(path)} | {
-        written[-1]
-    }
-    assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "sheet_00", "sheets.json"]
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("mine")
-    assert "expected an empty folder" in error_of(wlm.lightmap.export, model, tmp_path / "mine")
+    assert not model.bundle().parts
 
 
 def test_a_page_shows_the_first_light_and_says_so(tmp_path):

@@ -15,7 +15,8 @@ from wlm.formats.geometry import Geometry
 from wlm.lightmap.data import from_arrays, load
 from wlm.lightmap.evaluation import evaluate
 from wlm.lightmap.fit import compress
-from wlm.lightmap.views import NO_VIEWS, Views, views_of
+from wlm.lightmap.sheet import LIGHT
+from wlm.lightmap.view_scores import NO_VIEWS, Views, views_of
 
 UPWARD = """v -1 0 -1
 v 1 0 -1
@@ -37,7 +38,7 @@ def floor() -> Geometry:
 
 
 def grey(level=0.5, times=(6.0, 12.0, 18.0)):
-    return from_arrays(np.full((len(times), 8, 8, 3), level), times, period=24.0, name="grey")
+    return from_arrays(np.full((len(times), 8, 8, 3), level), times, period=24.0, name="grey").light
 
 
 def shown(light: float) -> float:
@@ -81,22 +82,28 @@ def test_all_times_take_turns_and_views_from_behind_show_nothing():
         Views(day, dataclasses.replace(floor(), position=np.zeros((4, 3), np.float32)), 1)
 
 
+def with_mesh(day, path):
+    return dataclasses.replace(day, sheets={LIGHT: dataclasses.replace(day.light, mesh=path)})
+
+
 def test_a_set_that_names_its_mesh_has_views_in_its_report(tmp_path):
     day = moving_light(hours=(0.0, 12.0))
     model = compress(day, tiny_profile(steps=20))
-    named = dataclasses.replace(day, mesh=tmp_path / "floor.obj")
+    named = with_mesh(day, tmp_path / "floor.obj")
     (tmp_path / "floor.obj").write_text(UPWARD)
     report = evaluate(model, named, metrics=("seen",), views=4)
-    assert report.views == 2 and 5.0 < report.view_psnr < 60.0 and 0.0 < report.view_flip < 1.0
-    assert report.worst_view["psnr"] <= report.view_psnr and not any("views" in line for line in report.warnings)
-    assert report.to_json()["worst_view"]["time"] in (0.0, 12.0)
-    assert evaluate(model, named, metrics=("seen",), views=0).views == 0
-    assert views_of(day, 4) == (None, [])
+    light = report.light
+    assert light.views == 2 and 5.0 < light.view_psnr < 60.0 and 0.0 < light.view_flip < 1.0
+    assert light.worst_view["psnr"] <= light.view_psnr and not any("views" in line for line in report.warnings)
+    assert report.to_json()["sheets"][0]["worst_view"]["time"] in (0.0, 12.0)
+    assert evaluate(model, named, metrics=("seen",), views=0).light.views == 0
+    assert views_of(day.light, 4) == (None, [])
     (tmp_path / "empty.obj").write_text("v 0 0 0")
     for name, says in (("empty.obj", "expected triangles"), ("absent.obj", "absent.obj")):
-        named = dataclasses.replace(day, mesh=tmp_path / name)
+        named = with_mesh(day, tmp_path / name)
         report = evaluate(model, named, metrics=("seen",), views=4)
-        assert report.views == 0 and math.isnan(report.view_psnr) and report.worst_view is None
+        light = report.light
+        assert light.views == 0 and math.isnan(light.view_psnr) and light.worst_view is None
         assert report.warnings[0].startswith("moving: no views are scored: ") and says in report.warnings[0]
 
 
@@ -108,9 +115,9 @@ def test_the_mesh_of_a_set_lies_in_its_folder(tmp_path):
         (tmp_path / "set.json").write_text(json.dumps(content | more))
         return tmp_path
 
-    assert load(stored()).mesh is None and load(stored(mesh=None)).mesh is None
+    assert load(stored()).light.mesh is None and load(stored(mesh=None)).light.mesh is None
     # It need not be there: evaluate alone reads it.
-    assert load(stored(mesh="scene.glb")).mesh == tmp_path / "scene.glb"
+    assert load(stored(mesh="scene.glb")).light.mesh == tmp_path / "scene.glb"
     assert "mesh: expected a file within" in error_of(load, stored(mesh="../scene.glb"))
-    assert load(stored(mesh="../scene.glb"), trust=True).mesh == tmp_path / "../scene.glb"
+    assert load(stored(mesh="../scene.glb"), trust=True).light.mesh == tmp_path / "../scene.glb"
     assert "mesh: expected the name of a mesh, got 3" in error_of(load, stored(mesh=3))

@@ -4,14 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from builders.small_sets import moving_light, tiny_profile
-from wlm.lightmap.seen import SeenScore, Tally
+from builders.small_sets import moving_light, sheet_from_arrays, tiny_profile
 
 from wlm.errors import WlmError
-from wlm.lightmap.data import from_arrays
 from wlm.lightmap.evaluation import evaluate
 from wlm.lightmap.fit import compress
-from wlm.lightmap.model import TimeAxis
+from wlm.lightmap.profile import TimeAxis
+from wlm.lightmap.view_scores import ShownScore, Tally
 from wlm.metrics import PSNR_CAP_DB, evaluate_frame
 from wlm.texels import fill_gaps
 
@@ -25,10 +24,10 @@ def light(height, width, times=(0.0,), mask=None, period=None):
         for y in range(0, height, 128):
             for x in range(0, width, 128):
                 frame[y, x], frame[y, min(x + 1, width - 1)] = 0.0, 1.0
-    return from_arrays(np.stack([frame] * len(times)), times, mask, period, name="noise")
+    return sheet_from_arrays(np.stack([frame] * len(times)), times, mask, period, name="noise")
 
 
-def scored(lightmaps, decoded, decode=None, mask=None, indices=None) -> SeenScore:
+def scored(lightmaps, decoded, decode=None, mask=None, indices=None) -> ShownScore:
     """The score of decoded frames, all or those of some times."""
     mask = lightmaps.mask if mask is None else mask
     tally = Tally(lightmaps, mask, decode)
@@ -63,7 +62,7 @@ def test_a_decoder_that_gives_the_original_is_at_the_cap(period):
     """A map that is no multiple of a tile, with gaps; the last hours of a day lie beside the first."""
     mask = np.ones((200, 228), bool)
     mask[40:60, 30:150] = mask[128:, 128:180] = False
-    day = moving_light(200, 228, mask=mask, period=period)
+    day = moving_light(200, 228, mask=mask, period=period).light
     filled = fill_gaps(day.frames, day.mask)
     score = scored(day, filled, mixed(day, filled))
     assert score.seen == score.ring == PSNR_CAP_DB and score.between > 115.0
@@ -130,14 +129,14 @@ def test_errors_at_borders_of_tiles_stand_out():
     error[:, :127] = error[:, 129:] = 0.0
     assert scored(still, [still.frames[0] + error]).border > 5.0
     # One that is wrong nowhere but where a point reads two tiles has no measure to be compared with.
-    flat = from_arrays(np.linspace(0.0, 1.0, 256)[None, None, :, None] * np.ones((1, 128, 1, 3)), [0.0])
+    flat = sheet_from_arrays(np.linspace(0.0, 1.0, 256)[None, None, :, None] * np.ones((1, 128, 1, 3)), [0.0])
     assert math.isnan(scored(flat, flat.frames).border)
 
 
 def test_a_dark_tile_is_not_blamed_for_the_error_of_a_bright_one():
     bright = light(128, 256)
     share = np.where(np.arange(256) < 128, np.float32(0.01), np.float32(1.0))[:, None]
-    both = from_arrays(bright.frames * share, bright.times, name="both")
+    both = sheet_from_arrays(bright.frames * share, bright.times, name="both")
     noise = np.random.default_rng(5).normal(0.0, 0.02, (128, 256, 3)).astype(np.float32)
     score = scored(both, [both.frames[0] + noise * share])
     # As with tiles that are alike: a hundredth of the light, a hundredth of the error.
@@ -150,7 +149,7 @@ def test_half_way_between_times_a_step_is_half_a_step_off():
     still = light(128, 128, (6.0, 18.0, 20.0), period=24.0)
     frames = still.frames.copy()
     frames[1:] += 0.2
-    day = from_arrays(frames, still.times, period=24.0)
+    day = sheet_from_arrays(frames, still.times, period=24.0)
 
     def stays(time):
         return frames[np.searchsorted(day.times, time, side="right") - 1]
@@ -161,7 +160,7 @@ def test_half_way_between_times_a_step_is_half_a_step_off():
     assert score.between == pytest.approx((PSNR_CAP_DB + 2 * wrong) / 3, abs=1e-3)
     assert score.worst_between["psnr"] == pytest.approx(wrong, abs=1e-3) and score.worst_between["time"] in (12.0, 1.0)
     # Without a period the day ends with its last hour.
-    open_day = from_arrays(frames, still.times)
+    open_day = sheet_from_arrays(frames, still.times)
     assert scored(open_day, frames, stays).between == pytest.approx((PSNR_CAP_DB + wrong) / 2, abs=1e-3)
 
 
@@ -179,10 +178,10 @@ def test_flicker_is_what_moves_beyond_the_original():
     assert scored(still, decoded).flicker == pytest.approx((3 * 0.005 + 0.015) / 4, rel=1e-3)
     # An original that moves as fast excuses it, and so one that moves faster.
     for faster in (1.0, 3.0):
-        moving = from_arrays(np.stack([still.frames[0] + faster * 0.1 * time for time in times]), times)
+        moving = sheet_from_arrays(np.stack([still.frames[0] + faster * 0.1 * time for time in times]), times)
         assert scored(moving, decoded, drifts).flicker < 1e-6
     # Two steps in an interval of 2.4 minutes.
-    brief = from_arrays(still.frames[:2], (0.0, 0.04))
+    brief = sheet_from_arrays(still.frames[:2], (0.0, 0.04))
     assert scored(brief, decoded[:2], drifts).flicker == pytest.approx(0.002, rel=1e-3)
 
 
@@ -234,7 +233,7 @@ def test_charts_of_one_texel():
     score = scored(few, [np.zeros_like(filled)])
     assert math.isnan(score.seen) and math.isnan(score.ring) and score.worst_seen is None
     assert score.worst_seen_time is None and score.worst_seen_tile is None
-    grey = from_arrays(np.full((2, 128, 128, 3), 0.5), (0.0, 1.0), square())
+    grey = sheet_from_arrays(np.full((2, 128, 128, 3), 0.5), (0.0, 1.0), square())
     score = scored(grey, grey.frames)
     assert all(math.isnan(value) for value in (score.seen, score.ring, score.between, score.border, score.flicker))
 
@@ -247,7 +246,7 @@ def test_tiles_that_a_file_lacks_are_no_error_beside_them():
     half[:, 128:] = False
     assert scored(still, decoded, mask=half).seen == PSNR_CAP_DB
     # Of a tile without a chart a filter reads what is there: black, in a 24th of a column's texels, as above.
-    empty = from_arrays(still.frames, [0.0], half)
+    empty = sheet_from_arrays(still.frames, [0.0], half)
     score = scored(empty, decoded)
     column = np.square(still.frames[0, :, 127]).mean()
     assert score.seen == pytest.approx(db(math.sqrt(column / 24 / 128)), abs=0.8)
@@ -259,13 +258,13 @@ def test_the_report_has_the_scores_of_its_decoder():
     model = compress(day, tiny_profile(steps=60))
     report = evaluate(model, day, metrics=("psnr", "seen"))
     decoder = model.decoder()
-    score = scored(day, [decoder.frame(time) for time in day.times], decoder.frame)
+    score = scored(day.light, [decoder.frame(time) for time in day.times], decoder.frame)
     for name, value in vars(score).items():
-        np.testing.assert_equal(getattr(report, name), value)
-    document = report.to_json()
+        np.testing.assert_equal(getattr(report.light, name), value)
+    (document,) = report.to_json()["sheets"]
     assert all(isinstance(document[name], float) for name in ("seen", "ring", "between", "border", "flicker"))
-    assert document["worst_seen"]["psnr"] == min(report.worst_seen["psnr"], np.nanmin(report.seen_by_tile))
-    left_out = evaluate(model, day, metrics=("psnr",)).to_json()
-    assert left_out["seen"] is None and left_out["worst_seen"] is None and left_out["psnr"] == report.psnr
+    assert document["worst_seen"]["psnr"] == min(report.light.worst_seen["psnr"], np.nanmin(report.light.seen_by_tile))
+    (left_out,) = evaluate(model, day, metrics=("psnr",)).to_json()["sheets"]
+    assert left_out["seen"] is None and left_out["worst_seen"] is None and left_out["psnr"] == document["psnr"]
     with pytest.raises(WlmError, match="views: expected at least 0, got -1"):
         evaluate(model, day, metrics=("seen",), views=-1)

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from builders.running import report_always
 from builders.small_sets import moving_light, static_light, tiny_profile, write_set
-from wlm.lightmap.worker import Fitter
 
 import wlm
 from wlm.errors import WlmError
 from wlm.formats import scratch
-from wlm.lightmap import fit
+from wlm.lightmap import dispatch, fit
 from wlm.lightmap.data import from_arrays, load
+from wlm.lightmap.trainer import Fitter
 from wlm.workers import Here, Lost, Processes, Workers
 
 PROFILE = tiny_profile(steps=40)
@@ -31,9 +31,9 @@ class Several(Workers):
 
     remote = False
 
-    def __init__(self, shared, track, devices, *_, seed=0, lose=()):
-        self.count, self._make = len(devices), lambda: Here(Fitter(*shared, devices[0], track))
-        self._random, self._lose = random.Random(seed), lose
+    def __init__(self, devices, workers, cluster, batches, seed, track, order=0, lose=()):
+        self.count, self._make = len(devices), lambda: Here(Fitter(seed, devices[0], track))
+        self._random, self._lose = random.Random(order), lose
         self._workers = [self._make() for _ in devices]
         self._called, self._answers = [], 0
 
@@ -61,7 +61,7 @@ class Several(Workers):
 def lightmaps(monkeypatch):
     """Two static tiles beside four dynamic ones, each a batch of its own."""
     monkeypatch.setattr(fit, "CPU_TILES", 1)
-    static, moving = static_light(256, 128), moving_light(256, 256)
+    static, moving = static_light(256, 128).light, moving_light(256, 256).light
     return from_arrays(np.concatenate([static.frames, moving.frames], axis=2), moving.times, period=24.0)
 
 
@@ -82,8 +82,8 @@ def test_the_order_of_answers_and_lost_workers_change_nothing(lightmaps, tmp_pat
     profile = tiny_profile(steps=20)
     whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
     checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0)
-    for seed, lose, kept in ((1, (), None), (2, (1, 9, 20, 21), checkpoint)):
-        monkeypatch.setattr(fit, "_workers", functools.partial(Several, seed=seed, lose=lose))
+    for order, lose, kept in ((1, (), None), (2, (1, 9, 20, 21), checkpoint)):
+        monkeypatch.setattr(fit, "start_workers", functools.partial(Several, order=order, lose=lose))
         assert bytes_of(fit.compress(lightmaps, profile, workers=3, checkpoint=kept), tmp_path) == whole
 
 
@@ -91,7 +91,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
     report_always(monkeypatch)
     whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(fit, "_workers", Several)
+        patched.setattr(fit, "start_workers", Several)
         checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
         with pytest.raises(KeyboardInterrupt):
             fit.compress(lightmaps, PROFILE, workers=3, progress=stop_after(100), checkpoint=checkpoint)
@@ -104,7 +104,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
 
 
 def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
-    monkeypatch.setattr(fit, "_workers", functools.partial(Several, lose=range(100)))
+    monkeypatch.setattr(fit, "start_workers", functools.partial(Several, lose=range(100)))
     with pytest.raises(WlmError, match="^fit: batch 0 has lost 3 workers: it was unlucky$"):
         fit.compress(lightmaps, PROFILE, workers=2)
 
@@ -122,10 +122,10 @@ def test_wrong_places_are_told_at_once(options, says):
 
 
 def test_workers_follow_the_cores_and_the_work(monkeypatch):
-    monkeypatch.setattr(fit, "cores", lambda: 64)
-    counts = [len(fit._devices("cpu", None, None, samples)) for samples in (0, 10**6, 10**8, 10**12)]
+    monkeypatch.setattr(dispatch, "cores", lambda: 64)
+    counts = [len(dispatch.worker_devices("cpu", None, None, samples)) for samples in (0, 10**6, 10**8, 10**12)]
     assert counts == [1, 1, 5, 32]
-    assert len(fit._devices("cpu", 3, None, 0)) == 3
+    assert len(dispatch.worker_devices("cpu", 3, None, 0)) == 3
 
 
 def processes_of(parent):
@@ -223,13 +223,13 @@ def test_a_cluster_gives_the_same_bytes(lightmaps, tmp_path, monkeypatch):
     ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
     try:
         made = []
-        begin = fit.Actors.__init__
+        begin = dispatch.Actors.__init__
 
         def remember(self, *arguments):
             begin(self, *arguments)
             made.append(self)
 
-        monkeypatch.setattr(fit.Actors, "__init__", remember)
+        monkeypatch.setattr(dispatch.Actors, "__init__", remember)
         report_always(monkeypatch)
         killed = []
 
@@ -252,10 +252,11 @@ def test_a_mapped_set_is_the_same_set(tmp_path, monkeypatch):
     write_set(tmp_path / "set", lightmaps)
     monkeypatch.setattr(scratch, "IN_MEMORY", 1000)
     times = lightmaps.times
-    mapped = [load(tmp_path / "set", period=24.0), from_arrays(lightmaps.frames[order], times[order], period=24.0)]
+    frames = lightmaps.light.frames
+    mapped = [load(tmp_path / "set", period=24.0), from_arrays(frames[order], times[order], period=24.0)]
     for each in mapped:
         assert each.source == lightmaps.source
-        assert each.frames.base is not None and type(each.frames) is np.ndarray
+        assert each.light.frames.base is not None and type(each.light.frames) is np.ndarray
     assert wlm.lightmap.compress(mapped[1], PROFILE).file_bytes() == fit.compress(lightmaps, PROFILE).file_bytes()
 
 
@@ -263,8 +264,8 @@ def test_a_fit_never_holds_all_tiles():
     lightmaps = moving_light(512, 512, hours=(0.0, 8.0, 16.0, 20.0))
     tracemalloc.start()
     try:
-        fit._Fit(lightmaps, PROFILE)
+        fit.SheetFit(lightmaps.light, PROFILE)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert peak < 0.6 * lightmaps.frames.nbytes  # two threads have a few tiles each in hand
+    assert peak < 0.6 * lightmaps.light.frames.nbytes  # two threads have a few tiles each

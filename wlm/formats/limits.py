@@ -62,12 +62,6 @@ PICTURE_BYTES = 256 << 20
 IMAGE_BYTES = 2 << 30
 """Largest PNG or TGA: 16384 x 16384 texels of 8 bytes."""
 
-VIDEO_GROWTH = 4096
-"""Largest expansion of a video to pictures of 6 bytes per texel: 0.012 bits per texel."""
-
-VIDEO_BYTES = 256 << 20
-"""Bytes of pictures that are allowed for any size of video."""
-
 TIMES = 100_000
 """Most lightmaps of a set."""
 

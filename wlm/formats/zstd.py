@@ -5,9 +5,16 @@ import zstandard
 _LEVEL = 19
 
 
-def compress(data: bytes) -> bytes:
-    """Packs bytes into one frame that states its size."""
-    return zstandard.ZstdCompressor(level=_LEVEL).compress(data)
+def compress(*pieces: bytes) -> bytes:
+    """Packs pieces of data, one after another, into one frame that states its size.
+
+    Each piece has blocks of its own, so that zstd models pieces with different statistics separately.
+    """
+    packer = zstandard.ZstdCompressor(level=_LEVEL).compressobj(size=sum(map(len, pieces)))
+    frame = b""
+    for piece in pieces:
+        frame += packer.compress(piece) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+    return frame + packer.flush()
 
 
 def decompress(frame: bytes, size: int, name: str) -> bytes:

@@ -44,8 +44,6 @@ _EXPORTS = _PROBE_EXPORTS | {
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-atlas": "a compressed lightmap of a mesh",
     "wlm-atlas-scene": "the compressed lightmaps of a scene",
-    "wlm-lightmap-export": "lightmaps over time: textures, weights and a shader",
-    "wlm-lightmap-layers-export": "layered lightmaps: a folder for each sheet",
     "wlm-probe-export": "light probes: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes: buffers and shaders",
     "wlm-godot-light": "light probes for Godot",

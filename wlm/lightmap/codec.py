@@ -195,7 +195,7 @@ def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
     """Packs each tile as one zstd frame: `tiles`, uint8, and `tile_sizes`, uint32 [n]."""
 
     def pack(number: int) -> bytes:
-        return zstd.compress(encoding_of(sheet.kind[number]).pack(sheet, number))
+        return zstd.compress(*encoding_of(sheet.kind[number]).pack(sheet, number))
 
     frames = list(each(pack, _packed_tiles(sheet)))
     if not frames:
@@ -211,6 +211,8 @@ def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
         WlmError, ValueError: The frames are not those of these tiles.
     """
     numbers = _packed_tiles(sheet)
+    for number in set(np.flatnonzero(sheet.kind).tolist()).difference(numbers):
+        encoding_of(sheet.kind[number]).unpack(sheet, number, np.empty(0, np.uint8))
     if not numbers and not packed:
         return
     tiles, sizes = (check_part(packed, name, part) for name, part in (("tiles", _BYTES), ("tile_sizes", _SIZES)))

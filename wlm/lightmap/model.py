@@ -94,7 +94,7 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
     }
 
 
-@dataclass
+@dataclass(eq=False)
 class SheetModel:
     """The arrays of one sheet. Their types and shapes are in `part_table`.
 
@@ -188,7 +188,7 @@ class SheetModel:
         return int((self.mapped < number).sum())
 
 
-@dataclass
+@dataclass(eq=False)
 class LightmapModel(Model):
     """A compressed lightmap set: a `SheetModel` for each sheet.
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from builders.small_sets import moving_light
 
-from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, evaluate_rivals, usual
+from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, usual
 from benchmarks.rivals.lightmap_ntc import LADDER, Latents, encode_ntc
 from wlm.errors import WlmError
-from wlm.lightmap.data import from_arrays
 from wlm.metrics import psnr_from_mse
 
 SMALL = Latents(2, 4, 4, 4)
@@ -32,7 +31,7 @@ def bytes_of(height: int, width: int, times: int, latents: Latents = SMALL) -> i
 
 
 def test_a_day_comes_back():
-    frames = moving_light(40, 60).frames
+    frames = moving_light(40, 60).light.frames
     short, long = encode(frames, steps=20), encode(frames, steps=300)
     assert short.name == "ntc-latents" and short.decoded.dtype == np.float32
     mean = np.broadcast_to(frames.mean((1, 2), keepdims=True), frames.shape)
@@ -43,7 +42,7 @@ def test_a_day_comes_back():
 
 
 def test_one_seed_gives_one_result():
-    frames = moving_light(24, 24).frames
+    frames = moving_light(24, 24).light.frames
     a, b, c = (encode(frames, steps=20, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(a.decoded, b.decoded)
     assert not np.array_equal(a.decoded, c.decoded)
@@ -67,7 +66,7 @@ def test_empty_black_and_constant():
 
 
 def test_what_lies_in_the_gaps_changes_nothing():
-    frames, mask = moving_light(24, 40).frames, np.ones((24, 40), bool)
+    frames, mask = moving_light(24, 40).light.frames, np.ones((24, 40), bool)
     mask[7:20, 10:35] = False
     zeros, garbage = frames.copy(), frames.copy()
     zeros[:, ~mask] = 0.0
@@ -82,7 +81,7 @@ def test_what_lies_in_the_gaps_changes_nothing():
 
 
 def test_a_network_for_each_region(monkeypatch):
-    frames = moving_light(20, 40).frames
+    frames = moving_light(20, 40).light.frames
     whole = encode(frames, steps=20)
     monkeypatch.setattr("benchmarks.rivals.lightmap_ntc.NETWORK_TEXELS", 20)
     halves = encode(frames, steps=20)
@@ -105,7 +104,7 @@ def test_more_latents_are_better_and_larger():
 
 def test_ranges_are_of_tiles():
     """A dark tile beside a bright one is as good, relative to its own light."""
-    frames = moving_light(16, 256, hours=(0.0, 12.0)).frames.copy()
+    frames = moving_light(16, 256, hours=(0.0, 12.0)).light.frames.copy()
     frames[:, :, 128:] *= 1e-3
     decoded = encode(frames, steps=300).decoded
     bright, dark = psnr(frames[:, :, :128], decoded[:, :, :128]), psnr(frames[:, :, 128:], decoded[:, :, 128:])
@@ -113,7 +112,7 @@ def test_ranges_are_of_tiles():
 
 
 def test_it_is_a_method_that_takes_a_device(monkeypatch):
-    moving = moving_light(24, 24)
+    moving = moving_light(24, 24).light
     names = [name for name, method in RIVALS.items() if method.fitted]
     assert names == [f"ntc-{name}" for name in LADDER]
     assert usual("cpu", quick=True) == FEW and usual("cuda:0", quick=True) == (*FEW, "ntc-medium")
@@ -131,7 +130,7 @@ def test_it_is_a_method_that_takes_a_device(monkeypatch):
 
 
 def test_settings_are_checked():
-    frames = moving_light(8, 8).frames
+    frames = moving_light(8, 8).light.frames
     bad = frames.copy()
     bad[1, 3, 3, 1] = np.nan
     for call, words in (
@@ -139,7 +138,6 @@ def test_settings_are_checked():
         (lambda: encode(frames, steps=0), "at least 1 step and 1 sample, got 0 and 256"),
         (lambda: encode(frames, device="tpu"), "device 'tpu'"),
         (lambda: encode(bad), "NaN or infinite"),
-        (lambda: evaluate_rivals(None, from_arrays(frames, moving_light(8, 8).times), (), device="tpu"), "'tpu'"),
     ):
         with pytest.raises(WlmError, match=words):
             call()

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import torch
 from builders.small_sets import moving_light, tiny_profile
+from builders.small_sets import sheet_from_arrays as from_arrays
 
 from benchmarks.lightmap_ablation import VARIANTS
 from benchmarks.rivals.lightmap_torch import Features, PlainFit, through_bc7
-from wlm.lightmap.data import from_arrays
 from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import Profile, TimeAxis
+from wlm.lightmap.profile import Profile, TimeAxis
+from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.trainer import Trainer
 
 HOURS = [0.0, 6.0, 12.0, 18.0]
@@ -58,13 +59,14 @@ def put_into_trainer(fit: PlainFit, trainer: Trainer) -> None:
 
 def test_what_it_decodes_to_is_what_the_product_decodes():
     """Sampling, wrapping at midnight, levels, network and scales, against the float64 decode of the same parameters."""
-    lightmaps, profile = moving_light(128, 256), tiny_profile(gelu="exact")
+    whole, profile = moving_light(128, 256), tiny_profile(gelu="exact")
+    lightmaps = whole.light
     fit = plain_fit(lightmaps, profile)
     for _ in range(profile.steps):
         fit.step()
     decoded = fit.decode()
     assert decoded.shape == (2, len(lightmaps.times), 128, 128, 3)
-    model = compress(lightmaps, profile)
+    model = compress(whole, profile).sheets[LIGHT]
     trainer = Trainer(profile, model.axis, dynamic_targets(lightmaps, profile), True, 0, "cpu")
     put_into_trainer(fit, trainer)
     for name, values in trainer.quantised().items():
@@ -78,7 +80,7 @@ def test_what_it_decodes_to_is_what_the_product_decodes():
 
 def test_its_loss_is_that_of_the_kernels():
     """The mean over many samples; both weight texels half-way to the metric."""
-    lightmaps = moving_light(128, 128)
+    lightmaps = moving_light(128, 128).light
     profile = tiny_profile(samples=16384, steps=10, map_rate=1e-12, net_rate=1e-12)
     fit, targets = plain_fit(lightmaps, profile), dynamic_targets(lightmaps, profile)
     trainer = Trainer(profile, TimeAxis(lightmaps.times, 24.0, "frames"), targets, True, 0, "cpu")
@@ -99,7 +101,7 @@ def patch(frames: np.ndarray, steps: int):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_each_variant_learns_and_ends_on_its_levels(name):
-    lightmaps, profile = patch(moving_light(128, 128, HOURS).frames, 120)
+    lightmaps, profile = patch(moving_light(128, 128, HOURS).light.frames, 120)
     fit = plain_fit(lightmaps, profile, VARIANTS[name])
     first = float(fit.step())
     for _ in range(113):

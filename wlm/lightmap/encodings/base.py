@@ -80,13 +80,13 @@ class Encoding(ABC):
         """Returns the number of bytes of `pack`."""
         return 0
 
-    def pack(self, sheet: SheetModel, number: int) -> bytes:
-        """Returns the maps, the network or the frames of a tile, arranged for a general packer.
+    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
+        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately.
 
         Raises:
             WlmError: The arrays can not be stored.
         """
-        return b""
+        return []
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
         """Writes the bytes of `pack`, uint8, into the arrays of a sheet.

@@ -219,14 +219,14 @@ class Frames(Encoding):
     def packed_size(self, sheet: SheetModel, number: int) -> int:
         return len(sheet.times) * int(needed_blocks(sheet.mask, number).sum()) * BLOCK_BYTES
 
-    def pack(self, sheet: SheetModel, number: int) -> bytes:
+    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
         blocks, needed = sheet.frames[sheet.row(number)], needed_blocks(sheet.mask, number)
         if not np.array_equal(blocks, clear_unneeded(blocks, needed)):
             raise WlmError(f"frames: tile {number}: expected black blocks where no read reaches, found others")
         kept = blocks[:, needed]
         _check_modes(kept, number)
         # The times of a block come one after another: they resemble each other more than neighbouring blocks do.
-        return kept.swapaxes(0, 1).tobytes()
+        return [kept.swapaxes(0, 1).tobytes()]
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
         needed, blocks = needed_blocks(sheet.mask, number), sheet.frames[sheet.row(number)]

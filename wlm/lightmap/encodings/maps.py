@@ -439,7 +439,7 @@ class Maps(Encoding):
     def packed_size(self, sheet: SheetModel, number: int) -> int:
         return tile_bytes(sheet.profile, bool(sheet.kind[number] == TileKind.DYNAMIC))
 
-    def pack(self, sheet: SheetModel, number: int) -> bytes:
+    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
         dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile
         pieces = _split_blocks(sheet.uv[sheet.map_row(number)])
         if dynamic:
@@ -447,7 +447,7 @@ class Maps(Encoding):
         net = sheet.net[row] if dynamic else sheet.net_static[row]
         wide = profile.net_bits == 16
         pieces.append(_apart(net) if wide else pack_network(net, profile.inputs(bool(dynamic)), profile.hidden))
-        return b"".join(piece.tobytes() for piece in pieces)
+        return [piece.tobytes() for piece in pieces]
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
         dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile

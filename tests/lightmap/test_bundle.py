@@ -1,4 +1,4 @@
-"""What an engine gets: textures that other decoders read, and weights and a shader that give the same light."""
+"""The bundle and its raw folder: textures that other decoders read, and a shader that gives the same light."""
 
 import json
 import shutil
@@ -8,19 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.shader_runs import HEADS, lightmap_uniforms, read_dds_levels, rows_of_floats, run_glsl
-from builders.synthetic import random_model
-from PIL import Image
+from builders.synthetic import random_model, random_sheet
 from scipy.special import erf
 
 from wlm.errors import WlmError
+from wlm.export import export
 from wlm.formats.bc7 import blocks_image, decode_image
 from wlm.formats.bc7_modes import decode_blocks
 from wlm.formats.exr import read_exr
-from wlm.lightmap.decode import Decoder
-from wlm.lightmap.exporter import export
+from wlm.lightmap.bundle import hour_tables, sheet_bundle
+from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.gaps import Gaps
-from wlm.lightmap.packed import hour_table, networks, textures
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl, texture_names
+from wlm.lightmap.sheet import LIGHT, Sheet
 
 TIMES = (7.5, 3.3, 21.7)  # stored, between, and across midnight (or past the end)
 AXES = [
@@ -31,17 +32,18 @@ AXES = [
     {"time_axis": "paper", "period": None, "times": (2.0, 7.5, 20.0), "interpolation": "network"},
     {"kinds": (4, 3, 4, 4)},
     {"kinds": (4, 2, 1, 4), "interpolation": "network", "period": None},
-    {"kinds": (5, 4, 1, 5)},
-    {"kinds": (6, 4, 5, 6)},
 ]
+
+
+def file_of(sheet):
+    return LightmapModel("random", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
 
 
 def image_of(folder, document, name, number, layer=0):
     """One image of a texture of all tiles, as "about" says."""
-    info = document["textures"][name]
-    (width, height), across = info["image"], info["across"]
+    info = document["images"][name]
+    (width, height), across = info["size"], info["across"]
     texels = read_dds_levels(folder / f"{name}.dds")
-    assert list(texels.shape[2:0:-1]) == info["size"]
     row, column = divmod(number, across)
     return texels[layer, row * height : (row + 1) * height, column * width : (column + 1) * width]
 
@@ -102,7 +104,7 @@ def layers_of(folder, document, tile):
 
 
 def frame_light(folder, document, tile, i):
-    """Radiance of a tile of frames or video at stored time i."""
+    """Radiance of a tile of frames at stored time i."""
     level = image_of(folder, document, tile["kind"], tile["image"], i)[..., :3]
     least, greatest = (np.array(tile[name][i]) for name in ("least", "greatest"))
     return (least + level * (greatest - least)) ** document["gamma"]
@@ -110,7 +112,7 @@ def frame_light(folder, document, tile, i):
 
 def frame_from_files(folder, t):
     """The whole map in float64 from the exported files alone."""
-    document = json.loads((folder / "weights.json").read_text())
+    document = json.loads((folder / "bundle.json").read_text())
     before, after, share, tau = place_in_time(document, t)
     if document["interpolation"] == "radiance" and share > 0.0:
         early, late = (frame_from_files(folder, document["times"][k]) for k in (before, after))
@@ -129,7 +131,7 @@ def frame_from_files(folder, t):
     for tile in document["tiles"]:
         if tile["kind"] == "constant":
             radiance = mixed(tile["radiance"])
-        elif tile["kind"] in ("frames", "video"):
+        elif tile["kind"] == "frames":
             radiance = mixed({i: frame_light(folder, document, tile, i) for i in {before, after}})
         else:
             x = features(folder, document, tile, tau, document["time_axis"]["repeats"])
@@ -144,9 +146,9 @@ def frame_from_files(folder, t):
 
 @pytest.mark.parametrize("settings", AXES, ids=str)
 def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
-    model = random_model(**settings)
-    export(model, tmp_path)
-    decoder = Decoder(model)
+    model = random_sheet(**settings)
+    export(file_of(model), tmp_path)
+    decoder = SheetDecoder(model)
     np.testing.assert_array_equal(read_exr(tmp_path / "frame.exr")[0], decoder.frame(model.times[0]))
     for time in TIMES:
         expected, found = decoder.frame(time), frame_from_files(tmp_path, time)
@@ -155,23 +157,23 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
 
 
 def test_other_decoders_read_the_textures(tmp_path):
-    model = random_model((3, 2, 4, 3, 4, 2), times=(0.0, 7.5))
-    paths = export(model, tmp_path)
-    names = [path.name for path in paths]
-    assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["frame.exr", "decode.glsl", "uv.dds", "uvt.dds", "planes.dds", "frames.dds", "hours.bin"] + [
+    model = random_sheet((3, 2, 4, 3, 4, 2), times=(0.0, 7.5))
+    paths = export(file_of(model), tmp_path)
+    names = {path.name for path in paths}
+    assert names == {path.name for path in tmp_path.iterdir()}
+    assert names == {f"{name}.dds" for name in ("uv", "uvt", "planes", "frames", "valid")} | {
+        "frame.exr",
+        "lightmap.glsl",
+        "hours.bin",
         "networks.bin",
-        "valid.png",
-        "weights.json",
-    ]
-    document = json.loads((tmp_path / "weights.json").read_text())
+        "bundle.json",
+    }
+    document = json.loads((tmp_path / "bundle.json").read_text())
     images = {tile["number"]: tile["image"] for tile in document["tiles"]}
     assert sorted(images) == list(range(6))
     for place, number in enumerate((0, 1, 3, 5)):
         found = image_of(tmp_path, document, "uv", images[number])
         assert np.array_equal(np.rint(found * 255.0), decode_image(model.uv[place]))
-    with Image.open(tmp_path / "uv.dds") as image:
-        assert np.array_equal(np.asarray(image), np.rint(read_dds_levels(tmp_path / "uv.dds")[0] * 255.0))
     for row, number in enumerate((2, 4)):
         for i in range(2):
             frame = image_of(tmp_path, document, "frames", images[number], i)
@@ -185,42 +187,27 @@ def test_other_decoders_read_the_textures(tmp_path):
             assert np.array_equal(np.rint(plane * 255.0), getattr(model, part)[row])
 
 
-def test_the_files_of_a_large_set_are_few(tmp_path):
-    paths = export(random_model((3,) * 64, columns=8, times=(0.0, 12.0)), tmp_path)
-    assert len(paths) <= 12
-    document = json.loads((tmp_path / "weights.json").read_text())
-    assert document["textures"]["uv"]["size"] == [1024, 1024]
+def test_the_textures_of_a_large_set_are_few():
+    bundle = random_model((3,) * 64, columns=8, times=(0.0, 12.0)).bundle()
+    assert len(bundle.textures) + len(bundle.buffers) <= 8
+    assert (bundle.textures["uv"].width, bundle.textures["uv"].height) == (1024, 1024)
 
 
 def test_a_texture_beyond_a_gpu():
-    model = random_model((4, 4, 4, 4), times=(0.0, 7.5))
-    many = replace(model, frames=np.broadcast_to(model.frames[:, :1], (4, 2049, 32, 32, 16)))
+    sheet = random_sheet((4, 4, 4, 4), times=(0.0, 7.5))
+    many = replace(sheet, frames=np.broadcast_to(sheet.frames[:, :1], (4, 2049, 32, 32, 16)))
     with pytest.raises(WlmError, match="random: cannot export: frames of all tiles is 256x256x2049, more than"):
-        textures(many)
+        file_of(many).bundle()
 
 
-def test_an_export_of_the_version_before_is_replaced(tmp_path):
-    for name in ("tile_0000_uv.dds", "tile_0001_frame_0000.dds", "mine.dds"):
-        (tmp_path / name).write_bytes(b"old")
-    (tmp_path / "weights.json").write_text('{"format": "wlm-lightmap-export", "version": 1}')
-    export(random_model(), tmp_path)
-    assert {path.name for path in tmp_path.glob("*.dds")} == {"uv.dds", "uvt.dds", "planes.dds", "mine.dds"}
-
-
-def test_what_cannot_be_exported(tmp_path):
-    model = random_model((2, 0))
-    net = model.net_static.copy()
+def test_what_cannot_be_exported():
+    sheet = random_sheet((2, 0))
+    net = sheet.net_static.copy()
     net[0, 5] = np.inf
     with pytest.raises(WlmError, match="a weight is NaN or infinite"):
-        export(replace(model, net_static=net), tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-    (tmp_path / "file").write_text("x")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(WlmError, match="cannot write there"):
-            export(model, folder)
+        file_of(replace(sheet, net_static=net)).bundle()
     with pytest.raises(WlmError, match="device 'tpu'"):
-        export(model, tmp_path / "new", device="tpu")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+        file_of(sheet).bundle(device="tpu")
 
 
 MAIN = """
@@ -235,9 +222,9 @@ void main()
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="no glslangValidator: install glslang-tools")
 @pytest.mark.parametrize("exact", ["", "#define WLM_LIGHTMAP_EXACT\n"])
-@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (5, 4, 1, 6)}, {"kinds": (2, 1, 0, 2)}], ids=str)
+@pytest.mark.parametrize("settings", [{"gelu": "exact"}, {"kinds": (4, 3, 1, 4)}, {"kinds": (2, 1, 0, 2)}], ids=str)
 def test_the_shader_compiles(settings, exact, tmp_path):
-    model = random_model(**settings)
+    model = random_sheet(**settings)
     names = [f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(texture_names(model))]
     for version, options, layout in (
         ("330\n", [], ""),
@@ -251,53 +238,45 @@ def test_the_shader_compiles(settings, exact, tmp_path):
         assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
-LIGHT = "light = vec4(wlm_radiance(pixel), 1.0);"
+SHOWN = "light = vec4(wlm_radiance(pixel), 1.0);"
 
 
 @pytest.mark.parametrize("settings", AXES[1:5], ids=str)
 def test_the_shader_gives_the_decoders_light(settings, tmp_path):
-    """Of the other settings; `tests/shading` has the default ones, kinds of tiles and languages."""
-    model = random_model(**settings)
-    export(model, tmp_path)
+    """Of the other settings; `tests/export/shading` has the default ones, kinds of tiles and languages."""
+    model = random_sheet(**settings)
+    export(file_of(model), tmp_path)
     uniforms, hour = lightmap_uniforms(tmp_path)
-    text, decoder = (tmp_path / "decode.glsl").read_text(), Decoder(model)
+    text, decoder = (tmp_path / "lightmap.glsl").read_text(), SheetDecoder(model)
     for i in (1, len(model.times) - 1):
         expected = decoder.frame(float(model.times[i]))
-        found = run_glsl("#define WLM_LIGHTMAP_EXACT\n" + text, LIGHT, expected.shape[:2], uniforms | hour(i))
+        found = run_glsl("#define WLM_LIGHTMAP_EXACT\n" + text, SHOWN, expected.shape[:2], uniforms | hour(i))
         # The constants' 8 digits: 1e-6 of the brightest texel measured.
         np.testing.assert_allclose(found[..., :3], expected, rtol=0, atol=1e-5 * expected.max())
 
 
 @pytest.mark.parametrize("time", TIMES[1:])
-def test_a_table_between_two_hours(time):
-    """Of networks that interpolate, with frames, which don't."""
-    model = random_model((3, 4, 5, 2), interpolation="network")
+def test_a_table_between_two_hours(time, tmp_path):
+    """Of networks that interpolate, with frames, which do not."""
+    model = random_sheet((3, 4, 1, 2), interpolation="network")
     with pytest.raises(ValueError, match="expected a stored one"):
-        hour_table(random_model(), time)
-    expected = Decoder(model).frame(time)
-    made = {f"wlm_lightmap_{name}": levels_of(texture) for name, texture in textures(model).items()}
-    made["wlm_lightmap_networks"] = rows_of_floats(networks(model)[0])
-    made["wlm_lightmap_hour"] = rows_of_floats(hour_table(model, time))
-    found = run_glsl("#define WLM_LIGHTMAP_EXACT\n" + decode_glsl(model), LIGHT, expected.shape[:2], made)
+        hour_tables(random_sheet(), [time])
+    expected = SheetDecoder(model).frame(time)
+    export(file_of(model), tmp_path)
+    uniforms, _ = lightmap_uniforms(tmp_path)
+    uniforms["wlm_lightmap_hour"] = rows_of_floats(hour_tables(model, [time])[0])
+    found = run_glsl("#define WLM_LIGHTMAP_EXACT\n" + decode_glsl(model, None), SHOWN, expected.shape[:2], uniforms)
     np.testing.assert_allclose(found[..., :3], expected, rtol=0, atol=1e-4 * expected.max())
 
 
-def levels_of(texture):
-    if texture.fmt == "BC7_UNORM":
-        images = [blocks_image(decode_blocks(each)) for each in texture.data.reshape(-1, *texture.data.shape[-3:])]
-        return np.stack(images) if texture.layers else images[0]
-    if texture.layers:
-        words = texture.data.view("<u4")
-        return np.concatenate([words >> shift & 1023 for shift in (0, 10, 20)], -1).astype(np.float32) / 1023.0
-    return texture.data
-
-
 def test_the_shader_of_values(tmp_path):
-    model = random_model(gamma=1.0)
-    export(model, tmp_path, values=(-1.0, 1.0))
+    model = random_sheet(gamma=1.0)
+    bundle = sheet_bundle(Sheet("0", "dir", ("R", "G", "B"), "signed"), model, "random", "0")
+    export(bundle, tmp_path)
     uniforms, hour = lightmap_uniforms(tmp_path)
-    text = "#define WLM_LIGHTMAP_EXACT\n" + (tmp_path / "decode.glsl").read_text()
+    text = "#define WLM_LIGHTMAP_EXACT\n" + (tmp_path / "lightmap.glsl").read_text()
     expected = read_exr(tmp_path / "frame.exr")[0]
+    assert expected.min() < 0.0 and "wlm_radiance" not in text
     found = run_glsl(text, "light = vec4(wlm_value(pixel), 1.0);", expected.shape[:2], uniforms | hour(0))
     np.testing.assert_allclose(found[..., :3], expected, rtol=0, atol=1e-4)
 
@@ -306,7 +285,7 @@ def test_the_shader_fills_gaps(tmp_path):
     mask = np.random.default_rng(0).random((236, 247)) < 0.03
     export(random_model(mask=mask), tmp_path)
     uniforms, hour = lightmap_uniforms(tmp_path)
-    text = (tmp_path / "decode.glsl").read_text()
+    text = (tmp_path / "lightmap.glsl").read_text()
     main = "light = vec4(vec2(wlm_source(pixel)), 0.0, 1.0);"
     found = run_glsl(text, main, mask.shape, uniforms | hour(0))[..., 1::-1]
     expected = np.moveaxis(np.indices(mask.shape), 0, 2)
