@@ -1,0 +1,31 @@
+# Written by python -m wlm._facade from `_PLACES` of the package.
+# ruff: noqa: I001
+from wlm.fluid.volume import DensityVolume as DensityVolume
+from wlm.smoke.camera import Camera as Camera
+from wlm.smoke.data import load as load
+from wlm.smoke.data import load_frames as load_frames
+from wlm.smoke.data import open_frames as open_frames
+from wlm.smoke.data import read_six_way as read_six_way
+from wlm.smoke.data import write_six_way as write_six_way
+from wlm.smoke.decode import Decoder as Decoder
+from wlm.smoke.evaluation import Report as Report
+from wlm.smoke.evaluation import evaluate as evaluate
+from wlm.smoke.fit import train as train
+from wlm.smoke.flipbook.textures import write_flipbook as write_flipbook
+from wlm.smoke.lightmaps import SixWay as SixWay
+from wlm.smoke.march.coarse import bake_coarse as bake_coarse
+from wlm.smoke.march.coarse import guide as guide
+from wlm.smoke.march.fine import bake as bake
+from wlm.smoke.model import SmokeModel as SmokeModel
+from wlm.smoke.network.onnx_file import export_onnx as export_onnx
+from wlm.smoke.network.prediction import SmokePredictor as SmokePredictor
+from wlm.smoke.network.prediction import predict as predict
+from wlm.smoke.network.settings import DatasetSettings as DatasetSettings
+from wlm.smoke.network.settings import NetworkSettings as NetworkSettings
+from wlm.smoke.network.settings import Profile as Profile
+from wlm.smoke.network.settings import TrainSettings as TrainSettings
+from wlm.smoke.scene import load_scene as load_scene
+from wlm.smoke.shading import Light as Light
+from wlm.smoke.shading import Ramp as Ramp
+from wlm.smoke.simulation import simulate as simulate
+from wlm_kernels.smoke.settings import March as March
