@@ -4,10 +4,10 @@ For each lightmap of each mesh these kinds of rows:
 
 - method "ours", one row for each profile: the file, the compression with the writing, the error as the mesh is seen
   from around, and the time to read a million random points of its surface. In a full run also the first profile at the
-  bits that the paper's method came to, and at CRs of 92.5% and 95%.
+  bits of the first cascade, and at CRs of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at those of the others.
-  Single-colour merging has a size of its own instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
+  Single-colour merging has its own size instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
   of its eq. 9, which leave out UVs and headers; a rival's bytes are these bits alone, it has no file.
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
   surface; the time is that of the tuning alone.
@@ -37,17 +37,16 @@ from benchmarks.rivals.rival import Rival
 from benchmarks.rows import MEAN, Row, read_json
 from benchmarks.runner import Bench, Note, exact_errors
 from wlm import interop
-from wlm.atlas.data import from_arrays
+from wlm.atlas.codec import sizes
+from wlm.atlas.data import Sheet, from_arrays
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import Sampler, compare
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
-from wlm.atlas.views import surface_points
 from wlm.errors import WlmError
-from wlm.texels import fill_gaps
 
-PROFILES = ("standard", "half", "bc6h", "astc", "compact", "cascade", "paper")
+PROFILES = ("standard", "bc6h", "astc", "cascade", "paper")
 """Profiles of a run; the first has the bits of the first cascade too."""
 
 _RIVALS = {
@@ -59,24 +58,25 @@ _RIVALS = {
     "carving": "carving",
 }
 _METHODS = (*_RIVALS, *OWN_SIZE)
-_OWN = "its own size"  # the option of those without a budget
+_OWN = "its own size"  # the option of rivals without a budget
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
-_HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # whose bits rivals get when they run alone
-_FIRST = "downsampling"  # what everything is compared with
+_HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # bits of rivals that run alone
+_FIRST = "downsampling"  # the rival of every run
 VIEWS, RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
 QUICK_VIEWS, QUICK_RESOLUTION = 8, 256
 _QUICK_CASCADE = {"steps": 30, "resolution": 256}
 _POINTS = 1_000_000
-_CHECKED = 1 << 17  # of them, against float64
+_CHECKED = 1 << 17  # points that are compared with float64
 _SAME = 0.01  # shares of bits that differ by less are equal
 SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
 """Figures of a row that are those of a `Score`."""
 
-_RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")  # with their least and most
+# Figures whose least and most are stated too.
+_RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
 _AVERAGED = ("bytes", "bpp", "compression_ratio", "encode_seconds", "decode_ms", *_RANGED)
 
 PANELS = (Panel("bpp", "psnr", ("ours", _FIRST, "BC6H", "ASTC")), Panel("decode_ms", "max_error", ("ours", "lightmap")))
-"""What a plot of the rows shows: quality against size, of all but the weakest rivals, whose names would hide the rest;
+"""The panels of a plot of the rows: quality against size, without the weakest rivals, whose names would hide the rest;
 and a decode's error against its time."""
 
 
@@ -214,13 +214,13 @@ def _share(row: Row) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """What a lightmap is measured with.
+    """A row of a lightmap that is being measured.
 
     Attributes:
-        row: Without score, and before the timing without a decode time.
+        row: The row, still without score, and before the timing without a decode time.
         sample: The decoder to score; None: none.
         decode: The decoder to time; None: none.
-        model: Ours.
+        model: Our model; None for rivals.
     """
 
     row: Row
@@ -236,11 +236,11 @@ class _AtlasBench(Bench):
         self, lightmap: Lightmap, device: str, progress: Note | None, points: int, repeats: int | None = None
     ) -> None:
         super().__init__("atlas", device, progress, scene=lightmap.scene, repeats=repeats)
-        self.mesh = lightmap.mesh
-        self.triangle, self.weight = surface_points(self.mesh, points, np.random.default_rng(0))
+        self.lit = lightmap.lit
+        self.triangle, self.weight = _surface_points(self.lit.sheets[0], points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
-        """Our profiles, the first of them smaller, and at the bits of the first cascade."""
+        """Measures our profiles, and the first of them at smaller sizes and at the bits of the first cascade."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
         if not whole or profiles[0].method != "tiles":
             return entries
@@ -258,7 +258,7 @@ class _AtlasBench(Bench):
     def entry(self, profile: Profile, option: str) -> _Entry:
         """Compresses and writes, and reads the file back."""
         self.note(f"{option}: compressing")
-        fit = self.fit(option, lambda: compress(self.mesh, profile, device=self.device))
+        fit = self.fit(option, lambda: compress(self.lit, profile, device=self.device))
         model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
         decode, errors = self._decode(model)
         figures = {f"{stage}_seconds": seconds for stage, seconds in model.report["seconds"].items()}
@@ -266,13 +266,13 @@ class _AtlasBench(Bench):
             "ours",
             option,
             model.method,
-            bytes=fit.bytes,
+            bytes=fit.bytes - sizes(model)[1],
             bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
             compression_ratio=model.compression_ratio,
             encode_seconds=fit.seconds,
             steps=profile.steps if profile.method == "cascade" else None,
-            colour_width=model.texels.shape[1],
-            colour_height=model.texels.shape[0],
+            colour_width=model.texels.shape[2],
+            colour_height=model.texels.shape[1],
             lut_width=model.lut.shape[1] or None,
             lut_height=model.lut.shape[0] or None,
             **errors,
@@ -304,14 +304,14 @@ class _AtlasBench(Bench):
         return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
-        """The lightmap itself, in the place of a model of it."""
+        """Measures the lightmap itself, as if it were a model."""
         model = replace(
             model,
             method="plain",
             colour="half",
-            texels=fill_gaps(self.mesh.lightmap, self.mesh.mask).astype(np.float16),
-            blocks=np.empty((0, 16), np.uint8),
-            block_texels=np.empty((0, 0, 3), np.float16),
+            texels=self.lit.sheets[0].lightmaps.astype(np.float16),
+            blocks=np.empty((0, 0, 16), np.uint8),
+            block_texels=np.empty((0, 0, 0, 3), np.float16),
             lut=np.empty((0, 0, 2), np.uint16),
             uv=np.empty((0, 3, 2), np.float32),
         )
@@ -327,9 +327,9 @@ class _AtlasBench(Bench):
         return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
 
     def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
-        """The rivals at the bits of our profiles, and those of a size of their own.
+        """Measures the rivals at the bits of our profiles, and those that have their own size.
 
-        One that holds the whole lightmap in fewer bits isn't measured twice.
+        A rival that holds the whole lightmap in fewer bits isn't measured twice.
 
         Args:
             shares: By profile, its bits over the lightmap's.
@@ -342,14 +342,15 @@ class _AtlasBench(Bench):
             measured.append(share)
             for method in (name for name in methods if name in _RIVALS):
                 if enough.get(method, math.inf) > share:
-                    make = partial(RIVALS[_RIVALS[method]], self.mesh, share)
+                    make = partial(RIVALS[_RIVALS[method]], self.lit, share)
                     entries.append(self._rival(method, f"bits of {profile}", make))
                     row = entries[-1].row
                     # ASTC has other blocks for other budgets.
-                    if (row.get("colour_height"), row.get("colour_width")) == self.mesh.mask.shape and method != "ASTC":
+                    whole = self.lit.sheets[0].mask.shape
+                    if (row.get("colour_height"), row.get("colour_width")) == whole and method != "ASTC":
                         enough[method] = _share(row)
         for method in (name for name in methods if name in OWN_SIZE):
-            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.mesh)))
+            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.lit)))
         return entries
 
     def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:
@@ -358,7 +359,7 @@ class _AtlasBench(Bench):
             rival = make()
         except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
             return _Entry(self.missing_row(method, option, error))
-        share = share_of(rival, self.mesh)
+        share = share_of(rival, self.lit)
         height, width = rival.size or (None, None)
         row = self.row(
             method,
@@ -377,16 +378,17 @@ class _AtlasBench(Bench):
         """Scores all in one go: each view is drawn once."""
         self.note(f"scoring, {views} views of {resolution}²")
         decoders = {str(i): entry.sample for i, entry in enumerate(entries) if entry.sample is not None}
-        reports = compare(self.mesh, decoders, views=views, resolution=resolution, device=self.device)
+        reports = compare(self.lit, decoders, views=views, resolution=resolution, device=self.device)
         rows = [entry.row for entry in entries]
         for i, report in reports.items():
             rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(report, name) for name in SCORES})
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
-        """The decode to time, and its errors against float64."""
+        """Makes the decode to time, and computes its errors against float64."""
         decoder = Decoder(model, self.device)
-        corner = model.uv if len(model.uv) else self.mesh.uv[self.mesh.triangle]
+        sheet = self.lit.sheets[0]
+        corner = model.uv if len(model.uv) else sheet.uv[sheet.triangle]
         uv = np.einsum("nk,nkc->nc", self.weight, corner[self.triangle]).astype(np.float32)
         points = interop.to_warp(torch.from_numpy(uv).to(self.device), wp.vec2)
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=self.device)
@@ -429,7 +431,18 @@ def warm_up(profile: Profile, device: str) -> None:
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
-    mesh = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
-    small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64, "budget": 1.0}
-    model = compress(mesh, profile.model_copy(update=small), device=device)
-    Decoder(model, device).lightmap(mesh)
+    square = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
+    small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64}
+    small |= {"budget": 1.0} if profile.method == "tiles" else {}
+    model = compress(square, profile.model_copy(update=small), device=device)
+    Decoder(model, device).lightmap()
+
+
+def _surface_points(sheet: Sheet, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draws random points of the active triangles, uniform over the surface: triangles [N] and weights [N, 3]."""
+    corner = sheet.position[sheet.triangle]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * sheet.active
+    ends = np.cumsum(area)
+    triangle = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
+    root, share = np.sqrt(random.random(count)), random.random(count)
+    return triangle, np.stack([1.0 - root, root * (1.0 - share), root * share], 1)

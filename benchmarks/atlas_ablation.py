@@ -22,7 +22,7 @@ from benchmarks.atlas import QUICK_RESOLUTION, QUICK_VIEWS, RESOLUTION, SCORES, 
 from benchmarks.atlas_inputs import Lightmap
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
-from wlm.atlas.cascade import fit_cascade, group_triangles
+from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import chart_labels, compare
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
@@ -157,17 +157,17 @@ def _rows(
     views: int,
     resolution: int,
 ) -> list[Row]:
-    mesh, device = lightmap.mesh, bench.device
+    scene, device = lightmap.lit, bench.device
     clusters = None
     if any(option != KEPT_UVS for _, option, _ in chosen):
         bench.note("grouping triangles")
-        clusters = group_triangles(mesh, base, Stages(device))
+        clusters = group_triangles(scene.sheets[0], base, Stages(device))
     rows, models = [], {}
     for i, (method, option, variant) in enumerate(chosen):
         bench.note(option)
         stages, start = Stages(device), time.perf_counter()
         try:
-            model = fit_cascade(mesh, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)
+            model = fit_cascade(scene, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)
         except WlmError as error:  # a package is missing, or the fit diverged
             rows.append(bench.missing_row(method, option, error))
             continue
@@ -175,8 +175,8 @@ def _rows(
         models[str(i)] = model
     bench.note(f"scoring, {views} views of {resolution}²")
     decoders = {i: Decoder(model, device) for i, model in models.items()}
-    labels = {i: chart_labels(model, mesh, device) for i, model in models.items()}
-    scores = compare(mesh, decoders, labels=labels, views=views, resolution=resolution, device=device)
+    labels = {i: chart_labels(model, scene, device) for i, model in models.items()}
+    scores = compare(scene, decoders, labels=labels, views=views, resolution=resolution, device=device)
     for i, score in scores.items():
         rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(score, name) for name in SCORES})
     return rows
@@ -195,8 +195,8 @@ def _row(
         step_ms=1e3 * fit / profile.steps if profile.steps else None,
         steps=profile.steps,
         resolution=profile.resolution if profile.space == "views" and profile.steps else None,
-        colour_width=model.texels.shape[1],
-        colour_height=model.texels.shape[0],
+        colour_width=model.texels.shape[2],
+        colour_height=model.texels.shape[1],
         lut_width=model.lut.shape[1] or None,
         lut_height=model.lut.shape[0] or None,
         **{f"{stage}_seconds": value for stage, value in stages.seconds.items()},

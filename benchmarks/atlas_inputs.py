@@ -6,17 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import wlm
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.data import load as load_mesh
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.data import load as load_scene
 from wlm.errors import WlmError
 
 
 @dataclass(frozen=True, eq=False)
 class Lightmap:
-    """A mesh with its lightmap, and the scene of its rows."""
+    """A mesh with its lightmap.
+
+    Attributes:
+        scene: The scene of its rows.
+        lit: The mesh and the lightmap.
+    """
 
     scene: str
-    mesh: LightmappedMesh
+    lit: LightmappedScene
 
 
 def load(
@@ -70,5 +75,5 @@ def load(
 def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[str] | None) -> list[Lightmap]:
     name = mesh.resolve().parent.name if mesh.stem == "mesh" else mesh.stem
     scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
-    meshes = (load_mesh(mesh, path, mask_path=mask) for path in lightmaps)
+    meshes = (load_scene(mesh, path, mask_path=mask) for path in lightmaps)
     return [Lightmap(*pair) for pair in zip(scenes, meshes, strict=True)]

@@ -25,13 +25,14 @@ import torch
 import wlm
 from benchmarks import describe_environment
 from benchmarks.atlas import PROFILES
-from wlm.atlas.cascade import group_triangles
-from wlm.atlas.data import LightmappedMesh, from_arrays
-from wlm.atlas.data import load as load_mesh
+from wlm.atlas.cascade.fit import group_triangles
+from wlm.atlas.data import LightmappedScene, from_arrays
+from wlm.atlas.data import load as load_scene
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.atlas.stages import Stages
 from wlm.formats.atomic import atomic_write
+from wlm.texels import fill_gaps
 
 DATA = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / "atlas"
 WARM_SIDE, SHEET_SIDE = 128, 2048
@@ -49,17 +50,19 @@ def noise(side: int) -> np.ndarray:
     return (1.0 + CONTRAST * total / total.std()).clamp(min=0.05).numpy()
 
 
-def enlarged(mesh: LightmappedMesh, side: int) -> LightmappedMesh:
-    """The mesh under a lightmap of another size."""
-    light = torch.from_numpy(mesh.filled).permute(2, 0, 1)[None]
+def enlarged(scene: LightmappedScene, side: int) -> LightmappedScene:
+    """Makes the scene under a lightmap of another size."""
+    (mesh,) = scene.sheets
+    light = torch.from_numpy(mesh.lightmap).permute(2, 0, 1)[None]
     light = torch.nn.functional.interpolate(light, (side, side), mode="bilinear")[0].permute(1, 2, 0).numpy()
     mask = torch.from_numpy(mesh.mask).float()[None, None]
     inside = torch.nn.functional.interpolate(mask, (side, side), mode="nearest")[0, 0].numpy() > 0
-    return replace(mesh, lightmap=np.ascontiguousarray(light * noise(side)[..., None], np.float32), mask=inside)
+    lightmaps = np.ascontiguousarray(light * noise(side)[..., None], np.float32)[None]
+    return replace(scene, sheets=(replace(mesh, lightmaps=fill_gaps(lightmaps, inside), mask=inside),))
 
 
-def sheet(triangles: int) -> LightmappedMesh:
-    """A bumpy sheet of about so many triangles."""
+def sheet(triangles: int) -> LightmappedScene:
+    """Makes a bumpy sheet of about a number of triangles."""
     count = max(math.isqrt(triangles // 2), 1)
     row, column = np.mgrid[: count + 1, : count + 1] / count
     uv = np.stack([column, row], -1).reshape(-1, 2)
@@ -71,19 +74,19 @@ def sheet(triangles: int) -> LightmappedMesh:
     return from_arrays(position, triangle, uv, light, np.ones((SHEET_SIDE, SHEET_SIDE), bool), name="sheet")
 
 
-def compressed(mesh: LightmappedMesh, name: str, device: str) -> dict[str, float]:
+def compressed(scene: LightmappedScene, name: str, device: str) -> dict[str, float]:
     """Seconds of each stage of a compression, and in all."""
-    mesh = replace(mesh)  # nothing is kept from a run before
+    scene = replace(scene)  # nothing is kept from a run before
     start = time.perf_counter()
-    seconds = compress(mesh, name, device=device).report["seconds"]
+    seconds = compress(scene, name, device=device).report["seconds"]
     return seconds | {"all": time.perf_counter() - start}
 
 
 def clustered(triangles: int, device: str) -> dict[str, float]:
-    """Seconds of the clustering of so many triangles, without compiling."""
+    """Seconds of the clustering of a number of triangles, without compiling."""
     profile = Profile.load("paper")
     for count in (1000, triangles):
-        mesh, stages = sheet(count), Stages(device)
+        mesh, stages = sheet(count).sheets[0], Stages(device)
         groups = group_triangles(mesh, profile, stages)
     return stages.seconds | {"triangles": len(mesh.triangle), "groups": len(groups.representative)}
 
@@ -95,7 +98,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=512, help="texels of the lightmap along a side")
     parser.add_argument("--profile", action="append", help="default all; several times")
     parser.add_argument("--times", type=int, default=2)
-    parser.add_argument("--triangles", type=int, help="instead, of the clustering of so many")
+    parser.add_argument("--triangles", type=int, help="number of triangles to cluster instead")
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     title = f"{args.triangles} triangles" if args.triangles else str(args.side)
@@ -112,7 +115,7 @@ def main() -> None:
     if args.triangles:
         done("clustering", clustered(args.triangles, args.device))
         return
-    room = load_mesh(DATA / "room.glb", DATA / "room.exr")
+    room = load_scene(DATA / "room.glb", DATA / "room.exr")
     mesh, small = enlarged(room, args.side), enlarged(room, WARM_SIDE)
     for name in args.profile or PROFILES:
         compressed(small, name, args.device)

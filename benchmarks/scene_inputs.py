@@ -15,11 +15,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from wlm.atlas.belonging import chart_map
 from wlm.atlas.charts import charts, welded
-from wlm.atlas.data import from_arrays
-from wlm.atlas.layout import place
-from wlm.atlas.scene.data import LightmappedScene, scene_of
+from wlm.atlas.data import LightmappedScene, from_arrays, join
+from wlm.atlas.matching import chart_map
+from wlm.atlas.tiles.layout import place
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.lightmap.data import SheetFrames
@@ -100,13 +99,12 @@ def cut(
     ]
     counts = np.array([int(inside.sum()) for _, inside, _ in pieces])
     object_of = _objects(position, triangle, chart, counts)
-    meshes, frames = [], []
+    scenes = []
     for number in range(int(object_of.max()) + 1):
         own = np.flatnonzero(object_of == number)
-        mesh, light = _object(position, triangle, texel, chart, own, pieces, factor, f"{lightmaps.name} {number}")
-        meshes.append(mesh)
-        frames.append(light)
-    return scene_of(meshes, frames, lightmaps.name)
+        name = f"{lightmaps.name} {number}"
+        scenes.append(_object(position, triangle, texel, chart, own, pieces, factor, name))
+    return join(scenes, lightmaps.name)
 
 
 def _piece(
@@ -154,7 +152,7 @@ def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, coun
 
 
 def _object(position, triangle, texel, chart, own, pieces, factor, name):
-    """A mesh with its charts laid out anew, and its lightmaps [M, H, W, 3]."""
+    """Makes the scene of one object, with its charts laid out anew."""
     sizes = np.array([pieces[number][1].shape[::-1] for number in own]) + _GAP
     first, tall = place(sizes, max(int(sizes[:, 0].max()), math.ceil(math.sqrt(sizes.prod(1).sum()))))
     wide = int((first[:, 0] + sizes[:, 0]).max())
@@ -170,5 +168,4 @@ def _object(position, triangle, texel, chart, own, pieces, factor, name):
     pairs = np.column_stack([np.repeat(chart[faces], 3), triangle[faces].reshape(-1)])
     used, corner = np.unique(pairs, axis=0, return_inverse=True)
     uv = (texel[used[:, 1]] / factor + shift[used[:, 0]]) / (wide, tall)
-    mesh = from_arrays(position[used[:, 1]], corner.reshape(-1, 3), uv, light[0], mask, name)
-    return replace(mesh, metres=True), light
+    return from_arrays(position[used[:, 1]], corner.reshape(-1, 3), uv, light, mask, name, metres=True)

@@ -14,7 +14,7 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data"
 PAGES = {
     "city": ("Lightmaps over the day", ["city.wlm"], {"original": DATA / "city"}),
-    "room": ("A mesh's lightmap", ["room-standard"], {"original": DATA / "atlas" / "room.exr"}),
+    "room": ("A mesh's lightmap", ["room-standard.wlm"], {"original": DATA / "atlas" / "room.exr"}),
     "street": ("Light probes", ["street.wlm"], {"original": DATA / "probes" / "street.npz", "key": "12.00"}),
     "plume": ("Six-way lightmaps of smoke", [f"smoke/plume_{a:02}.exr" for a in (0, 30, 60, 90)], {"rate": 2.0}),
 }

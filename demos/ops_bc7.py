@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from wlm import atlas, ops
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.views import visible_uv
 from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
@@ -28,7 +28,6 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.bc7 import decode_image
 from wlm.interop import check_device
 from wlm.ops.views import View
-from wlm.texels import fill_gaps
 from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
 
@@ -44,9 +43,11 @@ DRAWN, ERROR_GAIN = 320, 8.0  # pixels of a picture with its border, and what er
 LEAST_PSNR, LEAST_GAIN = 35.5, 2.0
 
 
-def visible(mesh: LightmappedMesh, directions: Sequence, pixels: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where pixels see the mesh, bool [views, pixels, pixels], and at which UV [views, pixels, pixels, 2]."""
-    views = visible_uv(mesh, [View.of(direction) for direction in directions], pixels, device)
+def visible(
+    scene: LightmappedScene, directions: Sequence, pixels: int, device: str
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Finds the pixels that show the mesh, bool [views, pixels, pixels], and their UVs [views, pixels, pixels, 2]."""
+    views = visible_uv(scene, [View.of(direction) for direction in directions], pixels, device)
     triangle, _, uv = map(torch.stack, zip(*views, strict=True))
     return triangle >= 0, uv
 
@@ -80,12 +81,13 @@ def fit(endpoints: torch.Tensor, weights: torch.Tensor, uv: torch.Tensor, target
 def run(out: Path, device: str) -> dict[str, float]:
     """Runs the demo, writes its picture and its blocks, and returns its figures."""
     data = HERE / "data" / "atlas"
-    mesh = atlas.load(data / "room.glb", data / "room.exr")
-    filled = fill_gaps(mesh.lightmap, mesh.mask)
+    scene = atlas.load(data / "room.glb", data / "room.exr")
+    (mesh,) = scene.sheets
+    filled = mesh.lightmap
     everywhere = np.ones(mesh.mask.shape, bool)
     colours = encode(filled, everywhere, white_of(mesh.lightmap[mesh.mask])).astype(np.float32) / 255.0
     lightmap = torch.tensor(colours, device=device)
-    hit, uv = visible(mesh, FITTED, PIXELS, device)
+    hit, uv = visible(scene, FITTED, PIXELS, device)
 
     averaged = torch.nn.functional.avg_pool2d(lightmap.movedim(2, 0), len(lightmap) // TEXELS).movedim(0, 2)
     start = endpoints_of(torch.cat([averaged, torch.ones_like(averaged[..., :1])], 2))
@@ -101,22 +103,22 @@ def run(out: Path, device: str) -> dict[str, float]:
     decoded = {name: torch.tensor(image, device=device) for name, image in images.items()}
     figures = {}
     for views, directions in (("six views", FITTED), ("held-out view", [HELD_OUT])):
-        hit, uv = visible(mesh, directions, PIXELS, device)
+        hit, uv = visible(scene, directions, PIXELS, device)
         target = ops.texture(lightmap, uv[hit])
         for name, image in decoded.items():
             error = (ops.texture(image, uv[hit]) - target).square().mean()
             figures[f"PSNR dB of the {name} texture, {views}"] = -10.0 * math.log10(float(error))
-    _picture(out / "ops_bc7.png", mesh, {"lightmap": lightmap} | decoded)
+    _picture(out / "ops_bc7.png", scene, {"lightmap": lightmap} | decoded)
     base, best = (figures[f"PSNR dB of the {name} texture, held-out view"] for name in files)
     if not best >= max(LEAST_PSNR, base + LEAST_GAIN):
         raise WlmError(f"demo: expected {LEAST_PSNR} dB and {LEAST_GAIN} dB above {base:.4g}, got {best:.4g}")
     return figures | {"bytes": files["fitted"].nbytes, "seconds": seconds}
 
 
-def _picture(path: Path, mesh: LightmappedMesh, images: dict[str, torch.Tensor]) -> None:
+def _picture(path: Path, scene: LightmappedScene, images: dict[str, torch.Tensor]) -> None:
     """The held-out view by each image, and the errors against the first."""
     device = str(images["lightmap"].device)
-    hit, uv = visible(mesh, [HELD_OUT], DRAWN, device)
+    hit, uv = visible(scene, [HELD_OUT], DRAWN, device)
     rows, columns = (torch.nonzero(hit[0].any(axis))[:, 0] for axis in (1, 0))
     box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
     mask = hit[0][box].cpu().numpy()[..., None]

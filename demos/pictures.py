@@ -40,7 +40,7 @@ LIGHTMAPS = ("right", "left", "top", "bottom", "front", "back")
 # By file: what is opened, its options, the view, and the sliders.
 VIEWS: dict[str, tuple[Sequence[str], dict[str, Any], str, dict[str, float]]] = {
     "lightmap.png": (["city.wlm"], {"original": DATA / "city"}, "light", {"hour": 12.0}),
-    "atlas.png": (["room-standard"], {"original": DATA / "atlas" / "room.exr"}, "tiles", {}),
+    "atlas.png": (["room-standard.wlm"], {"original": DATA / "atlas" / "room.exr"}, "tiles", {}),
     "probe.png": (
         ["street.wlm"],
         {"original": DATA / "probes" / "street.npz", "key": "12.00"},

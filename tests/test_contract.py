@@ -8,7 +8,6 @@ from pkgutil import iter_modules
 
 import numpy as np
 import pytest
-from builders.checks import assert_same
 from builders.contract import SUBJECTS, Subject
 from builders.running import report_always
 
@@ -17,7 +16,7 @@ from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.system import Meter, load
 
 SYSTEMS = ("lightmap", "atlas", "probe", "smoke")
-VERBS = {"load", "evaluate", "export", "Profile", "Report", "Decoder"}
+VERBS = {"load", "evaluate", "Profile", "Report", "Decoder"}
 PROFILES = {"lightmap": "M", "atlas": "standard", "probe": "small", "smoke": "fast"}
 FITTED = ["lightmap", "probe", "atlas-tiles"]
 
@@ -86,15 +85,10 @@ def test_old_files_decode_to_what_they_did(subject):
 
 @every_file
 def test_a_file_that_is_saved_again_is_the_same(subject, tmp_path):
-    first = subject.file
-    if subject.name.startswith("atlas"):  # their parts weren't streams
-        first = tmp_path / "streams.wlm"
-        wlm.load(subject.file).save(first)
-        assert_same(wlm.load(first), wlm.load(subject.file))
-    model = wlm.load(first)
+    model = wlm.load(subject.file)
     size = model.save(tmp_path / "again.wlm")
-    assert size == model.file_bytes() == first.stat().st_size
-    assert (tmp_path / "again.wlm").read_bytes() == first.read_bytes()
+    assert size == model.file_bytes() == subject.file.stat().st_size
+    assert (tmp_path / "again.wlm").read_bytes() == subject.file.read_bytes()
 
 
 @every_file

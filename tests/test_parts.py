@@ -12,6 +12,7 @@ from builders.resigned import GONE, put, rewrite, rewrite_number
 import wlm
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.zstd import compress
 
 MODELS = (
     "lightmap",
@@ -40,6 +41,9 @@ WEIRD = {
 # What is a good value after all.
 ACCEPTED = {
     ("name", "text"),
+    ("uv_set", "zero"),
+    ("metres", "true"),
+    ("hides", "true"),
     ("period", "none"),
     ("dropped", "zero"),
     ("report", "mapping"),
@@ -164,10 +168,10 @@ def _sized(*size) -> dict:
         ("probe", {"outputs": 4097}, "setting outputs: expected less than or equal to 4096"),
         ("probe", {"probes": 2**40}, "setting probes: expected less than or equal to 16777216"),
         ("probe", {"gaussians": 41}, "part gaussians is uint8 (1040,), expected uint8 (1066)"),
-        ("atlas-tiles", {"size": [65536, 65536]}, "part lut is uint16"),
-        ("atlas-tiles", {"size": [0, 48]}, "setting size.0"),
-        ("atlas-bc6h", {"size": [16384, 16384]}, "at most 65536 texels for each of the 414 that its textures hold"),
-        ("atlas-cascade", {"size": [65536, 65536]}, "and 268435456 in all, found 65536x65536"),
+        ("atlas-tiles", {"sizes": [[4096, 4096]]}, "part lut is uint16"),
+        ("atlas-tiles", {"sizes": [[0, 48]]}, "setting sizes.0.0"),
+        ("atlas-bc6h", {"sizes": [[16384, 16384]]}, "part mask is uint8 (240,), expected uint8 (33554432)"),
+        ("atlas-cascade", {"sizes": [[65536, 65536]]}, "and 268435456 in all, found 65536x65536"),
         ("smoke", {"network": {"width": 64, "levels": 6}}, "part encoder.5.2.weight is missing"),
         ("smoke", {"network": {"width": 2**70}}, "setting network.width"),
     ],
@@ -212,11 +216,13 @@ def test_a_few_bytes_that_claim_many_frames(path):
 
 def test_a_few_bytes_that_claim_a_large_atlas(path):
     kept = written(path, "atlas-bc6h")
-    settings = {"size": [65536, 65536], "texels": [1, 1], "colour": "half"}
-    rewrite(path, settings, {"colour": np.zeros((1, 1, 3), np.float16)})
+    settings = {"sizes": [[65536, 65536]], "texels": [1, 1], "colour": "half"}
+    rewrite(path, settings, {"colour": np.zeros((1, 1, 1, 3), np.float16)})
     refused(kept, path, "found 65536x65536")
-    rewrite(path, {"size": [8192, 8192]})
-    refused(kept, path, "at most 65536 texels for each of the 1 that its textures hold, found 8192x8192")
+    mask = np.full(1 << 23, 255, np.uint8)
+    frame = np.frombuffer(compress(mask.tobytes()), np.uint8)
+    rewrite(path, {"sizes": [[8192, 8192]], "parts": {"mask": [1 << 23]}}, {"mask": frame})
+    refused(kept, path, "at most 65536 texels for each of the 1 of its textures, found 8192x8192")
 
 
 def test_a_few_bytes_that_claim_a_large_network(path):

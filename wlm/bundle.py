@@ -6,7 +6,8 @@ that leaves a model consumes it: the raw folder and the engine kits of `wlm.expo
 
     system    textures                               buffers                       reference           files
     lightmap  uv, uvt, planes, frames, valid         networks, hours               frame
-    atlas     colour, blocks, lut, sheets, factors                                                     mesh.glb
+    atlas     colour, blocks, lut, tail, sheets,                           lightmap            mesh.glb
+              factors
     probe                                            gaussians, network,           position, values
                                                      positions
     smoke     first, second, motion, depth

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 _PACKAGES = {
     "lightmap": "wlm.lightmap",
     "atlas": "wlm.atlas",
-    "atlas-scene": "wlm.atlas.scene",
     "probe": "wlm.probe",
     "smoke-network": "wlm.smoke",
 }

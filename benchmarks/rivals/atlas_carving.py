@@ -1,7 +1,7 @@
 """Carving of a lightmap together with the mesh's UVs, after "Texture Size Reduction Through Symmetric Overlap and
 Texture Carving" (Knodt and Gao, ACM Transactions on Graphics 44(1), 2025).
 
-Known of the method, from its abstract and section 4.3 of lightmap-uv-clustering-cascade: it carves redundant and void
+The abstract of the method and section 4.3 of lightmap-uv-clustering-cascade state: it carves redundant and void
 texels in a way that is aware of the UVs and of the texture, without inverting the UV mesh and without a change of the
 mesh itself; carving is seam carving. Its other half, charts laid over their mirror images, is left out, as it is there:
 light isn't symmetric.
@@ -14,11 +14,10 @@ dynamic programming. Rows and columns are treated alike, in turns. Ours, where t
   gradient, as in 2007, is 5 dB worse at equal bits on three lightmaps, and worse than a smaller lightmap, which is what
   lightmap-uv-clustering-cascade finds of the method.
 - Removing a seam moves UVs by a map without folds: nothing up to the centre of the texel before the seam, one texel
-  from that of the texel behind it, linearly between. A triangle's inside follows its corners, so that the texture isn't
-  what seams leave, but is drawn again after every few of them, and the last one has the least squared error where
-  charts are read.
+  from that of the texel behind it, linearly between. A triangle's inside follows its corners, so the texture is
+  drawn again after every few seams, and the last one has the least squared error where charts are read.
 - A seam that would turn a triangle over isn't taken: its texels there are blocked until the next drawing.
-- RGB9E5, of which the texels that charts read are paid for, as for other rivals. UVs are free in eq. 9.
+- The texture is RGB9E5, and costs the texels that charts read, as for other rivals. UVs are free in eq. 9.
 """
 
 import time
@@ -31,36 +30,36 @@ import torch
 from benchmarks.rivals.atlas_share import budget_bits, read_blocks
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.colour import quantise
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import COLOUR_BITS, TEXELS
-from wlm.atlas.views import corner_weights, texel_triangles
+from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.formats.exr import HALF_MAX
 from wlm.ops import raster
 from wlm.texels import fill_gaps
 
-_ROUND = 32  # a side over the seams between two drawings, which take most of the time; with 16 it is 1 dB worse
+_ROUND = 32  # a side over the seams between two drawings; with 16 it is 1 dB worse
 _FINE = 2  # points along a texel, where errors are least: with one, reads between centres are 3 dB worse
 _THIN = 1e-9  # twice a triangle's area in texels
-_PULL = 1e-4  # towards the mean of the points around a texel, which decides those that few read
-_ROUNDS = 20  # of conjugate gradients
+_PULL = 1e-4  # regularisation towards the mean of the points around a texel
+_ROUNDS = 20  # rounds of conjugate gradients
 
 
-def carving(mesh: LightmappedMesh, share: float) -> Rival:
-    """The lightmap without the seams that hold least, read bilinearly under UVs that follow.
+def carving(scene: LightmappedScene, share: float) -> Rival:
+    """Removes the seams of least cost from the lightmap, which is read bilinearly under UVs that follow.
 
     Args:
-        mesh: The mesh and its lightmap.
+        scene: A scene of one lightmap.
         share: The budget.
 
     Raises:
         ValueError: A share without room for one texel, or that is reached by no seams that keep the triangles' winding.
     """
-    start = time.perf_counter()
+    start, (mesh,) = time.perf_counter(), scene.sheets
     most, bits = budget_bits(mesh, share) // COLOUR_BITS[TEXELS], COLOUR_BITS[TEXELS]
     if most == 0:
         raise ValueError(f"share: {share} of {mesh.mask.shape} texels has no room for {bits} bits")
-    points = _Points(mesh)
-    sheet = _Sheet(mesh.uv * mesh.mask.shape[::-1], mesh.mask.shape)
+    points = _Samples(mesh)
+    sheet = _Texture(mesh.uv * mesh.mask.shape[::-1], mesh.mask.shape)
     while (count := read_blocks(points.places(sheet), sheet.size)) > most:
         # Each side has about the same share of its texels left, where it can.
         left = [side / most for side, most in zip(sheet.size, mesh.mask.shape, strict=True)]
@@ -79,7 +78,7 @@ def carving(mesh: LightmappedMesh, share: float) -> Rival:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sheet:
+class _Texture:
     """A texture that is carved.
 
     Attributes:
@@ -105,15 +104,15 @@ class _Sample:
     def __init__(self, texels: np.ndarray, corner: np.ndarray) -> None:
         self._texels, self.corner = torch.tensor(texels), torch.tensor(corner, dtype=torch.float32)
 
-    def __call__(self, uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        corner = self.corner.to(uv.device)[triangle.long()]
-        return raster.texture(self._texels.to(uv.device), (barycentric[..., None].float() * corner).sum(1))
+    def __call__(self, points: Points, state: int) -> torch.Tensor:
+        corner = self.corner.to(points.uv.device)[points.triangle]
+        return raster.texture(self._texels.to(points.uv.device), (points.weight[..., None].float() * corner).sum(1))
 
 
-class _Points:
-    """Points of the charts that a texture is fitted to."""
+class _Samples:
+    """Points of the charts at which a texture is fitted."""
 
-    def __init__(self, mesh: LightmappedMesh) -> None:
+    def __init__(self, mesh: Sheet) -> None:
         shape = tuple(_FINE * side for side in mesh.mask.shape)
         triangle, barycentric = texel_triangles(mesh, *shape, "cpu")
         inside = torch.tensor(mesh.mask.repeat(_FINE, 0).repeat(_FINE, 1)) & (triangle >= 0)
@@ -127,14 +126,14 @@ class _Points:
             self._weight = corner_weights(barycentric[inside]).numpy().astype(np.float64)
             row, column = np.nonzero(inside.numpy())
             uv = np.stack([(column + 0.5) / shape[1], (row + 0.5) / shape[0]], 1)
-        image = torch.tensor(mesh.filled)
+        image = torch.tensor(mesh.lightmap)
         self._light = raster.texture(image, torch.tensor(uv, dtype=torch.float32)).numpy().astype(np.float64)
 
-    def places(self, sheet: _Sheet) -> np.ndarray:
+    def places(self, sheet: _Texture) -> np.ndarray:
         """Row and column of each on a texture, from the first texel's centre: float64 [N, 2]."""
         return np.einsum("nk,nkc->nc", self._weight, sheet.place[self._vertex])[:, ::-1] - 0.5
 
-    def fitted(self, sheet: _Sheet) -> np.ndarray:
+    def fitted(self, sheet: _Texture) -> np.ndarray:
         """The texture of least squared error, float32 [h, w, 3]."""
         place, count = self.places(sheet), np.array(sheet.size)
         low = np.floor(place).astype(np.int64)
@@ -157,7 +156,7 @@ class _Points:
         for _ in range(_ROUNDS):
             image = squares @ direction
             curvature = (direction * image).sum(0)
-            # A channel that is solved already has a curvature of 0.
+            # A channel that is already solved has a curvature of 0.
             step = np.divide(energy, curvature, out=np.zeros(3), where=curvature > 0.0)
             light, residual = light + step * direction, residual - step * image
             before, energy = energy, np.square(residual).sum(0)
@@ -165,13 +164,13 @@ class _Points:
         return light.clip(0.0, HALF_MAX).reshape(*sheet.size, 3).astype(np.float32)
 
 
-def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _Sheet:
+def _carved(mesh: Sheet, sheet: _Texture, seams: int, turned: bool) -> _Texture:
     """Removes seams.
 
     Args:
         mesh: The mesh.
         sheet: The texture before.
-        seams: How many, at most: fewer where none is left that turns no triangle over.
+        seams: Most seams; fewer where every other one would turn a triangle over.
         turned: Whether they run from the left to the right, and not from the top to the bottom.
     """
     image = _drawn(mesh, sheet)
@@ -180,7 +179,7 @@ def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _
     if turned:
         image, place = image.transpose(1, 0, 2), place[:, ::-1]
     winding = _areas(place[triangle])
-    # Of triangles without an area to speak of rounding decides.
+    # Rounding would decide for triangles with hardly an area.
     winding = np.where(np.abs(winding) > _THIN, np.sign(winding), 0.0)
     blocked = np.zeros(image.shape[:2], bool)
     for _ in range(min(seams, image.shape[1] - 1)):
@@ -195,10 +194,12 @@ def _carved(mesh: LightmappedMesh, sheet: _Sheet, seams: int, turned: bool) -> _
         place = moved
         image, blocked = (_without(each, seam) for each in (image, blocked))
     height, width = image.shape[:2]
-    return _Sheet(np.ascontiguousarray(place[:, ::-1]), (width, height)) if turned else _Sheet(place, (height, width))
+    return (
+        _Texture(np.ascontiguousarray(place[:, ::-1]), (width, height)) if turned else _Texture(place, (height, width))
+    )
 
 
-def _drawn(mesh: LightmappedMesh, sheet: _Sheet) -> np.ndarray:
+def _drawn(mesh: Sheet, sheet: _Texture) -> np.ndarray:
     """The lightmap under the sheet's UVs, its gaps filled: float64 [h, w, 3]."""
     triangle = mesh.triangle[mesh.active]
     drawn = raster.rasterize_uv(
@@ -210,12 +211,12 @@ def _drawn(mesh: LightmappedMesh, sheet: _Sheet) -> np.ndarray:
     corner = mesh.uv[triangle[drawn.triangle[hit].numpy()]]
     uv = np.einsum("nk,nkc->nc", corner_weights(drawn.barycentric[hit]).numpy(), corner)
     image = np.zeros((*sheet.size, 3))
-    image[hit.numpy()] = raster.texture(torch.tensor(mesh.filled), torch.tensor(uv, dtype=torch.float32)).numpy()
+    image[hit.numpy()] = raster.texture(torch.tensor(mesh.lightmap), torch.tensor(uv, dtype=torch.float32)).numpy()
     return fill_gaps(image, hit.numpy())
 
 
 def _costs(image: np.ndarray) -> np.ndarray:
-    """What each texel of [h, w, 3] differs by from the mean of its neighbours in the row: [h, w]."""
+    """The difference of each texel of [h, w, 3] from the mean of its neighbours in the row, [h, w]."""
     padded = np.pad(image, ((0, 0), (1, 1), (0, 0)), mode="edge")
     return np.abs(image - (padded[:, 2:] + padded[:, :-2]) / 2.0).sum(2)
 

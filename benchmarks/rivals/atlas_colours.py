@@ -1,11 +1,11 @@
 """Triangles of one colour share a texel, after "Texture Atlas Compression Based on Repeated Content Removal" (Luo et
 al., SIGGRAPH Asia 2023), at a size of its own.
 
-Known of the method, from its abstract, the interface of its published program and section 4.3 of
-lightmap-uv-clustering-cascade: repeated contents share texels; what is left is background, whose triangles are grouped
-by colour, with a threshold of 10 levels; a new atlas holds what remains at its own resolution; a second pass leaves
-triangles out that were wrong: in 50 views of 512 x 512 pixels, where a view is below 38 dB, one triangle after another,
-that with the largest error first, until it isn't. 38 dB are those of the whole picture, background and all.
+The abstract of the method, the interface of its published program and section 4.3 of
+lightmap-uv-clustering-cascade state: repeated contents share texels; the rest is background, whose triangles are
+grouped by colour, with a threshold of 10 levels; a new atlas holds what remains at its own resolution; a second pass
+leaves triangles out that were wrong: in 50 views of 512 x 512 pixels, where a view is below 38 dB, one triangle after
+another, that with the largest error first, until it isn't. 38 dB are those of the whole picture, background and all.
 
 Ours, where that is silent:
 
@@ -28,13 +28,13 @@ import torch
 
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.coverage import touched_texels
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.display import screen_exposure
+from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.evaluation import RESOLUTION, VIEWS
 from wlm.atlas.model import SOURCE_BITS
 from wlm.atlas.stages import one_thread
-from wlm.atlas.views import mesh_views, visible_uv
+from wlm.atlas.views import Points, points_at, scene_views, visible_uv
 from wlm.ops import raster
+from wlm.texels import exposure as exposure_of
 
 _THRESHOLD = 10 / 255
 _FLOOR = 38.0
@@ -43,7 +43,7 @@ _SAMPLES_AT_ONCE = 1 << 20
 
 
 def single_colour(
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     *,
     threshold: float = _THRESHOLD,
     floor: float = _FLOOR,
@@ -53,11 +53,11 @@ def single_colour(
     """Triangles of nearly one colour become one texel each, the same for all that are nearly alike; others stay.
 
     Args:
-        mesh: The mesh and its lightmap.
+        scene: A scene of one lightmap.
         threshold: How far a triangle's colours may be from their middle in any channel, see the module. A group's
             colours are within four times that of each other.
         floor: PSNR in dB of each view, see the module, but for what changes as groups lose triangles; -inf: none.
-        views: Number of views, as of `wlm.atlas.views.mesh_views`.
+        views: Number of views, as of `wlm.atlas.views.scene_views`.
         resolution: Pixels along a side of a view.
 
     Raises:
@@ -65,17 +65,17 @@ def single_colour(
     """
     if not threshold >= 0.0:
         raise ValueError(f"threshold: expected at least 0, got {threshold}")
-    start = time.perf_counter()
-    exposure = screen_exposure(mesh)
+    start, (mesh,) = time.perf_counter(), scene.sheets
+    exposure = exposure_of(mesh.lightmap[mesh.mask])
     low, high, mean = _colours(mesh, exposure)
     flat = mesh.active & (((high - low) / 2.0).max(axis=1) <= threshold)
     cell = (low + high) / 2.0
     if threshold > 0.0:
         cell = np.floor(cell / (2.0 * threshold))
-    image = mesh.filled.astype(np.float16).astype(np.float32)
+    image = mesh.lightmap.astype(np.float16).astype(np.float32)
     groups = _Groups(mesh, flat, cell, mean, image)
     if floor > -math.inf and flat.any():
-        wrong = _wrong_triangles(mesh, groups, exposure, floor, views, resolution)
+        wrong = _wrong_triangles(scene, groups, exposure, floor, views, resolution)
         groups = _Groups(mesh, flat & ~wrong, cell, mean, image)
     return Rival("single colour", groups.texels * SOURCE_BITS // 8, time.perf_counter() - start, None, groups)
 
@@ -85,12 +85,10 @@ class _Groups:
 
     Attributes:
         colour: int64 [F], the number of each triangle's colour, -1 for none.
-        texels: How many there are, of colours and of triangles that stay.
+        texels: Number of texels of the colours and of the triangles that stay.
     """
 
-    def __init__(
-        self, mesh: LightmappedMesh, flat: np.ndarray, cell: np.ndarray, mean: np.ndarray, image: np.ndarray
-    ) -> None:
+    def __init__(self, mesh: Sheet, flat: np.ndarray, cell: np.ndarray, mean: np.ndarray, image: np.ndarray) -> None:
         self.colour = np.full(len(flat), -1)
         number = np.unique(cell[flat], axis=0, return_inverse=True)[1].reshape(-1)
         self.colour[flat] = number
@@ -100,16 +98,16 @@ class _Groups:
         area = np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
         light = [np.bincount(number, area * channel, count) for channel in mean[flat].T]
         palette = np.stack(light, 1) / np.bincount(number, area, count)[:, None]
-        # The last is of triangles without: it isn't read.
+        # The last entry stands for triangles without a colour; it isn't read.
         self._palette = torch.tensor(np.concatenate([palette, np.zeros((1, 3))]).astype(np.float16).astype(np.float32))
         self._image = torch.tensor(image)
         stays = mesh.triangle[mesh.active & ~flat]
         self.texels = count + int(np.count_nonzero(touched_texels(mesh.uv, stays, *mesh.mask.shape)))
 
-    def __call__(self, uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        device = uv.device
-        colour = torch.tensor(self.colour, device=device)[triangle.long()]
-        read = raster.texture(self._image.to(device), uv)
+    def __call__(self, points: Points, state: int) -> torch.Tensor:
+        device = points.uv.device
+        colour = torch.tensor(self.colour, device=device)[points.triangle]
+        read = raster.texture(self._image.to(device), points.uv)
         return torch.where(colour[:, None] >= 0, self._palette.to(device)[colour], read)
 
 
@@ -119,36 +117,36 @@ def _coded(light: np.ndarray | torch.Tensor, exposure: float) -> np.ndarray | to
 
 
 def _wrong_triangles(
-    mesh: LightmappedMesh, groups: _Groups, exposure: float, floor: float, views: int, resolution: int
+    scene: LightmappedScene, groups: _Groups, exposure: float, floor: float, views: int, resolution: int
 ) -> np.ndarray:
     """The triangles without whose errors every view has a PSNR of at least `floor`: bool [F]."""
+    (mesh,) = scene.sheets
     wrong = np.zeros(len(mesh.triangle), bool)
-    image = torch.tensor(mesh.filled)
+    image = torch.tensor(mesh.lightmap)
     most = 10.0 ** (-floor / 10.0) * 3 * resolution**2
     with one_thread("cpu"):
-        for visible, _, uv in visible_uv(mesh, mesh_views(mesh, views, _SEED), resolution, "cpu"):
-            hit = visible >= 0
-            triangle, uv = visible[hit], uv[hit]
-            light = groups(uv, triangle, uv), raster.texture(image, uv)
+        for drawn in visible_uv(scene, scene_views(scene, views, _SEED), resolution, "cpu"):
+            points = points_at(scene, *drawn)[1]
+            light = groups(points, 0), raster.texture(image, points.uv)
             error = (_coded(light[0], exposure) - _coded(light[1], exposure)).double().square().sum(1).numpy()
-            triangle = triangle.numpy()
+            triangle = points.triangle.numpy()
             error[wrong[triangle]] = 0.0
             worst, total = np.zeros(len(wrong)), np.bincount(triangle, error, len(wrong))
             np.maximum.at(worst, triangle, error)
             order = np.argsort(-worst, kind="stable")
-            # What is left without the first triangle, the first two, and so on; at last nothing.
+            # The error without the first triangle, the first two, and so on, down to nothing.
             left = np.append(np.cumsum(total[order[::-1]])[-2::-1], 0.0)
             if total.sum() > most:
                 wrong[order[: int(np.argmax(left <= most)) + 1]] = True
-    # Those that keep their texels have errors of rounding alone.
+    # Triangles that keep their texels have errors of rounding alone.
     return wrong & (groups.colour >= 0)
 
 
-def _colours(mesh: LightmappedMesh, exposure: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _colours(mesh: Sheet, exposure: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least and largest coded colours of each triangle, and its mean light: float64 [F, 3] each, of points that are a
     texel or less apart."""
     height, width = mesh.mask.shape
-    image = torch.tensor(mesh.filled)
+    image = torch.tensor(mesh.lightmap)
     corner = mesh.uv[mesh.triangle]
     edge = (corner - np.roll(corner, 1, axis=1)) * [width, height]
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(axis=1)

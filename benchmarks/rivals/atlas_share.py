@@ -1,22 +1,22 @@
-"""What a texture of a rival of an atlas costs: shares of a lightmap's bits, and the texels and blocks that are read."""
+"""The cost of a rival's texture: shares of a lightmap's bits, and the texels and blocks that are read."""
 
 import math
 
 import numpy as np
 
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import Sheet
 from wlm.atlas.model import SOURCE_BITS
 
 
-def budget_bits(mesh: LightmappedMesh, share: float) -> int:
-    """The bits of a share of a lightmap at 48 a texel.
+def budget_bits(sheet: Sheet, share: float) -> int:
+    """The bits of a share of a lightmap at 48 per texel.
 
     Raises:
         ValueError: The share isn't above 0.
     """
     if not 0.0 < share < math.inf:
         raise ValueError(f"share: expected above 0, got {share}")
-    return int(share * mesh.mask.size * SOURCE_BITS)
+    return int(share * sheet.mask.size * SOURCE_BITS)
 
 
 def read_blocks(place: np.ndarray, size: tuple[int, int], block: tuple[int, int] = (1, 1)) -> int:

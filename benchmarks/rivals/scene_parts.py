@@ -1,8 +1,7 @@
-"""A scene's parts: the lightmap of each object and state by itself, as `standard` of one lightmap compresses it.
+"""A scene's parts: each lightmap, of one object in one state, compressed alone as `standard` does it.
 
-What a scene costs without `wlm.atlas.scene`: each part has tiles, a table and textures of its own, and its share of
-the bits by its texels. Tiles are fitted in all parts at once, with the scene's own weights: views of the whole scene,
-which none of them knows by itself, and in which they are scored.
+They are the rival of shared tiles: each part has its own tiles and textures, and its share of the bits by its texels.
+Tiles are fitted in all parts at once, with the weights of the scene's views, in which the parts are scored.
 """
 
 import math
@@ -12,30 +11,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.fit import with_fallback
-from wlm.atlas.layout import Layout, Size, layout, sizes_of
-from wlm.atlas.model import LUT_BITS, SOURCE_BITS, AtlasModel, Profile, compression_ratio, tile_counts
-from wlm.atlas.scene.data import LightmappedScene
+from wlm.atlas.model import BLOCKS, COLOUR_BITS, LUT_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile, tile_counts
 from wlm.atlas.stages import one_thread
-from wlm.atlas.tiles import Tiles, composed_model, curves, cut, least_gain, solved
+from wlm.atlas.tiles.fit import Tiles, composed_model, curves, cut, least_gain, solved
+from wlm.atlas.tiles.layout import Layout, Size, layout, sizes_of
+from wlm.atlas.views import Points
 from wlm.atlas.weights import FineGrid
 
-_TRIES, _CLOSE = 8, 1.005  # of finding the share whose bits are those that are asked for, and how close is enough
+_FORMATS = (TEXELS, BLOCKS)  # of the textures of the colours that scenes have
+_TRIES, _CLOSE = (
+    8,
+    1.005,
+)  # attempts to find the share with the bits that are asked for, and the ratio that is close enough
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A sheet's lightmap in one state, and its tiles among those of all parts."""
+    """A sheet's lightmap in one state, as a scene, and the range of its tiles among those of all parts."""
 
-    mesh: LightmappedMesh
+    scene: LightmappedScene
     sheet: int
     tiles: slice
-
-    @property
-    def texels(self) -> int:
-        return self.mesh.mask.size
 
 
 class SceneParts:
@@ -43,7 +42,7 @@ class SceneParts:
 
     Attributes:
         models: By sheet and state.
-        share: Of each lightmap's bits at 48 a texel, the budget of each part.
+        share: The budget of each part, as a fraction of its lightmap's bits at 48 per texel.
     """
 
     def __init__(self, models: list[list[AtlasModel]], share: float, device: str) -> None:
@@ -52,16 +51,16 @@ class SceneParts:
 
     @property
     def bits(self) -> float:
-        """Of all textures and tables."""
+        """Bits of all textures."""
         models = (model for of_sheet in self.models for model in of_sheet)
-        return sum(SOURCE_BITS * model.height * model.width * (1.0 - model.compression_ratio) for model in models)
+        return sum(model.bits for model in models)
 
-    def read(self, uv: torch.Tensor, sheet: torch.Tensor, state: int) -> torch.Tensor:
-        """A `SceneSampler`."""
-        light = torch.zeros((len(uv), 3), dtype=torch.float32, device=uv.device)
-        for number in torch.unique(sheet).tolist():
-            at = sheet == number
-            light[at] = self._decoders[number][state].read(uv[at].contiguous())
+    def __call__(self, points: Points, state: int) -> torch.Tensor:
+        """Reads light at points; a `Sampler`."""
+        light = torch.zeros((len(points), 3), dtype=torch.float32, device=points.uv.device)
+        for number in torch.unique(points.sheet).tolist():
+            at = points.sheet == number
+            light[at] = self._decoders[number][state].read(points.uv[at].contiguous())
         return light
 
 
@@ -72,13 +71,13 @@ def scene_parts(
     colour: str = "mixed",
     device: str = "cpu",
 ) -> SceneParts:
-    """Compresses each part by itself.
+    """Compresses each part alone.
 
     Args:
         scene: The scene.
         weights: For each sheet [2 H, 2 W], how much each quarter of a texel counts, `scene_weights`.
-        bits: Of all parts, which have that many at least, but for plain ones, and as few more as their sizes allow.
-        colour: Instead of that of `standard`.
+        bits: Bits of all parts; except for plain ones they have at least these, and as few more as their sizes allow.
+        colour: The colour in place of that of `standard`.
         device: "cpu" or "cuda:N".
 
     Returns:
@@ -94,7 +93,7 @@ def _compressed(
     tiles, parts = _cut(scene, weights, profile, device)
     sizes = sizes_of(profile)
     error = torch.from_numpy(curves(tiles, sizes))
-    share, tries = bits / scene.source_bits, []
+    share, tries = bits / (scene.texels * SOURCE_BITS), []
     for _ in range(_TRIES):
         placed = [_placed(error[:, part.tiles], sizes, part, share, profile) for part in parts]
         taken = sum(_bits(each, part, share, profile) for each, part in zip(placed, parts, strict=True))
@@ -111,25 +110,26 @@ def _compressed(
     models: list[list[AtlasModel]] = [[] for _ in scene.sheets]
     settings = profile.model_copy(update={"budget": share})
     for number, (part, each) in enumerate(zip(parts, placed, strict=True)):
-        grid, model = FineGrid(part.mesh, device), None
+        grid, model = FineGrid(part.scene.sheets[0], device), None
         if each is not None:
             index = tiles.index[part.tiles].cpu().numpy()
-            model = composed_model(part.mesh, settings, samples[number], sizes, each, index, device)
+            model = composed_model(part.scene, settings, samples[number], sizes, each, index, device)
         weight = torch.from_numpy(weights[part.sheet]).to(device)
-        models[part.sheet].append(with_fallback(grid, model, settings, weight))
+        models[part.sheet].append(with_fallback(part.scene, grid, model, settings, weight))
     return SceneParts(models, share, device)
 
 
 def _cut(
     scene: LightmappedScene, weights: Sequence[np.ndarray], profile: Profile, device: str
 ) -> tuple[Tiles, list[_Part]]:
-    """The tiles of all parts, of which each has weights that add up to 1; and the parts, sheet by sheet."""
+    """Cuts the tiles of all parts, each with weights that add up to 1; and lists the parts, sheet by sheet."""
     pieces, parts, first = [], [], 0
     for number, (sheet, weight) in enumerate(zip(scene.sheets, weights, strict=True)):
-        for frame in sheet.frames:
-            piece = cut(frame, weight, profile.tile, device)
+        for state, lightmap in zip(scene.states, sheet.lightmaps, strict=True):
+            piece = cut(lightmap, weight, profile.tile, device)
             after = first + len(piece.index)
-            parts.append(_Part(replace(sheet.mesh, lightmap=frame), number, slice(first, after)))
+            alone = replace(scene, states=(state,), sheets=(replace(sheet, lightmaps=lightmap[None]),))
+            parts.append(_Part(alone, number, slice(first, after)))
             pieces.append(piece)
             first = after
     together = (torch.cat([getattr(piece, name) for piece in pieces]) for name in ("index", "light", "weight"))
@@ -137,26 +137,30 @@ def _cut(
 
 
 def _placed(error: torch.Tensor, sizes: list[Size], part: _Part, share: float, profile: Profile) -> Layout | None:
-    room = share * part.texels * SOURCE_BITS - math.prod(tile_counts(*part.mesh.mask.shape, profile.tile)) * LUT_BITS
+    room = (
+        share * part.scene.texels * SOURCE_BITS
+        - math.prod(tile_counts(*part.scene.sheets[0].mask.shape, profile.tile)) * LUT_BITS
+    )
     if room < error.shape[1] * min(size.bits for size in sizes):
         return None
-    return layout(error, sizes, room, least_gain(part.mesh))
+    return layout(error, sizes, room, least_gain(part.scene.sheets[0]))
 
 
 def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) -> float:
-    """Of a part's textures and table; about, where it becomes a smaller lightmap."""
-    size = part.mesh.mask.shape
+    """Bits of a part's textures; an estimate where it becomes a smaller lightmap."""
+    size = part.scene.sheets[0].mask.shape
     if placed is None:
-        return share * part.texels * SOURCE_BITS
-    table = tile_counts(*size, profile.tile)
-    second = placed.shapes[1:] or ((0, 0),)
-    return part.texels * SOURCE_BITS * (1.0 - compression_ratio(placed.shapes[0], table, size, profile.colour, *second))
+        return share * part.scene.texels * SOURCE_BITS
+    bits = math.prod(tile_counts(*size, profile.tile)) * LUT_BITS
+    return bits + sum(
+        math.prod(shape) * COLOUR_BITS[each] for shape, each in zip(placed.shapes, _FORMATS, strict=False)
+    )
 
 
 def _by_part(
     samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]], parts: list[_Part]
 ) -> list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]]:
-    """What `solved` has of all tiles, for each part with its own numbers of tiles."""
+    """Splits the result of `solved` by parts, each with its own numbers of tiles."""
     ends = np.array([part.tiles.stop for part in parts])
     result: list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]] = [[] for _ in parts]
     for members, values, weight in samples:

@@ -8,10 +8,13 @@ import torch
 from builders.atlas_meshes import charts, sheet, write_files
 from builders.atlas_models import KINDS, MIXED
 
+import wlm
 from wlm.atlas.decode import Decoder
 from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
-from wlm.atlas.model import AtlasModel, Profile
+from wlm.atlas.model import AtlasModel, Profile, SheetPlace
+from wlm.atlas.stored import store
+from wlm.atlas.views import Points
 from wlm.errors import WlmError
 
 FEW = {"views": 2, "fallback": False}
@@ -20,8 +23,9 @@ FEW = {"views": 2, "fallback": False}
 def model_of(mesh, method: str, texels: np.ndarray, **parts: np.ndarray) -> AtlasModel:
     """A model with the given textures and UVs."""
     profile = Profile(name=method, method="cascade")
-    texels = texels.astype(np.float16)
-    return AtlasModel(mesh.name, mesh.source, profile, method, "half", *mesh.mask.shape, texels, **parts)
+    texels, places = texels.astype(np.float16)[None], (SheetPlace(mesh.name, *mesh.sheets[0].mask.shape),)
+    settings = (mesh.name, mesh.source, profile, method, "half", mesh.states, places, texels)
+    return AtlasModel(*settings, stored=store(mesh), **parts)
 
 
 @cache
@@ -29,25 +33,26 @@ def models(make_mesh) -> dict[str, AtlasModel]:
     """For a mesh one model of each method, and a plain one under new UVs."""
     mesh, random = make_mesh(), np.random.default_rng(0)
     texels = random.random((11, 17, 3))
-    uv = (1.0 - mesh.uv[mesh.triangle])[..., ::-1].astype(np.float32)
+    uv = (1.0 - mesh.sheets[0].uv[mesh.sheets[0].triangle])[..., ::-1].astype(np.float32)
     lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     return {
-        "tiles": compress(mesh, "half", **FEW),
+        "tiles": compress(mesh, "standard", colour="half", tile=7, **FEW),
         MIXED: compress(mesh, "standard", **FEW),
         "cascade": model_of(mesh, "cascade", texels, lut=lut, uv=uv),
         "plain": model_of(mesh, "plain", texels),
-        "plain with uv": model_of(mesh, "plain", mesh.lightmap[::-1, ::-1].transpose(1, 0, 2), uv=uv),
+        "plain with uv": model_of(mesh, "plain", mesh.sheets[0].lightmap[::-1, ::-1].transpose(1, 0, 2), uv=uv),
     }
 
 
-def points(mesh, count: int = 500) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Random points on the mesh: UVs, triangles and weights."""
-    random = np.random.default_rng(1)
-    triangle = random.integers(0, len(mesh.triangle), count)
+def points(mesh, count: int = 500, device: str = "cpu") -> Points:
+    """Random points on the mesh."""
+    random, (own,) = np.random.default_rng(1), mesh.sheets
+    triangle = random.integers(0, len(own.triangle), count)
     weight = random.dirichlet([1.0, 1.0, 1.0], count)
-    uv = (mesh.uv[mesh.triangle[triangle]] * weight[:, :, None]).sum(1)
-    return tuple(torch.tensor(part, dtype=kind) for part, kind in
-                 ((uv, torch.float32), (triangle, torch.int32), (weight, torch.float32)))  # fmt: skip
+    uv = (own.uv[own.triangle[triangle]] * weight[:, :, None]).sum(1)
+    kinds = torch.float32, torch.int32, torch.int64, torch.float32
+    parts = zip((uv, 0 * triangle, triangle, weight), kinds, strict=True)
+    return Points(*(torch.tensor(part, dtype=kind, device=device) for part, kind in parts))
 
 
 @pytest.mark.parametrize("name", [*KINDS, MIXED])
@@ -57,7 +62,7 @@ def test_against_float64(device: str, name: str):
     uv = random.uniform(-0.1, 1.1, (2000, 2)).astype(np.float32)
     if model.method == "tiles":
         # A point on a border of tiles may be read from either.
-        place = (uv * [mesh.mask.shape[1], mesh.mask.shape[0]] - 0.5) / model.profile.tile
+        place = (uv * [mesh.sheets[0].mask.shape[1], mesh.sheets[0].mask.shape[0]] - 0.5) / model.profile.tile
         uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
     expected = decode64(model, uv)
     decoder = model.decoder(device)
@@ -73,7 +78,7 @@ def test_two_references_agree():
 
     model = models(sheet)["tiles"]
     uv = np.random.default_rng(3).random((300, 2))
-    expected = reference.decode(uv, model.height, model.width, model.profile.tile, model.lut, model.texels)
+    expected = reference.decode(uv, *model.sheets[0].size, model.profile.tile, model.lut, model.texels[0])
     np.testing.assert_allclose(decode64(model, uv), expected, atol=1e-12)
 
 
@@ -81,12 +86,12 @@ def test_a_sampler_takes_the_meshs_own_uvs(device: str):
     """A model with new UVs interpolates them by triangle and weights; one without reads at the mesh's."""
     mesh = sheet()
     for name, model in models(sheet).items():
-        uv, triangle, weight = points(mesh)
-        model_uv = uv
+        drawn = points(mesh)
+        model_uv = drawn.uv
         if len(model.uv):
-            model_uv = torch.tensor((model.uv[triangle.numpy()] * weight.numpy()[:, :, None]).sum(1))
+            model_uv = torch.tensor((model.uv[drawn.triangle.numpy()] * drawn.weight.numpy()[:, :, None]).sum(1))
         decoder = Decoder(model, device)
-        light = decoder(uv.to(device), triangle.to(device), weight.to(device))
+        light = decoder(points(mesh, device=device))
         assert torch.allclose(light, decoder.read(model_uv.to(device)), atol=1e-4), name
 
 
@@ -94,10 +99,10 @@ def test_new_uvs_show_the_same_light(device: str):
     """A lightmap turned by its UVs and by its texels alike is the lightmap."""
     mesh = sheet()
     decoder = Decoder(models(sheet)["plain with uv"], device)
-    parts = [part.to(device) for part in points(mesh)]
-    expected = decode64(model_of(mesh, "plain", mesh.lightmap), parts[0].cpu().numpy())
-    np.testing.assert_allclose(decoder(*parts).cpu().numpy(), expected, atol=2e-4)
-    np.testing.assert_allclose(decoder.lightmap(mesh), mesh.lightmap, atol=2e-3)
+    drawn = points(mesh, device=device)
+    expected = decode64(model_of(mesh, "plain", mesh.sheets[0].lightmap), drawn.uv.cpu().numpy())
+    np.testing.assert_allclose(decoder(drawn).cpu().numpy(), expected, atol=2e-4)
+    np.testing.assert_allclose(decoder.lightmap(), mesh.sheets[0].lightmap, atol=2e-3)
 
 
 def test_the_lightmap_in_its_own_layout(device: str):
@@ -105,23 +110,21 @@ def test_the_lightmap_in_its_own_layout(device: str):
     mesh = charts()
     for name, model in models(charts).items():
         decoder = Decoder(model, device)
-        decoded = decoder.lightmap(mesh)
-        assert decoded.shape == mesh.lightmap.shape and decoded.dtype == np.float32
-        assert not decoded[~mesh.mask].any() and (decoded[mesh.mask] > 0).any(), name
+        decoded = decoder.lightmap()
+        assert decoded.shape == mesh.sheets[0].lightmap.shape and decoded.dtype == np.float32
+        assert not decoded[~mesh.sheets[0].mask].any() and (decoded[mesh.sheets[0].mask] > 0).any(), name
         if not len(model.uv):
-            row, column = np.nonzero(mesh.mask)
-            uv = np.stack([column + 0.5, row + 0.5], 1) / mesh.mask.shape[::-1]
+            row, column = np.nonzero(mesh.sheets[0].mask)
+            uv = np.stack([column + 0.5, row + 0.5], 1) / mesh.sheets[0].mask.shape[::-1]
             light = decoder.read(torch.tensor(uv, dtype=torch.float32, device=device)).cpu().numpy()
             np.testing.assert_array_equal(decoded[row, column], light)
     exact = models(charts)["plain with uv"]
     # A texel with its centre in no triangle has its neighbour's light.
-    assert np.abs(Decoder(exact, device).lightmap(mesh) - mesh.lightmap)[mesh.mask].mean() < 0.02
+    assert np.abs(Decoder(exact, device).lightmap() - mesh.sheets[0].lightmap)[mesh.sheets[0].mask].mean() < 0.02
 
 
 def test_the_front_door(tmp_path, monkeypatch):
     """The snippet of the README, as it stands there."""
-    import wlm
-
     glb, exr = write_files(tmp_path, sheet())
     glb.rename(tmp_path / "room.glb"), exr.rename(tmp_path / "room.exr")
     monkeypatch.chdir(tmp_path)
@@ -135,16 +138,18 @@ def test_the_front_door(tmp_path, monkeypatch):
     model.save("room.wlm")
     assert torch.equal(wlm.load("room.wlm").decoder("cpu").read(uv), light)
     assert wlm.atlas.evaluate(model, mesh, views=2, resolution=64).psnr > 30.0
-    assert wlm.atlas.export(model, "engine", mesh)[-1].name == "report.json"
+    assert "colour" in model.bundle().textures and "mesh.glb" in model.bundle().files
     assert all(getattr(wlm.atlas, name) is not None for name in wlm.atlas.__all__)
 
 
 def test_another_mesh_is_refused():
     model = models(sheet)["tiles"]
-    line = "sheet: expected the mesh and lightmap that the model was made of"
-    for mesh in (sheet(height=41), sheet(lambda place: place[..., :1] * np.ones(3)), sheet(quads=5)):
-        with pytest.raises(WlmError, match=line):
-            Decoder(model).lightmap(mesh)
+    with pytest.raises(WlmError, match="sheet: expected the sheet that the model was made of"):
+        Decoder(model).texels(sheet(height=41).sheets[0])
+    with pytest.raises(WlmError, match="sheet: expected the scene that the model was made of, source"):
+        wlm.atlas.evaluate(model, sheet(quads=5))
+    with pytest.raises(ValueError, match="state: expected 0 to 0, got 1"):
+        Decoder(model).read(torch.zeros((1, 2)), 0, 1.0)
     with pytest.raises(WlmError, match="device 'tpu'"):
         Decoder(model, "tpu")
 
@@ -157,7 +162,7 @@ def test_reading_into_an_existing_array(device: str):
 
     for model in models(sheet).values():
         decoder = Decoder(model, device)
-        uv = points(sheet())[0].to(device)
+        uv = points(sheet(), device=device).uv
         out = torch.full((len(uv), 3), -1.0, device=device)
         decoder.run(interop.to_warp(uv, wp.vec2), out)
         wp.synchronize()

@@ -11,9 +11,9 @@ from builders.atlas_models import random_model
 from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
 from wlm import metrics
-from wlm.atlas.data import from_arrays
+from wlm.atlas.data import from_arrays, join
 from wlm.atlas.evaluation import compare, evaluate
-from wlm.atlas.views import mesh_charts, visible_uv
+from wlm.atlas.views import sheet_charts, visible_uv
 from wlm.errors import WlmError
 from wlm.ops import raster
 from wlm.ops.views import View, sphere_views
@@ -26,10 +26,10 @@ SQUARE_UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
 
 def _reader(mesh, change=lambda colour, uv, triangle: colour):
     """Decodes what the reference holds, with a change."""
-    image = torch.tensor(mesh.filled)
+    image = torch.tensor(mesh.sheets[0].lightmap)
 
-    def sample(uv, triangle, barycentric):
-        return change(raster.texture(image.to(uv.device), uv), uv, triangle)
+    def sample(points, state=0):
+        return change(raster.texture(image.to(points.uv.device), points.uv), points.uv, points.triangle)
 
     return sample
 
@@ -53,8 +53,8 @@ def test_the_reference_is_exact(device):
 
 def test_an_upside_down_lightmap_is_terrible():
     mesh = lit_cube()
-    image = torch.tensor(mesh.filled).flip(0).contiguous()
-    report = _one(mesh, lambda uv, triangle, barycentric: raster.texture(image, uv), views=12)
+    image = torch.tensor(mesh.sheets[0].lightmap).flip(0).contiguous()
+    report = _one(mesh, lambda points, state: raster.texture(image, points.uv), views=12)
     assert report.psnr < 12.0 and report.texel_psnr < 12.0 and report.one_minus_ssim > 0.5
 
 
@@ -63,7 +63,7 @@ def test_a_known_error(device):
     report = _one(mesh, _reader(mesh, _offset(0.01)), device=device)
     colours = []
     for visible, _, uv in visible_uv(mesh, FACES, 64, "cpu"):
-        colours.append(raster.texture(torch.tensor(mesh.filled), uv[visible >= 0]))
+        colours.append(raster.texture(torch.tensor(mesh.sheets[0].lightmap), uv[visible >= 0]))
     peak = float(torch.cat(colours).max() - torch.cat(colours).min())
     expected = 20.0 * math.log10(peak / 0.01)
     assert report.peak == pytest.approx(peak, rel=1e-6) and 1.5 < peak < 2.1
@@ -77,13 +77,13 @@ def test_against_the_metrics_of_pictures(device, resolution):
     mesh, views = lit_cube(3), sphere_views(4, seed=3)
     small = torch.tensor(waves(12, 18))
 
-    def blurred(uv, triangle, barycentric):
-        return raster.texture(small.to(uv.device), uv)
+    def blurred(points, state):
+        return raster.texture(small.to(points.uv.device), points.uv)
 
     report = _one(mesh, blurred, views=views, resolution=resolution, device=device)
     psnr, ssim = [], []
     for visible, _, uv in visible_uv(mesh, views, resolution, "cpu"):
-        images = torch.tensor(mesh.filled), small
+        images = torch.tensor(mesh.sheets[0].lightmap), small
         pictures = [raster.texture(image, uv).numpy() for image in images]
         psnr.append(metrics.psnr(*pictures, visible.numpy() >= 0, peak=report.peak))
         ssim.append(metrics.ssim(*pictures, visible.numpy() >= 0, data_range=report.peak))
@@ -112,7 +112,7 @@ def test_decoders_do_not_mix():
 
 def test_charts():
     mesh = lit_cube(2)
-    number = mesh_charts(mesh)
+    number = sheet_charts(mesh.sheets[0])
     assert number.shape == (48,) and len(set(number)) == 6
     assert (number.reshape(6, 8) == number[::8, None]).all()
     # Vertices of their own at equal places make no border; one place in UV with another in space does, and the reverse.
@@ -122,11 +122,11 @@ def test_charts():
         (SQUARE[TWO].reshape(6, 3) + np.repeat([[0], [1.0]], 3, 0), SQUARE_UV[TWO].reshape(6, 2), 2),
         (SQUARE[TWO].reshape(6, 3), SQUARE_UV[TWO].reshape(6, 2) * np.repeat([[1], [0.5]], 3, 0), 2),
     ):
-        assert len(set(mesh_charts(from_arrays(position, six, uv, waves())))) == count
+        assert len(set(sheet_charts(from_arrays(position, six, uv, waves()).sheets[0]))) == count
     # A shared corner alone doesn't join; a triangle without area is in none.
     fan = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], np.float64)
     mesh = from_arrays(fan, np.array([[0, 1, 2], [1, 2, 2], [0, 3, 4]]), fan[:, :2] * 0.5 + 0.5, waves())
-    assert mesh_charts(mesh).tolist() == [0, -1, 1]
+    assert sheet_charts(mesh.sheets[0]).tolist() == [0, -1, 1]
 
 
 def test_errors_beside_seams_stand_out():
@@ -155,8 +155,8 @@ def test_seams_of_tiles_by_labels(device):
     mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves())
     decoder = _reader(mesh, lambda colour, uv, t: torch.where((uv[:, :1] - 0.5).abs() < 0.02, colour + 1.0, colour))
 
-    def tiles(uv, triangle, barycentric):
-        return (uv[:, 0] * 4).int()
+    def tiles(points):
+        return (points.uv[:, 0] * 4).int()
 
     options = {"views": [View.of([0, 0, 1])], "resolution": 96, "device": device}
     plain = compare(mesh, {"a": decoder, "b": decoder}, labels={"b": tiles}, **options)
@@ -210,13 +210,13 @@ def test_a_models_report_is_its_score_and_its_size(device, kind):
     mesh = sheet()
     model, options = random_model(mesh, kind), {"views": 3, "resolution": 64, "device": device}
     report = evaluate(model, mesh, **options)
-    labels = {} if kind == "tiles" else {"it": lambda uv, triangle, barycentric: triangle}  # a chart per triangle
+    labels = {} if kind == "tiles" else {"it": lambda points: points.triangle}  # a chart per triangle
     score = compare(mesh, {"it": model.decoder(device)}, labels=labels, **options)["it"]
     assert {name: report.to_json()[name] for name in score.to_json()} == score.to_json()
     assert math.isnan(report.seam_ratio) == (kind == "tiles")
-    assert (report.method, report.profile, report.bytes) == (model.method, "random", model.file_bytes())
+    assert (report.method, report.profile, report.gpu_bytes) == (model.method, "random", -(-model.bits // 8))
+    assert report.bytes + report.geometry_bytes == model.file_bytes()
     assert (report.cr, report.cr_disk) == (model.compression_ratio, 1 - report.bytes * 8 / (40 * 48 * 48))
-    assert evaluate(model, mesh, **options, file_bytes=11520).cr_disk == 0.0
 
 
 def test_texels_in_the_mask_count(device):
@@ -224,20 +224,21 @@ def test_texels_in_the_mask_count(device):
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[:, : WIDTH // 2] = True
     mesh = from_arrays(SQUARE, TWO, SQUARE_UV, waves(), mask=mask)
-    image = torch.tensor(mesh.filled)
+    image = torch.tensor(mesh.sheets[0].lightmap)
     calls = []
 
-    def decoder(uv, triangle, barycentric):
-        calls.append((uv.cpu(), triangle.cpu(), barycentric.cpu()))
-        return raster.texture(image.to(uv.device), uv) + 0.1 * (uv[:, :1] > 0.5)
+    def decoder(points, state):
+        calls.append((points.uv.cpu(), points.triangle.cpu(), points.weight.cpu()))
+        return raster.texture(image.to(points.uv.device), points.uv) + 0.1 * (points.uv[:, :1] > 0.5)
 
     report = _one(mesh, decoder, views=[View.of([0, 0, 1])], device=device)
     assert report.texel_psnr == metrics.PSNR_CAP_DB and report.psnr < 40.0
     uv, triangle, barycentric = calls[-1]
     row, column = np.nonzero(mask)
     np.testing.assert_allclose(uv, np.stack([(column + 0.5) / WIDTH, (row + 0.5) / HEIGHT], 1), rtol=1e-6)
-    assert triangle.dtype == torch.int32 and barycentric.shape == (len(uv), 3)
-    weighted = (torch.tensor(mesh.uv)[mesh.triangle[triangle]] * barycentric[..., None]).sum(1)
+    assert triangle.dtype == torch.int64 and barycentric.shape == (len(uv), 3)
+    (own,) = mesh.sheets
+    weighted = (torch.tensor(own.uv)[own.triangle[triangle]] * barycentric[..., None]).sum(1)
     np.testing.assert_allclose(weighted, uv, atol=1e-6)
 
 
@@ -251,7 +252,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="labels: expected names of decoders, got other"):
         _one(mesh, _reader(mesh), labels={"other": _reader(mesh)})
     with pytest.raises(ValueError, match="it: expected labels"):
-        _one(mesh, _reader(mesh), labels={"it": lambda uv, t, b: uv[:, 0]})
+        _one(mesh, _reader(mesh), labels={"it": lambda points: points.uv[:, 0]})
     with pytest.raises(WlmError, match="gpu"):
         _one(mesh, _reader(mesh), device="gpu")
 
@@ -265,9 +266,9 @@ def test_progress():
 def test_threads_are_given_back():
     mesh, before, inside = lit_cube(1), torch.get_num_threads(), []
 
-    def decoder(uv, triangle, barycentric):
+    def decoder(points, state):
         inside.append(torch.get_num_threads())
-        return uv
+        return points.uv
 
     try:
         torch.set_num_threads(2)
@@ -276,3 +277,41 @@ def test_threads_are_given_back():
         assert inside == [1] and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_states_are_scored_one_by_one(device):
+    """Each has its own peak, and an error in one of them is an error of that one alone."""
+    mesh = lit_cube()
+    own = mesh.sheets[0]
+    scene = from_arrays(own.position, own.triangle, own.uv, np.stack([own.lightmap, 0.5 * own.lightmap]), own.mask)
+    images = torch.tensor(scene.sheets[0].lightmaps, device=device)
+
+    def decoder(points, state):
+        return raster.texture(images[state], points.uv) + 0.01 * state
+
+    report = compare(scene, {"it": decoder}, views=FACES, resolution=64, device=device)["it"]
+    assert report.peaks[1] == pytest.approx(0.5 * report.peaks[0], rel=1e-5) and report.views == 6
+    assert report.psnr_by_state[0] == metrics.PSNR_CAP_DB
+    assert report.psnr_by_state[1] == pytest.approx(20.0 * math.log10(report.peaks[1] / 0.01), abs=1e-3)
+    assert report.psnr == pytest.approx(np.mean(report.psnr_by_state))
+
+
+def test_sheets_are_scored_together():
+    """Triangles of a second sheet have its light, and hide what is behind them."""
+    near = from_arrays(SQUARE + [0, 0, 1.0], TWO, SQUARE_UV, waves(), name="near")
+    far = from_arrays(SQUARE * 0.5, TWO, SQUARE_UV, 2.0 * waves(), name="far")
+    scene = join([near, far])
+    images = [torch.tensor(each.lightmap) for each in scene.sheets]
+
+    def decoder(points, state):
+        assert set(points.sheet.tolist()) <= {0, 1}
+        light = torch.empty(len(points), 3)
+        for number, image in enumerate(images):
+            at = points.sheet == number
+            light[at] = raster.texture(image, points.uv[at].contiguous())
+        return light
+
+    report = compare(scene, {"it": decoder}, views=[View.of([0, 0, 1]), View.of([0, 0, -1])], resolution=64)["it"]
+    assert report.psnr == report.texel_psnr == metrics.PSNR_CAP_DB and report.views == 2
+    ((visible, _, _),) = visible_uv(scene, [View.of([0, 0, 1])], 64, "cpu")
+    assert set(visible.unique().tolist()) == {-1, 0, 1}

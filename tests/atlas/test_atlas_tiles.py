@@ -6,22 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from wlm.atlas import layout as allocation
-from wlm.atlas import tiles as grid
 from wlm.atlas.colour import quantise, stored
 from wlm.atlas.decode import Decoder
-from wlm.atlas.layout import Size
 from wlm.atlas.model import (
     FIRST_BLOCK_CODE,
     MOST_SIZE,
     NO_BLOCKS,
     AtlasModel,
     Profile,
+    SheetPlace,
     first_block_code,
     pack_entries,
     tile_counts,
     unpack_entries,
 )
+from wlm.atlas.tiles import fit as grid
+from wlm.atlas.tiles import layout as allocation
+from wlm.atlas.tiles.layout import Size
 
 RANDOM = np.random.default_rng(11)
 
@@ -217,8 +218,9 @@ def test_errors_are_those_of_the_decoder():
         row, column = divmod(index, columns)
         texels[row * ny : (row + 1) * ny, column * nx : (column + 1) * nx] = values
     lut = pack_entries(first, np.broadcast_to([nx, ny], first.shape))
-    settings = ("a", "0", Profile(name="a", tile=size), "tiles", "half", height, width)
-    model = AtlasModel(*settings, texels, lut=lut)
+    place = SheetPlace("a", height, width, 0, 0, rows, columns)
+    settings = ("a", "0", Profile(name="a", tile=size), "tiles", "half", ("0",), (place,))
+    model = AtlasModel(*settings, texels[None], lut=lut)
     x, y = _places(tiles, rows, columns)
     uv = np.stack([(x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height], 1).astype(np.float32)
     decoded = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)

@@ -9,11 +9,11 @@ from kernels.compare import close, exact
 from reference import cascade as reference
 
 from wlm import interop
-from wlm.atlas import cascade
-from wlm.atlas.cascade import Textures, fit_cascade, initial, tune
-from wlm.atlas.data import LightmappedMesh, from_arrays
-from wlm.atlas.model import Profile
-from wlm.atlas.pack import pack, regenerate
+from wlm.atlas.cascade import fit as cascade
+from wlm.atlas.cascade import pack as packing
+from wlm.atlas.cascade.fit import Textures, fit_cascade, initial
+from wlm.atlas.data import LightmappedScene, from_arrays
+from wlm.atlas.model import AtlasModel, Profile
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 from wlm.ops import raster as ops_raster
@@ -24,12 +24,24 @@ pytest.importorskip("uvunwrap")
 SIDE = 16  # texels of a face of the box
 
 
+def pack(scene: LightmappedScene, *rest) -> packing.Packed:
+    return packing.pack(scene.sheets[0], *rest)
+
+
+def regenerate(scene: LightmappedScene, *rest) -> tuple[np.ndarray, np.ndarray]:
+    return packing.regenerate(scene.sheets[0], *rest)
+
+
+def tune(scene: LightmappedScene, *rest, **options) -> Textures:
+    return cascade.tune(scene.sheets[0], *rest, **options)
+
+
 def _profile(**settings) -> Profile:
     defaults = {"steps": 40, "resolution": 48, "colour_rate": 0.01, "lut_rate": 2e-3, "scale": 1.0}
     return Profile(**{"name": "test", "method": "cascade", **defaults, **settings})
 
 
-def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
+def _box(gain: float = 1.0, light=None) -> LightmappedScene:
     """A box, each face a chart of two triangles with an edge of shadow in it; 2 x 3 faces in a map of 40 x 60."""
     corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     position, uv, triangle = [], [], []
@@ -47,18 +59,22 @@ def _box(gain: float = 1.0, light=None) -> LightmappedMesh:
     return from_arrays(np.concatenate(position), np.array(triangle), np.concatenate(uv), gain * light)
 
 
-def _error(mesh: LightmappedMesh, uv: np.ndarray, colour: np.ndarray, lut: np.ndarray) -> float:
+def _model_error(mesh: LightmappedScene, model: AtlasModel, uv: np.ndarray | None = None) -> float:
+    return _error(mesh, model.uv if uv is None else uv, model.texels[0], model.lut / 65535.0)
+
+
+def _error(mesh: LightmappedScene, uv: np.ndarray, colour: np.ndarray, lut: np.ndarray) -> float:
     """Mean error over the surface in units of the mean radiance, in float64 by the reference."""
     random = np.random.default_rng(9)
-    triangle = random.integers(0, len(mesh.triangle), 4000)
+    triangle = random.integers(0, len(mesh.sheets[0].triangle), 4000)
     weights = random.dirichlet([1, 1, 1], 4000)[:, None]
-    old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.uv[mesh.triangle], uv))
-    want = reference.bilinear(exact(mesh.filled), old)
+    old, new = (exact((weights @ each[triangle])[:, 0]) for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv))
+    want = reference.bilinear(exact(mesh.sheets[0].lightmap), old)
     got = reference.sample(exact(colour), exact(lut) if lut.size else None, new)
     return float((got - want).abs().mean() / want.mean())
 
 
-def _start(mesh: LightmappedMesh, profile: Profile) -> tuple[np.ndarray, Textures]:
+def _start(mesh: LightmappedScene, profile: Profile) -> tuple[np.ndarray, Textures]:
     packed = pack(mesh, None, profile.scale)
     return packed.uv, initial(*regenerate(mesh, packed), profile)
 
@@ -103,20 +119,25 @@ def test_a_steps_gradient_of_a_view(device: str, lut_scale: float):
     lut = start.lut + random.uniform(-0.04, 0.04, start.lut.shape).astype(np.float32)
     start = Textures(random.uniform(size=start.colour.shape).astype(np.float32), lut.clip(0, 1))
     with interop.stream(device):
-        step = cascade._Step(mesh, uv, start, profile, 5, device)
+        step = cascade._Step(mesh.sheets[0], uv, start, profile, 5, device)
         before = step.textures()
         step()
         grads = [grad.cpu().numpy() for grad in step._grads]
         after = step.textures()
 
-    clip = torch.tensor(clip_positions(normalised(mesh.position, mesh.triangle), sphere_views(profile.steps, 5)[0]))
-    raster = ops_raster.rasterize(clip, torch.tensor(mesh.triangle), 48, 48)
+    clip = torch.tensor(
+        clip_positions(normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), sphere_views(profile.steps, 5)[0])
+    )
+    raster = ops_raster.rasterize(clip, torch.tensor(mesh.sheets[0].triangle), 48, 48)
     hit = raster.triangle >= 0
     weights = torch.cat([raster.barycentric, 1 - raster.barycentric.sum(-1, keepdim=True)], -1)[hit].double()
-    old, new = ((weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0] for each in (mesh.uv[mesh.triangle], uv))
-    unit = mesh.lightmap[mesh.mask].mean()
+    old, new = (
+        (weights[:, None] @ exact(each)[raster.triangle[hit]])[:, 0]
+        for each in (mesh.sheets[0].uv[mesh.sheets[0].triangle], uv)
+    )
+    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
     leaves = [exact(before.colour / unit, grad=True), exact(before.lut, grad=True)]
-    want = reference.bilinear(exact(mesh.filled / unit), old)
+    want = reference.bilinear(exact(mesh.sheets[0].lightmap / unit), old)
     image = torch.zeros(48, 48, 3, dtype=torch.float64)
     image[hit] = reference.sample(leaves[0], leaves[1] if lut_scale else None, new) - want
     reference.image_loss(image, profile.gradient).backward()
@@ -170,8 +191,8 @@ def test_rates_that_fall():
     """The first step is as long as at full rate, the last one as short as it is to be; less noise is left."""
     mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)
     uv, start = _start(mesh, profile)
-    step = cascade._Step(mesh, uv, start, profile, 0, "cpu")
-    unit = mesh.lightmap[mesh.mask].mean()
+    step = cascade._Step(mesh.sheets[0], uv, start, profile, 0, "cpu")
+    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
     before = step.textures().colour
     step()
     assert np.abs(step.textures().colour - before).max() / unit == pytest.approx(profile.colour_rate, rel=1e-3)
@@ -210,19 +231,18 @@ def test_the_whole(device: str):
     clusters = grouped([0, 1, 0, 1, 4, 5, 0, 1, 0, 1, 10, 11])
     stages = Stages(device)
     model = fit_cascade(mesh, clusters, _profile(scale=1.0, colour_scale=0.8), 0, stages)
-    assert (model.method, model.colour, model.source, model.height, model.width) == (
-        "cascade", "half", mesh.source, 40, 60
-    )  # fmt: skip
+    assert (model.method, model.colour, model.source) == ("cascade", "half", mesh.source)
+    assert model.sheets[0].size == (40, 60)
     assert model.texels.dtype == np.float16 and model.lut.dtype == np.uint16 and model.uv.dtype == np.float32
-    assert model.blocks.shape == (0, 16)
+    assert model.blocks.shape == (0, 0, 16)
     height, width = model.report["packed"]
-    assert model.texels.shape == (round(0.8 * height), round(0.8 * width), 3)
+    assert model.texels.shape == (1, round(0.8 * height), round(0.8 * width), 3)
     assert model.lut.shape == (round(0.7 * height), round(0.7 * width), 2)
     counts = {key: model.report[key] for key in ("triangles", "groups", "shared", "charts", "steps")}
     assert counts == {"triangles": 12, "groups": 6, "shared": 8, "charts": 3, "steps": 40}
     assert set(stages.seconds) == {"pack", "regenerate", "fit", "write"}
     assert height * width < 0.5 * 6 * (SIDE + 2) ** 2 * 2
-    assert _error(mesh, model.uv, model.texels, model.lut / 65535.0) < 0.03
+    assert _model_error(mesh, model) < 0.03
     assert 0 < model.compression_ratio < 1
 
 
@@ -230,20 +250,21 @@ def test_without_a_table_it_is_plain():
     mesh = _box()
     model = fit_cascade(mesh, None, _profile(lut_scale=0.0, colour_scale=1.0), 0, Stages("cpu"))
     assert model.method == "plain" and model.lut.shape == (0, 0, 2) and model.uv.shape == (12, 3, 2)
-    assert _error(mesh, model.uv, model.texels, model.lut) < 0.02
+    assert _model_error(mesh, model) < 0.02
 
 
 def test_triangles_that_are_not_active():
     """They hide what is behind them and teach nothing: a fit with one is finite, whatever its UVs say."""
     box = _box()
-    uv = np.concatenate([box.uv, [[0.5, 0.5]] * 3])
-    position = np.concatenate([box.position, [[-2, -2, 1.5], [2, -2, 1.5], [0, 2, 1.5]]])
-    mesh = from_arrays(position, np.concatenate([box.triangle, [[24, 25, 26]]]), uv, box.lightmap, box.mask)
-    assert mesh.active.sum() == 12
+    sheet = box.sheets[0]
+    uv = np.concatenate([sheet.uv, [[0.5, 0.5]] * 3])
+    position = np.concatenate([sheet.position, [[-2, -2, 1.5], [2, -2, 1.5], [0, 2, 1.5]]])
+    mesh = from_arrays(position, np.concatenate([sheet.triangle, [[24, 25, 26]]]), uv, sheet.lightmap, sheet.mask)
+    assert mesh.sheets[0].active.sum() == 12
     for space in ("views", "uv"):
         model = fit_cascade(mesh, None, _profile(space=space), 0, Stages("cpu"))
         assert model.report["groups"] == 12 and np.isfinite(model.uv).all()
-        assert _error(box, model.uv[:12], model.texels, model.lut / 65535.0) < 0.1
+        assert _model_error(box, model, model.uv[:12]) < 0.1
 
 
 def test_blocks_of_the_colours():
@@ -254,8 +275,8 @@ def test_blocks_of_the_colours():
         fit_cascade(mesh, None, _profile(colour_scale=1.0, colour=colour), 0, Stages("cpu"))
         for colour in ("half", "bc6h")
     )
-    rows, columns = (-(-n // 4) for n in blocks.texels.shape[:2])
-    assert blocks.colour == "bc6h" and blocks.blocks.shape == (rows * columns, 16)
+    rows, columns = (-(-n // 4) for n in blocks.texels.shape[1:3])
+    assert blocks.colour == "bc6h" and blocks.blocks.shape == (1, rows * columns, 16)
     close(blocks.texels.astype(np.float32), half.texels.astype(np.float32), 0.1)
     assert (blocks.texels != half.texels).any()
 
@@ -268,7 +289,7 @@ def test_a_cuda_step_is_captured(device: str):
         mesh, profile = _box(), _profile(space=space)
         uv, start = _start(mesh, profile)
         with interop.stream(device):
-            graph = interop.StepGraph(cascade._Step(mesh, uv, start, profile, 0, device), device)
+            graph = interop.StepGraph(cascade._Step(mesh.sheets[0], uv, start, profile, 0, device), device)
             for _ in range(5):
                 graph()
             wp.synchronize_device(device)

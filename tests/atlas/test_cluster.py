@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from reference import patches as reference
 
-from wlm.atlas import cluster as clustering
-from wlm.atlas.cluster import Clusters, cluster
+from wlm.atlas.cascade import cluster as clustering
+from wlm.atlas.cascade.cluster import Clusters, cluster
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import ORDERS, SIZES
 
@@ -138,7 +138,7 @@ def test_permuted_copies(device: str):
 
 def test_sizes_are_those_of_texels():
     """R_s of a lightmap that isn't square takes texels along both axes; a length of 5 texels is size 5, more is 9."""
-    from wlm.atlas.cluster import _corners, _levels
+    from wlm.atlas.cascade.cluster import _corners, _levels
 
     lengths = [[5, 0], [0, 5], [5.01, 0], [0, 5.01], [3, 4], [0.2, 0.1], [0, 0], [60, 0]]
     uv = _uv([[[1, 1], [1 + dx, 1 + dy], [1, 1]] for dx, dy in lengths])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from builders.atlas_models import grouped
 
-from wlm.atlas import pack as packing
-from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.cascade import pack as packing
+from wlm.atlas.cascade.pack import Packed
+from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.fit import compress
-from wlm.atlas.pack import Packed, pack, regenerate
 from wlm.errors import WlmError
 from wlm_kernels.atlas.patches import ORDERS
 
@@ -19,7 +19,15 @@ pytest.importorskip("uvunwrap")
 SIZE = (40, 64)  # H, W
 
 
-def _mesh(triangles: list, lightmap: np.ndarray | None = None, position: np.ndarray | None = None) -> LightmappedMesh:
+def pack(scene: LightmappedScene, *rest) -> Packed:
+    return packing.pack(scene.sheets[0], *rest)
+
+
+def regenerate(scene: LightmappedScene, *rest) -> tuple[np.ndarray, np.ndarray]:
+    return packing.regenerate(scene.sheets[0], *rest)
+
+
+def _mesh(triangles: list, lightmap: np.ndarray | None = None, position: np.ndarray | None = None) -> LightmappedScene:
     """A mesh of triangles given by their corners in texels; corners at one place of one sheet are one."""
     flat = np.array(triangles, np.float64).reshape(-1, 2)
     uv, index = np.unique(flat, axis=0, return_inverse=True)
@@ -42,8 +50,8 @@ def _edges(corner: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corner - np.roll(corner, 1, 1), axis=-1)
 
 
-def _texels(mesh: LightmappedMesh) -> np.ndarray:
-    return (mesh.uv * mesh.mask.shape[::-1])[mesh.triangle]
+def _texels(mesh: LightmappedScene) -> np.ndarray:
+    return (mesh.sheets[0].uv * mesh.sheets[0].mask.shape[::-1])[mesh.sheets[0].triangle]
 
 
 def _read_by(packed: Packed) -> dict[tuple[int, int], set[int]]:
@@ -76,7 +84,7 @@ def test_rigid_and_apart(scale: float):
     """Edges keep their length, no chart is mirrored, no texel is read by two charts, all is in the atlas."""
     mesh = _mesh(_many(2))
     packed = pack(mesh, None, scale)
-    active = mesh.active
+    active = mesh.sheets[0].active
     np.testing.assert_allclose(_edges(packed.corner)[active], scale * _edges(_texels(mesh))[active], atol=1e-4)
     area = packing._signed_area
     np.testing.assert_allclose(area(packed.corner)[active], scale**2 * area(_texels(mesh))[active], atol=1e-3)
@@ -104,9 +112,9 @@ def test_charts_stay_whole():
 def test_to_lightmap_leads_to_the_old_place():
     mesh = _mesh(_many(3))
     packed = pack(mesh, None, 0.5)
-    at = np.concatenate([packed.corner, np.ones((*packed.corner.shape[:2], 1))], 2)[mesh.active]
-    np.testing.assert_allclose(np.einsum("fij,fkj->fki", packed.to_lightmap[packed.chart[mesh.active]], at),
-                               _texels(mesh)[mesh.active], atol=1e-6)  # fmt: skip
+    at = np.concatenate([packed.corner, np.ones((*packed.corner.shape[:2], 1))], 2)[mesh.sheets[0].active]
+    np.testing.assert_allclose(np.einsum("fij,fkj->fki", packed.to_lightmap[packed.chart[mesh.sheets[0].active]], at),
+                               _texels(mesh)[mesh.sheets[0].active], atol=1e-6)  # fmt: skip
 
 
 @pytest.mark.parametrize("order", range(6))
@@ -137,7 +145,7 @@ def test_what_is_not_active():
     """It has no texels; it reads one place that a neighbour reads, or the first."""
     triangles = [*_quad(5, 5, 8, 6), [[5, 5], [9, 5], [13, 5]], [[30, 30], [31, 31], [32, 32]]]
     mesh = _mesh(triangles)
-    np.testing.assert_array_equal(mesh.active, [True, True, False, False])
+    np.testing.assert_array_equal(mesh.sheets[0].active, [True, True, False, False])
     packed = pack(mesh, None, 1.0)
     np.testing.assert_array_equal(packed.source, [0, 1, -1, -1])
     assert (packed.uv[2] == packed.uv[2, 0]).all() and (packed.uv[3] == 0).all()
@@ -160,7 +168,7 @@ def test_thin_triangles_get_a_place(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(packing, "_thickened", lambda *args: asked.append(len(args[0])) or thickened(*args))
     thin = [[[2, 2], [60, 2.0005], [30, 2.0002]], [[2, 6], [60, 6], [30, 6.0001]], [[5, 30], [25, 30], [15, 29.99999]]]
     mesh = _mesh([*thin, *_quad(5, 30, 20, 8)])
-    assert mesh.active.all()
+    assert mesh.sheets[0].active.all()
     packed = pack(mesh, None, 0.5)
     assert sum(asked) >= 1
     np.testing.assert_allclose(_edges(packed.corner), 0.5 * _edges(_texels(mesh)), atol=1e-4)
@@ -172,7 +180,7 @@ def test_many_charts(monkeypatch: pytest.MonkeyPatch):
     mesh = _mesh(_many(2))
     monkeypatch.setattr(packing, "_FEW", 3)
     packed = pack(mesh, None, 0.5)
-    active = mesh.active
+    active = mesh.sheets[0].active
     np.testing.assert_allclose(_edges(packed.corner)[active], 0.5 * _edges(_texels(mesh))[active], atol=1e-4)
     assert max(len(charts) for charts in _read_by(packed).values()) == 1
 
@@ -198,7 +206,8 @@ def test_regenerated_colours():
     """A lightmap that is linear in x and y is the same under the new UVs, up to the charts' borders and beyond."""
     y, x = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5, indexing="ij")
     lightmap = np.stack([x, y, x + 2 * y], -1).astype(np.float32) / 100
-    mesh = from_arrays(*(lambda m: (m.position, m.triangle, m.uv))(_mesh(_many(4))), lightmap, np.ones(SIZE, bool))
+    (own,) = _mesh(_many(4)).sheets
+    mesh = from_arrays(own.position, own.triangle, own.uv, lightmap, np.ones(SIZE, bool))
     packed = pack(mesh, None, 0.7)
     rendered, mask = regenerate(mesh, packed)
     readers = _read_by(packed)

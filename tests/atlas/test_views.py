@@ -63,10 +63,10 @@ def test_what_is_no_direction(direction):
 def test_the_picture_just_holds_the_sphere():
     """A tangent from the camera touches the sphere of radius sqrt 3 where p . d = 1: at corners of the cube."""
     mesh = lit_cube(1)
-    position = normalised(mesh.position, mesh.triangle)
+    position = normalised(mesh.sheets[0].position, mesh.sheets[0].triangle)
     clip = clip_positions(position, View.of([1, 0, 0]))
     assert clip.shape == (24, 4) and clip.dtype == np.float32
-    touching = mesh.position[:, 0] == 1.0
+    touching = mesh.sheets[0].position[:, 0] == 1.0
     radius = np.hypot(clip[:, 0], clip[:, 1]) / clip[:, 3]
     np.testing.assert_allclose(radius[touching], 1.0, rtol=1e-6)
     assert (radius[~touching] < 0.9).all()
@@ -81,7 +81,9 @@ def test_normalised_whatever_the_place_and_size():
     position, triangle, uv = corners(1)
     for scale, shift in ((1.0, 0.0), (1e-6, 0.0), (250.0, [3.0, -7.0, 1000.0])):
         mesh = from_arrays(position * [1.0, 0.5, 0.25] * scale + shift, triangle, uv, waves())
-        np.testing.assert_allclose(normalised(mesh.position, mesh.triangle), position * [1.0, 0.5, 0.25], atol=1e-6)
+        np.testing.assert_allclose(
+            normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), position * [1.0, 0.5, 0.25], atol=1e-6
+        )
 
 
 def test_each_face_from_its_own_side(device):
@@ -92,9 +94,9 @@ def test_each_face_from_its_own_side(device):
         assert visible.dtype == np.int32 and barycentric.shape == (48, 48, 2) and uv.shape == (48, 48, 2)
         assert set(np.unique(visible[hit])) == set(range(8 * number, 8 * number + 8))
         weight = np.concatenate([barycentric, 1.0 - barycentric.sum(-1, keepdims=True)], -1)[hit][..., None]
-        corner = mesh.triangle[visible[hit]]
-        np.testing.assert_allclose(uv[hit], (mesh.uv[corner] * weight).sum(1), atol=1e-6)
-        place = (mesh.position[corner] * weight).sum(1)
+        corner = mesh.sheets[0].triangle[visible[hit]]
+        np.testing.assert_allclose(uv[hit], (mesh.sheets[0].uv[corner] * weight).sum(1), atol=1e-6)
+        place = (mesh.sheets[0].position[corner] * weight).sum(1)
         np.testing.assert_allclose(place @ direction, 1.0, atol=1e-5)
         # Seen upright: rows go down, columns to the right.
         row, column = np.nonzero(hit)
@@ -112,11 +114,12 @@ def test_inactive_triangles_hide_and_are_not_seen():
     triangle = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [6, 5, 7]])
     uv = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0.5], [0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
     mesh = from_arrays(position, triangle, uv, waves())
-    assert mesh.active.tolist() == [True, False, True, True]
+    assert mesh.sheets[0].active.tolist() == [True, False, True, True]
     visible, barycentric, at = _drawn(mesh, [0, 0, 1])
     assert set(np.unique(visible)) == {-1, 0}
     assert not barycentric[visible < 0].any() and not at[visible < 0].any()
-    flat = dataclasses.replace(mesh, active=np.array([True, True, True, True]))
+    whole = dataclasses.replace(mesh.sheets[0], active=np.array([True, True, True, True]))
+    flat = dataclasses.replace(mesh, sheets=(whole,))
     assert set(np.unique(_drawn(flat, [0, 0, 1])[0])) == {-1, 0, 1}
     assert set(np.unique(_drawn(mesh, [0, 0, -1])[0])) == {-1, 2, 3}
 
@@ -129,7 +132,7 @@ def test_visibility_counts_every_covered_pixel_once(device):
     np.testing.assert_array_equal(count, visibility(mesh, views, 64, HEIGHT, WIDTH, device).cpu())
     fine = visibility(mesh, views, 64, 2 * HEIGHT, 2 * WIDTH, device).cpu().numpy()
     np.testing.assert_array_equal(fine.reshape(HEIGHT, 2, WIDTH, 2).sum(axis=(1, 3)), count)
-    assert (count[mesh.mask] > 0).mean() > 0.7 and not count[~mesh.mask].any()
+    assert (count[mesh.sheets[0].mask] > 0).mean() > 0.7 and not count[~mesh.sheets[0].mask].any()
 
 
 def test_visibility_of_one_side_and_of_none():

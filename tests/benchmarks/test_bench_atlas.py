@@ -12,10 +12,11 @@ from benchmarks import write_json
 from benchmarks.atlas import PANELS, plotted, run, run_rivals, run_rows
 from benchmarks.atlas_inputs import Lightmap, load
 from benchmarks.rivals.atlas import single_colour
-from wlm.atlas.data import LightmappedMesh, write_mesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
+from wlm.atlas.stored import store
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 
@@ -157,15 +158,15 @@ def test_no_room_for_a_rival_or_a_table():
     assert not any(row.figures for row in missing) and "psnr" in rows[0].figures
 
 
-def _files(folder, mesh: LightmappedMesh, *names: str, masked: bool = False) -> None:
+def _files(folder, mesh: LightmappedScene, *names: str, masked: bool = False) -> None:
     from PIL import Image
 
     folder.mkdir()
-    write_mesh(folder / "mesh.glb", mesh, mesh.uv[mesh.triangle])
+    (folder / "mesh.glb").write_bytes(store(mesh).glb)
     for i, name in enumerate(names):
-        write_exr(folder / f"{name}.exr", image(soft, *mesh.mask.shape) * (i + 1))
+        write_exr(folder / f"{name}.exr", image(soft, *mesh.sheets[0].mask.shape) * (i + 1))
     if masked:
-        Image.fromarray(mesh.mask.astype(np.uint8) * 255).save(folder / "mask.png")
+        Image.fromarray(mesh.sheets[0].mask.astype(np.uint8) * 255).save(folder / "mask.png")
 
 
 def test_folders(tmp_path):
@@ -175,12 +176,12 @@ def test_folders(tmp_path):
     (tmp_path / "notes").mkdir()
     assert [lightmap.scene for lightmap in load(tmp_path)] == ["Cube day", "Cube night", "Sheet day"]
     assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube day", "Cube night"]
-    day, night = (lightmap.mesh for lightmap in load(tmp_path / "Cube"))
+    day, night = (lightmap.mesh.sheets[0] for lightmap in load(tmp_path / "Cube"))
     np.testing.assert_allclose(night.lightmap, 2 * day.lightmap, rtol=2e-3)
-    np.testing.assert_array_equal(day.mask, charts().mask)
+    np.testing.assert_array_equal(day.mask, charts().sheets[0].mask)
     mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "night.exr"
     (named,) = load(None, mesh, [exr], tmp_path / "Cube" / "mask.png")
-    assert named.scene == "Cube night" and named.mesh.source == night.source
+    assert named.scene == "Cube night" and named.mesh.source == load(tmp_path / "Cube")[1].mesh.source
     exr.rename(exr.with_stem("Cube"))
     assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube", "Cube day"]
 

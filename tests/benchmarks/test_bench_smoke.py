@@ -71,7 +71,7 @@ def test_shares_of_the_copy(rows):
         ("float32, periodic", 32, 152),
         ("float32, all boundaries", 32, 153),
         ("float16, all boundaries", 32, 77),
-        ("float32, all boundaries, D3Q27 recursive", 32, 217),
+        ("float32, all boundaries, D3Q27", 32, 217),
         ("float16, all boundaries, 12³", 12, 77),
     ):
         row = lattice[option]

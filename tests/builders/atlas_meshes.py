@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf_writer import write_glb
 
@@ -34,7 +34,7 @@ def constant(*colour: float) -> Light:
 
 def sheet(
     light: Light = soft, height: int = 40, width: int = 48, quads: int = 4, name: str = "sheet"
-) -> LightmappedMesh:
+) -> LightmappedScene:
     """A bent sheet of `quads` x `quads`, one chart that fills the whole lightmap."""
     v, u = np.meshgrid(*[np.linspace(0.0, 1.0, quads + 1)] * 2, indexing="ij")
     position = np.stack([u, v, 0.3 * np.sin(3.0 * u)], -1).reshape(-1, 3)
@@ -42,7 +42,7 @@ def sheet(
     return from_arrays(position, _quads(quads, quads), uv, image(light, height, width), name=name)
 
 
-def charts(light: Light = soft, height: int = 48, width: int = 64, name: str = "charts") -> LightmappedMesh:
+def charts(light: Light = soft, height: int = 48, width: int = 64, name: str = "charts") -> LightmappedScene:
     """The six sides of a cube, one separate chart per side; a seventh chart inside it is hidden from all views."""
     position, triangle, uv = [], [], []
     for side in range(7):
@@ -59,17 +59,17 @@ def charts(light: Light = soft, height: int = 48, width: int = 64, name: str = "
     return from_arrays(*mesh, lightmap, name=name)
 
 
-def triangle(light: Light = soft, height: int = 16, width: int = 16, name: str = "triangle") -> LightmappedMesh:
+def triangle(light: Light = soft, height: int = 16, width: int = 16, name: str = "triangle") -> LightmappedScene:
     """One triangle, in a corner of its lightmap."""
     corner = np.array([[0.1, 0.1], [0.7, 0.15], [0.2, 0.6]])
     position = np.insert(corner, 2, 0.0, axis=1)
     return from_arrays(position, np.array([[0, 1, 2]]), corner, image(light, height, width), name=name)
 
 
-def write_files(folder: Path, mesh: LightmappedMesh) -> tuple[Path, Path]:
+def write_files(folder: Path, mesh: LightmappedScene) -> tuple[Path, Path]:
     """Writes a mesh and its lightmap as `mesh.glb` and `light.exr`."""
     write_glb(folder / "mesh.glb", mesh.document, [], 1)
-    write_exr(folder / "light.exr", mesh.lightmap)
+    write_exr(folder / "light.exr", mesh.sheets[0].lightmap)
     return folder / "mesh.glb", folder / "light.exr"
 
 

@@ -1,4 +1,4 @@
-"""Atlas models of random numbers, for tests of what only writes or reads them; and groups of triangles."""
+"""Atlas models of random numbers, for tests that only write or read them; and groups of triangles."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,11 +8,21 @@ import pytest
 from builders.resigned import GONE, rewrite
 
 from wlm.atlas import codec
-from wlm.atlas.cluster import Clusters, Stats
+from wlm.atlas.cascade.cluster import Clusters, Stats
 from wlm.atlas.colour import quantise
 from wlm.atlas.corners import snapped
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.model import MOST_SIZE, AtlasModel, Profile, first_block_code, pack_entries, tile_counts
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.model import (
+    MOST_SIZE,
+    AtlasModel,
+    Profile,
+    SheetPlace,
+    first_block_code,
+    pack_entries,
+    pack_tiles,
+    tile_counts,
+)
+from wlm.atlas.stored import store
 
 KINDS = ("tiles", "cascade", "plain", "plain with uv")
 MIXED = "tiles mixed"
@@ -21,45 +31,80 @@ WIDE = "tiles wide"
 """Tiles in BC6H, in a texture with more texels along a side than an entry can name: it names blocks."""
 
 
-def random_model(mesh: LightmappedMesh, kind: str, colour: str = "half", seed: int = 0, tile: int = 7) -> AtlasModel:
-    """Makes a model of one of `KINDS`, `MIXED` or `WIDE`, for a mesh."""
+def random_model(scene: LightmappedScene, kind: str, colour: str = "half", seed: int = 0, tile: int = 7) -> AtlasModel:
+    """Makes a model of one of `KINDS`, `MIXED` or `WIDE`, for a scene of one sheet."""
     random = np.random.default_rng(seed)
-    height, width = mesh.mask.shape
+    (sheet,) = scene.sheets
+    size = sheet.mask.shape
     method, colour = kind.split()[0], {MIXED: "mixed", WIDE: "bc6h"}.get(kind, colour)
     profile = Profile(name="random", method="tiles" if method == "tiles" else "cascade", tile=tile, colour=colour)
     shape = (16, MOST_SIZE + 4) if kind == WIDE else (18, 23)
     texels, lut = random.random((*shape, 3)) * 3.0, np.empty((0, 0, 2), np.uint16)
     second = {}
     if method == "tiles":
-        counts = tile_counts(height, width, tile)
-        size = random.integers(1, tile + 2, (*counts, 2))
-        first, blocks = random.integers(0, np.array(shape[::-1]) - size + 1), False
+        counts = tile_counts(*size, tile)
+        side = random.integers(1, tile + 2, (*counts, 2))
+        first, blocks = random.integers(0, np.array(shape[::-1]) - side + 1), False
         if kind == WIDE:
             whole = random.integers(1, 4, (*counts, 2))
-            first, size, blocks = 4 * random.integers(0, np.array(shape[::-1]) // 4 - whole + 1), 4 * whole, True
+            first, side, blocks = 4 * random.integers(0, np.array(shape[::-1]) // 4 - whole + 1), 4 * whole, True
         elif colour == "mixed":
             encoded = quantise(random.random((16, 20, 3)) * 3.0, "bc6h")
             second = {"blocks": encoded["blocks"], "block_texels": encoded["texels"]}
             blocks = random.random(counts) < 0.5
             whole = random.integers(1, 4, (*counts, 2))
-            size = np.where(blocks[..., None], 4 * whole, size)
+            side = np.where(blocks[..., None], 4 * whole, side)
             first = np.where(blocks[..., None], 4 * random.integers(0, np.array([5, 4]) - whole + 1), first)
-        lut = pack_entries(first, size, blocks, first_block_code(colour, shape))
+        lut = pack_entries(first, side, blocks, first_block_code(colour, shape))
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
-    triangles = len(mesh.triangle) if method == "cascade" or kind.endswith("uv") else 0
+    triangles = len(sheet.triangle) if method == "cascade" or kind.endswith("uv") else 0
     uv = snapped(random.random((triangles, 3, 2)))
-    settings = (mesh.name, mesh.source, profile, method, colour, height, width)
+    place = SheetPlace(sheet.name, *size, 0, 0, *(tile_counts(*size, tile) if method == "tiles" else (0, 0)))
+    settings = (scene.name, scene.source, profile, method, colour, scene.states, (place,))
     report = {"seconds": {"fit": 1.5}, "tiles": 4}
     textures = quantise(texels, "rgb9e5" if colour == "mixed" else colour) | second
-    return AtlasModel(*settings, **textures, lut=lut, uv=uv, report=report)
+    textures = {name: texture[None] for name, texture in textures.items()}
+    return AtlasModel(*settings, **textures, lut=lut, uv=uv, stored=store(scene), report=report)
+
+
+def shared_model(scene: LightmappedScene, seed: int = 0, separate: bool = False) -> AtlasModel:
+    """Makes a model of shared or separate tiles in RGB9E5, for a scene of any sheets and states."""
+    random, tile = np.random.default_rng(seed), 7
+    states, places, row = len(scene.states), [], 0
+    for _ in range(states if separate else 1):
+        for sheet in scene.sheets:
+            counts = tile_counts(*sheet.mask.shape, tile)
+            places.append(SheetPlace(sheet.name, *sheet.mask.shape, row, 0, *counts))
+            row += counts[0]
+    shape = row, max(place.columns for place in places)
+    count = np.ones(shape, int) if separate else random.integers(0, 4, shape)
+    size = random.integers(1, tile + 2, (*shape, 2))
+    first = random.integers(0, 8, (*shape, 2))
+    lut = pack_tiles(first, size, 4 * random.integers(0, 2, shape), count, random.integers(0, 2, shape))
+    texels = quantise(random.random((32, 40, 3)) * 3.0, "rgb9e5")["texels"].reshape(2, 16, 40, 3)
+    profile = Profile(name="random", colour="rgb9e5", tile=tile)
+    sheets = len(scene.sheets)
+    return AtlasModel(
+        scene.name,
+        scene.source,
+        profile,
+        "shared",
+        "rgb9e5",
+        scene.states,
+        tuple(places[:sheets]),
+        texels,
+        lut,
+        factor=(random.random((states, 8, 3)) - 0.3).astype(np.float32),
+        later=tuple(places[sheets:]),
+        stored=store(scene),
+    )
 
 
 def save_plainly(model: AtlasModel, path: Path) -> None:
-    """As earlier versions did: no part is a stream, and corners are floats."""
+    """Saves a model with no part as a frame, so that tests can change its numbers."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codec, "deflated", lambda parts: (parts, {}))
-        patch.setattr(codec, "encode_corners", lambda uv: {"uv": uv})
+        patch.setattr(codec, "pack_parts", lambda parts: (parts, {}))
         model.save(path)
     rewrite(path, {"parts": GONE})
 

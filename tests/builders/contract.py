@@ -10,6 +10,7 @@ import torch
 from builders import atlas_meshes, probe_sets, small_sets
 
 import wlm
+from wlm.export import export
 
 FILES = Path(__file__).resolve().parents[1] / "files"
 
@@ -109,7 +110,7 @@ def _probe_pca() -> Subject:
 
 def _atlas(kind: str) -> Subject:
     settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
-    profile = wlm.atlas.Profile(name="tiny", views=0, **settings)
+    profile = wlm.atlas.Profile(name="tiny", views=4, **settings)
 
     def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
         from wlm.atlas.fit import open_checkpoint
@@ -129,7 +130,7 @@ def _atlas(kind: str) -> Subject:
         atlas_meshes.sheet,
         lambda data, **options: wlm.atlas.compress(data, profile, **options),
         lambda model, data: wlm.atlas.evaluate(model, data, views=2, resolution=32),
-        lambda model, data, folder: wlm.atlas.export(model, folder, data),
+        lambda model, data, folder: export(model, folder),
         checkpoint,
     )
 

@@ -67,8 +67,10 @@ def _atlas(kind: str, colour: str) -> Kept:
     from builders.atlas_meshes import sheet
     from builders.atlas_models import random_model, save_plainly
 
-    free = {"uv": "missing size", "lut": "sizes" if kind == "cascade" else ""}
-    ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv": (0, 1.5)}
+    free = {"lut": "sizes" if kind == "cascade" else "", "mesh": "size"}
+    # Places and triangles beyond those that are named do no harm.
+    free |= {name: "size size size" for name in ("uv_place", "uv_triangle")}
+    ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv_order": (0, 6), "uv_index": (0, 255)}
     ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
     content = _written(lambda path: save_plainly(random_model(sheet(), kind, colour), path))
     return Kept(content, wlm.load, free, ranges)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import shutil
@@ -183,9 +182,3 @@ def file_bytes(path: Path) -> dict[str, Any]:
     """The bytes of a file, or of each file in a folder."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return {file.name: file.read_bytes() for file in files}
-
-
-def without_seconds(path: Path) -> dict[str, Any]:
-    """The files of an atlas, but for the seconds in its report."""
-    content = file_bytes(path)
-    return content | {"report.json": json.loads(content["report.json"]) | {"seconds": 0, "inputs": 0}}

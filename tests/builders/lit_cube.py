@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlm.atlas.data import LightmappedMesh, from_arrays
+from wlm.atlas.data import LightmappedScene, from_arrays
 
 HEIGHT, WIDTH = 64, 96
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
@@ -35,6 +35,6 @@ def waves(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
     return np.stack([base, 0.1 + 0.8 * base, 2.2 - base], axis=-1).astype(np.float32)
 
 
-def lit_cube(parts: int = 2, lightmap: np.ndarray | None = None) -> LightmappedMesh:
+def lit_cube(parts: int = 2, lightmap: np.ndarray | None = None) -> LightmappedScene:
     """The cube with waves, or another light."""
     return from_arrays(*corners(parts), waves() if lightmap is None else lightmap, name="cube")

@@ -1,4 +1,4 @@
-"""Compressed scenes of three squares, in folders as `wlm atlas compress` writes them."""
+"""A compressed scene of three squares."""
 
 import dataclasses
 import json
@@ -7,11 +7,10 @@ import numpy as np
 import torch
 from builders.gltf_scene import Thing, write_scene
 
-from wlm.atlas.scene.data import load_scene
-from wlm.atlas.scene.decode import Decoder
-from wlm.atlas.scene.exporter import export_scene
-from wlm.atlas.scene.fit import compress_scene
-from wlm.atlas.scene.model import COARSE_BITS, COUNT_BITS, ENTRY
+from wlm.atlas.data import load
+from wlm.atlas.decode import Decoder
+from wlm.atlas.fit import compress
+from wlm.atlas.model import COARSE_BITS, COUNT_BITS, ENTRY
 from wlm.formats.exr import write_exr
 
 STATES = ("dawn", "noon", "night")
@@ -24,9 +23,9 @@ _SQUARES = {
 
 
 def scene_folder(folder, uv_set=1, states=STATES, **settings):
-    """Writes one and gives its model.
+    """Writes the scene, compresses it, saves the model as `made.wlm` and returns it.
 
-    Where states share tiles, as they do in few bits, its first page is black and nowhere read.
+    Where states share tiles, as they do in few bits, the model's first page is black and nothing reads it.
     """
     folder.mkdir()
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
@@ -49,14 +48,14 @@ def scene_folder(folder, uv_set=1, states=STATES, **settings):
     objects = [{"node": name, "sheet": sheet, "scale_offset": place} for name, (_, sheet, place) in _SQUARES.items()]
     text = {"states": states, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
-    scene = load_scene(path, folder / "lights.json")
-    model = compress_scene(scene, views=1, **{"budget": 0.1} | settings)
+    scene = load(path, folder / "lights.json")
+    model = compress(scene, views=1, method="shared", **{"budget": 0.1} | settings)
     if model.lut.shape[2] == ENTRY:
         pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
         pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}
         second = np.array([0, 0, 0, 1 << (COUNT_BITS + COARSE_BITS)], np.uint16)
         model = dataclasses.replace(model, lut=model.lut + second, **pages)
-    export_scene(model, folder / "made", scene)
+    model.save(folder / "made.wlm")
     return model
 
 

@@ -9,9 +9,10 @@ import torch
 from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames
 from builders.smoke_books import shown as shown_book
+from reference.flipbook import from_point
 
 from wlm.smoke.camera import LAYOUTS, Camera
-from wlm.smoke.flipbook.depth import encoded_depth, from_point
+from wlm.smoke.flipbook.depth import encoded_depth
 from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.flipbook.shader import billboard_shader, smoke_shader
 from wlm.smoke.flipbook.textures import lay_out, pack

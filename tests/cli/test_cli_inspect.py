@@ -11,18 +11,16 @@ import pytest
 from builders import atlas_meshes, small_sets
 from builders.contract import FILES
 from builders.godot_bakes import Writer, bake, probes
-from builders.probe_models import random_model
+from builders.probe_models import whole_model as random_model
 from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
-from wlm.atlas.exporter import read_folder
 from wlm.cli.app import app
-from wlm.export.engines.atlas import export_atlas
+from wlm.export import export
 from wlm.formats.exr import write_exr
 from wlm.inspection import files, inspect
 from wlm.inspection.folders import MOST
-from wlm.probe import export_grid, export_unity, export_unreal
 
 
 def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> np.ndarray:
@@ -69,7 +67,8 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     (tmp_path / "other" / "smoke.vdb").write_bytes(b" BDV\0\0\0\0")
     shutil.copy(FILES / "lightmap.wlm", tmp_path / "other" / "map.wlm")
     mesh = atlas_meshes.sheet()
-    wlm.atlas.export(wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0)), tmp_path / "atlas", mesh)
+    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
+    model.save(tmp_path / "other" / "atlas.wlm")
     text = told(tmp_path)
     for said in (
         "unity: 2 states of light from Unity, 1 map of 64x64, with light, dir -> "
@@ -84,11 +83,11 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "wlm compress HERE/other/two.npz --key 9 -o OUT.wlm",
         "smoke.vdb: cannot be read",
         "map.wlm: compressed lightmaps over time",
-        "atlas: a compressed lightmap of a mesh -> ",
+        "atlas.wlm: compressed lightmaps of meshes",
     ):
         assert said in text, said
     assert "LICENSE" not in text and text.count("set") < 20
-    export_atlas(read_folder(tmp_path / "atlas"), tmp_path / "engine", "unity")
+    export(model, tmp_path / "engine", "unity")
     # No command takes it.
     assert told(tmp_path / "engine").endswith(" -> ")
 
@@ -103,13 +102,13 @@ def test_all_folders_that_are_written_are_known():
 
 def test_probes_of_exports_can_be_read_back(tmp_path):
     model = random_model(count=3, probes=20, positions=True)
-    for export, name, what in (
-        (export_grid, "grid.json", "a grid of light for three.js: 4 light probes"),
-        (export_unreal, "light.json", "light probes for Unreal, volume textures and a shader: 4 light probes"),
-        (export_unity, "probes.json", "light probes for Unity: 20 light probes"),
+    for engine, name, what in (
+        ("three", "grid.json", "a grid of light for three.js: 4 light probes"),
+        ("unreal", "light.json", "light probes for Unreal, volume textures and a shader: 4 light probes"),
+        ("unity", "probes.json", "light probes for Unity: 20 light probes"),
     ):
         folder = tmp_path / name.removesuffix(".json")
-        export(model, folder, **({} if export is export_unity else {"cells": 2}))
+        export(model, folder, engine, **({} if engine == "unity" else {"cells": 2}))
         (finding,) = inspect(folder / name)
         assert finding.what.startswith(f"{what} of 9 RGB coefficients")
         assert finding.command == f"wlm compress {folder / name} -o OUT.wlm"
@@ -157,16 +156,6 @@ def test_what_is_damaged_is_said_and_nothing_stops(tmp_path):
     assert text.count("cannot be read") == 12 and "is missing" in text and "pipe" not in text and "link" not in text
     (tmp_path / "empty").mkdir()
     assert told(tmp_path / "empty") == ".: no known kind of file -> "
-
-
-def test_a_damaged_region_of_probes_is_said(tmp_path):
-    data = bytearray((FILES / "probe-regions.wlm").read_bytes())
-    (tmp_path / "whole.wlm").write_bytes(data)
-    assert inspect(tmp_path / "whole.wlm")[0].problems == ()
-    data[-10] ^= 0xFF
-    (tmp_path / "a.wlm").write_bytes(data)
-    (problem,) = inspect(tmp_path / "a.wlm")[0].problems
-    assert "damaged" in problem and "region" in problem
 
 
 def test_no_more_is_told_than_can_be_read(tmp_path):

@@ -178,7 +178,7 @@ def test_predict_frames(network, tmp_path):
     folder = write_frames(tmp_path / "frames").path
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
     # One that has learned next to nothing is left out, and one line says so.
-    assert " ".join(call.stderr.split()).count("of the network is taken") == 1
+    assert " ".join(call.stderr.split()).count("the network has a weight of") == 1
     call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
     assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
     assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)

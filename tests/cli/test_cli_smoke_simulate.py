@@ -75,7 +75,7 @@ def test_simulate_as_told(jet, tmp_path):
     assert "4096 x 4096 x 4096 cells" in line
     (tmp_path / "fast.yaml").write_text(yaml.safe_dump(JET | {"air": {"speed": 0.1}}))
     line = fails("smoke", "simulate", tmp_path / "fast.yaml", "-o", tmp_path / "b")
-    assert "cells a step: expected at most 0.3" in line
+    assert "cells per step: expected at most 0.3" in line
     narrow = [SCENE["inlets"][0] | {"radius": 0.01}]
     (tmp_path / "thin.yaml").write_text(yaml.safe_dump(JET | {"inlets": narrow}))
     line = fails("smoke", "simulate", tmp_path / "thin.yaml", "-o", tmp_path / "b")

@@ -22,7 +22,6 @@ from wlm.inspection import input_system
 from wlm.system import _PACKAGES, Settings
 
 MOST_COMMANDS, MOST_OPTIONS = 25, 15
-until_merged = pytest.mark.xfail(reason="the groups of lightmap, atlas and probe are still there", strict=False)
 
 
 class Inner(BaseModel, use_attribute_docstrings=True):
@@ -175,7 +174,6 @@ def every_command():
     return dict(commands(typer.main.get_command(app)))
 
 
-@until_merged
 def test_the_command_line_is_small(every_command):
     assert len({path[0] if path[0] in VERBS else path for path in every_command}) <= MOST_COMMANDS
     for path, command in every_command.items():
@@ -187,7 +185,6 @@ def test_the_command_line_is_small(every_command):
 FRAGMENT = re.compile(r"^(Of|What|Those|That|Told|Whose|Which|As|How|Where|When)\b")
 
 
-@until_merged
 def test_every_help_is_written_in_sentences(every_command):
     for path, command in every_command.items():
         texts = [inspect.cleandoc(command.help or ""), *(each.help for each in command.params if each.help is not None)]

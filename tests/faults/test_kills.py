@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 from builders import atlas_meshes, probe_sets, small_sets
-from builders.killing import Command, drive, file_bytes, without_seconds
+from builders.killing import Command, drive, file_bytes
 from builders.smoke_plumes import SCENE, write_frames
 from builders.smoke_samples import file_content
 
@@ -113,17 +113,12 @@ def command(request, tmp_path_factory):
             words += (place / "room.npz", "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("probe.wlm"), file_bytes, kept_or_whole, beside)
         case "atlas compress" | "atlas compress cascade":
-            cascade = {"name": "tiny", "method": "cascade", "steps": 400, "resolution": 64, "views": 0}
-            tiles = {"name": "tiny", "views": 0}
+            cascade = {"name": "tiny", "method": "cascade", "steps": 400, "resolution": 64, "views": 4}
+            tiles = {"name": "tiny", "views": 4}
             light = atlas_meshes.sheet(height=200, width=240)
             profile = settings(tiles if len(words) == 2 else cascade | {"fallback": False})
             words = (*words[:2], *atlas_meshes.write_files(place, light), "--profile", profile, *EVERY)
-            mesh = atlas_meshes.sheet()
-            model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="older", views=0))
-            check = earlier_or_unfinished("report.json", without_seconds)
-            return Command(
-                words, "out", lambda path: wlm.atlas.export(model, path, mesh), without_seconds, check, beside
-            )
+            return Command(words, "a.wlm", older("atlas-tiles.wlm"), file_bytes, kept_or_whole, beside)
         case "smoke simulate":
             words += (settings(JET | {"frames": 40}), *EVERY)
             earlier = JET | {"frames": 3, "name": "older"}

@@ -9,7 +9,7 @@ import pytest
 from builders.checks import error_of
 from builders.godot_bakes import Writer, bake, colours, probes, with_users
 
-from wlm.atlas.scene.description import read_description
+from wlm.atlas.listing import read_description
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.godot import read_lmbake, read_users

@@ -33,7 +33,7 @@ from wlm.formats.folder import read_index, staged, write_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_lmbake
 from wlm.formats.mask import read_mask
-from wlm.formats.obj import read_obj
+from wlm.formats.meshes import read_mesh
 from wlm.formats.reading import named_file, read_file
 from wlm.lightmap.model import Profile
 from wlm.probe import load as load_probes
@@ -83,7 +83,7 @@ def write(path: Path, content: object) -> Path:
         (read_artifact, ".wlm"),
         (read_exr, ".exr"),
         (read_gltf, ".gltf"),
-        (read_obj, ".obj"),
+        (read_mesh, ".obj"),
         (read_lmbake, ".lmbake"),
         (read_runs, ".json"),
         (load_probes, ".json"),
@@ -117,7 +117,7 @@ def test_a_file_above_its_limit_is_not_read(tmp_path):
     assert "expected 6 bytes, found 5" in refused(read_file, path, 9, "it", first=6)
     with open(tmp_path / "sparse.obj", "wb") as file:
         file.truncate(1 << 40)
-    assert "expected at most" in refused(read_obj, tmp_path / "sparse.obj")
+    assert "expected at most" in refused(read_mesh, tmp_path / "sparse.obj")
 
 
 def test_a_name_stays_in_its_folder(tmp_path):

@@ -16,10 +16,10 @@ from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from benchmarks import Row, write_json
+from wlm.atlas.stored import store
 from wlm.export import export
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
-from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import open_frames, write_six_way
@@ -94,16 +94,13 @@ def _textures(folder: Path) -> None:
 
 def _meshes(folder: Path) -> None:
     sheet = atlas_meshes.sheet(quads=2)
-    write_glb(folder / "mesh.glb", sheet.document, [], 1)
+    (folder / "mesh.glb").write_bytes(store(sheet).glb)
     corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
     lines = ["# a square", "o square"]
     lines += [f"v {x} {y} 0.5" for x, y in corners] + [f"vt {x} {y}" for x, y in corners]
     lines += ["vn 0 0 1", "g all", "usemtl white", "f 1/1/1 2/2/1 4/4/1 \\", "  3/3/1", "f -4/-4 -3/-3 -1/-1", ""]
     (folder / "mesh.obj").write_text("\n".join(lines))
     (folder / "mesh.gltf").write_text(json.dumps(_gltf()))
-    report = {"format": "wlm-atlas", "version": 1, "source": "2ff375949fdc4fb2", "uv_set": 0, "bytes": {"mesh.glb": 1}}
-    report |= {"triangles": len(sheet.triangle), "inputs": {"mesh": "mesh.glb", "lightmap": "light.exr"}}
-    (folder / "report.json").write_text(json.dumps(report))
 
 
 def _gltf() -> dict:
@@ -169,10 +166,10 @@ def _probe_files(folder: Path) -> None:
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
     with tempfile.TemporaryDirectory() as grid:
-        export(probe_models.random_model(count=3), Path(grid) / "out", "three", cells=2)
+        export(probe_models.whole_model(count=3), Path(grid) / "out", "three", cells=2)
         for name in ("grid.json", "grid.ktx2"):
             (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
-        export(probe_models.random_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
+        export(probe_models.whole_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
         for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
             (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)

@@ -78,8 +78,8 @@ def _many_outputs(settings: Any, parts: dict[str, np.ndarray]) -> Any:
 
 
 def _large_plain(settings: Any, parts: dict[str, np.ndarray]) -> Any:
-    parts["colour"] = np.ones((1, 1, 3), np.float16)
-    return settings | {"size": [1 << 16, 1 << 16], "texels": [1, 1]}
+    parts["colour"] = np.ones((1, 1, 1, 3), np.float16)
+    return settings | {"sizes": [[1 << 16, 1 << 16]], "texels": [1, 1]}
 
 
 def _no_weights(settings: Any, parts: dict[str, np.ndarray]) -> Any:

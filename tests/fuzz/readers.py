@@ -18,8 +18,7 @@ from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
 
 import wlm
 from benchmarks.rows import read_json
-from wlm.atlas.exporter import geometry, read_folder
-from wlm.atlas.scene.description import read_description
+from wlm.atlas.listing import read_listing
 from wlm.bake.geometry import read_geometry
 from wlm.bake.settings import LightmapSettings
 from wlm.config import load_settings
@@ -30,7 +29,7 @@ from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
-from wlm.formats.obj import read_obj
+from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
 from wlm.probe.data import load_positions
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
@@ -42,7 +41,7 @@ from wlm.smoke.scene import Scene
 from . import models
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
 from .mutate import corrupt, vary_json, vary_numbers, vary_text
-from .reader import Reader, check_finite, corpus, stored
+from .reader import Reader, check_finite, corpus
 from .textures import vary_dds, vary_ktx2, vary_radiance
 
 _PROFILES = Path(__file__).resolve().parents[2] / "configs"
@@ -131,24 +130,19 @@ def _mesh(path: Path) -> None:
 
 
 def _obj(path: Path) -> None:
-    mesh = read_obj(path)
+    mesh = read_mesh(path)
     assert not len(mesh.triangle) or mesh.triangle.max() < len(mesh.position), "a corner beyond the vertices"
     _lit(path)
 
 
 def _lit(path: Path) -> None:
-    mesh = wlm.atlas.load(path, path.with_name("light.exr"))
-    check_finite(position=mesh.position, uv=mesh.uv, lightmap=mesh.lightmap)
-    assert mesh.triangle.max() < len(mesh.position), "a corner beyond the vertices"
+    (sheet,) = wlm.atlas.load(path, path.with_name("light.exr")).sheets
+    check_finite(position=sheet.position, uv=sheet.uv, lightmap=sheet.lightmap)
+    assert sheet.triangle.max() < len(sheet.position), "a corner beyond the vertices"
 
 
 def _light() -> Mapping[str, bytes]:
     return {"light.exr": corpus("light.exr")()[0], "image.png": corpus("mask-grey.png")()[0]}
-
-
-def _exported(path: Path) -> None:
-    output = read_folder(path.parent)
-    check_finite(position=geometry(output).position)
 
 
 # Probes and volumes.
@@ -382,7 +376,7 @@ _ALL = (
     Reader(
         "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
     ),
-    Reader("atlas-lights", "lights.json", _light_lists, _json, read_description),
+    Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
@@ -458,14 +452,6 @@ _ALL = (
         _json,
         _frames,
         lambda: {"frame_0001.npz": corpus("volume.npz")()[0]},
-    ),
-    Reader(
-        "atlas-export",
-        "report.json",
-        corpus("report.json"),
-        _json,
-        _exported,
-        lambda: {"atlas.wlm": stored("atlas-tiles.wlm")()[0], "mesh.glb": corpus("mesh.glb")()[0]},
     ),
     Reader("bench-rows", "a.json", corpus("rows.json"), _json, read_json),
     _settings("yaml-lightmap", lambda: wlm.lightmap.Profile, "lightmap-*"),

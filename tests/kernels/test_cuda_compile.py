@@ -182,9 +182,9 @@ LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
     {"lattice": "D3Q19", "solids": True, "storage": "float16"},
     {"lattice": "D3Q19", "operator": "bgk", "force": "field"},
-    {"lattice": "D3Q27", "operator": "recursive", "solids": True, "force": "uniform"},
+    {"lattice": "D3Q27", "solids": True, "force": "uniform"},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
-    {"lattice": "D2Q9", "operator": "recursive"},
+    {"lattice": "D2Q9"},
 )
 
 

@@ -99,15 +99,12 @@ def _slow(*values: object) -> object:
 OPERATORS = [
     ("D2Q9", "bgk", 0.0),
     ("D2Q9", "regularised", 0.17),
-    ("D2Q9", "recursive", 0.0),
     ("D3Q19", "bgk", 0.0),
     _slow("D3Q19", "bgk", 0.17),
     ("D3Q19", "regularised", 0.0),
     ("D3Q19", "regularised", 0.17),
     _slow("D3Q27", "bgk", 0.0),
     ("D3Q27", "regularised", 0.17),
-    ("D3Q27", "recursive", 0.0),
-    _slow("D3Q27", "recursive", 0.17),
 ]
 
 
@@ -135,14 +132,12 @@ def test_operators(lattice: str, operator: str, smagorinsky: float, device: str)
     [
         ("bgk", "field"),
         ("regularised", "uniform"),
-        ("recursive", "field"),
         _slow("bgk", "uniform"),
         _slow("regularised", "field"),
-        _slow("recursive", "uniform"),
     ],
 )
 def test_forces(operator: str, kind: str, device: str):
-    lattice = "D3Q27" if operator == "recursive" else "D3Q19"
+    lattice = "D3Q19"
     force = np.array([1e-3, -2e-3, 5e-4])
     if kind == "field":
         force = 2e-3 * np.random.default_rng(5).uniform(-1, 1, (*_shape(lattice), 3))
@@ -200,7 +195,7 @@ def test_solids_alone(device: str):
 def test_solids_with_other_lattices(device: str):
     """The tables of links serve D3Q27 and D2Q9 as well."""
     solid = _obstacles()
-    pair = Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape, operator="recursive")
+    pair = Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape)
     _run(pair, steps=2)
     flat = np.zeros((6, 6, 1), int)
     flat[2:4, 2] = 1
@@ -238,10 +233,9 @@ def test_thin_domains(device: str):
 def test_spec_is_checked():
     for wrong in (
         {"lattice": "D3Q19", "operator": "trt"},
-        {"lattice": "D3Q19", "operator": "recursive"},
         {"lattice": "D3Q19", "storage": "bfloat16"},
         {"lattice": "D3Q19", "force": "some"},
-        {"lattice": "D3Q15", "operator": "recursive"},
+        {"lattice": "D3Q15"},
     ):
         with pytest.raises(ValueError):
             Spec(**wrong)

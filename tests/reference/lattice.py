@@ -4,11 +4,10 @@
     while True:
         f = stream(box, collide(box, f, operator, viscosity, smagorinsky, force))
 
-It shares nothing with the kernels: streaming asks for each cell and direction where the population comes from, and
-collision uses Hermite polynomials, those of the recursive operator by Malaspinas's recursion taken literally.
+It shares no code with the kernels: streaming finds for each cell and direction where the population comes from, and
+collision uses Hermite polynomials.
 """
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -64,43 +63,6 @@ def fields(box: Box, f: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.n
     return rho, (f @ box.c + 0.5 * force) / rho[..., None]
 
 
-def _hermite(order: int, c: np.ndarray) -> np.ndarray:
-    return [np.ones_like(c), c, c * c - CS2][order]
-
-
-def _recursive(c: np.ndarray, w: np.ndarray, u: np.ndarray, stress: np.ndarray) -> np.ndarray:
-    """Populations of a stress [3, 3] and of all orders above it."""
-    used = [a for a in range(3) if c[:, a].any()]
-
-    def coefficient(index: tuple[int, ...]) -> float:
-        if len(index) == 2:
-            return stress[index]
-        head, last = index[:-1], index[-1]
-        total = u[last] * coefficient(head)
-        for at, axis in enumerate(head):
-            rest = head[:at] + head[at + 1 :]
-            total += np.prod([u[a] for a in rest]) * stress[axis, last]
-        return total
-
-    out = np.zeros(len(c))
-    for orders in itertools.product(range(3), repeat=len(used)):
-        if sum(orders) < 2:
-            continue
-        index = tuple(a for a, k in zip(used, orders, strict=True) for _ in range(k))
-        polynomial = np.prod([_hermite(k, c[:, a]) for a, k in zip(used, orders, strict=True)], 0)
-        norm = np.prod([[1.0, CS2, 2 * CS2**2][k] for k in orders])
-        out += coefficient(index) * polynomial / norm
-    return w * out
-
-
-def _product(c: np.ndarray, w: np.ndarray, rho: float, u: np.ndarray) -> np.ndarray:
-    """The equilibrium of all orders that a lattice of products of one axis carries."""
-    terms = [
-        1 + c[:, a] * u[a] / CS2 + (c[:, a] ** 2 - CS2) * u[a] ** 2 / (2 * CS2**2) for a in range(3) if c[:, a].any()
-    ]
-    return w * rho * np.prod(terms, 0)
-
-
 def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsky: float, force) -> np.ndarray:
     """The populations that leave each cell, from those that have arrived."""
     c, w, out = box.c, box.w, np.empty_like(f)
@@ -121,11 +83,9 @@ def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsk
         shear = stress - axes * np.trace(stress) / np.trace(axes)
         if operator == "bgk":
             out[cell] = f[cell] - (f[cell] - f_eq) / tau + equilibrium(c, w, rho, after) - f_eq
-        elif operator == "regularised":
+        else:
             second = w * np.einsum("qab,ab->q", traceless, shear) / (2 * CS2**2)
             out[cell] = equilibrium(c, w, rho, after) + keep * second
-        else:
-            out[cell] = _product(c, w, rho, after) + keep * _recursive(c, w, u, shear)
     return out
 
 

@@ -15,7 +15,6 @@ from wlm.smoke.march.fine import bake
 from wlm.smoke.network import dataset
 from wlm.smoke.network.dataset import (
     ATTEMPTS,
-    STAGES,
     fixed_cameras,
     make_pool,
     make_validation,
@@ -142,7 +141,7 @@ def test_pools_share_no_sequence(few, validation):
 def test_reports_of_a_pool(pool):
     samples, reports = pool
     assert [(progress.done, progress.total) for progress in reports] == [(1, 3), (2, 3), (3, 3)]
-    assert _counts(reports)["samples"] == len(samples) and all(_counts(reports)[stage] > 0 for stage in STAGES)
+    assert _counts(reports)["samples"] == len(samples)
 
 
 def test_sequences_with_their_own_cells(monkeypatch):

@@ -8,12 +8,13 @@ import torch
 from builders.running import call, fails
 from builders.smoke_plumes import SPHERE, facing, plume, write_frames
 from PIL import Image
+from reference.flipbook import from_point
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import load_frames
-from wlm.smoke.flipbook.depth import encoded_depth, frames_depth, from_point, middle_depth
+from wlm.smoke.flipbook.depth import encoded_depth, frames_depth, middle_depth
 from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.march.fine import bake
 from wlm.smoke.synthetic import make_plume

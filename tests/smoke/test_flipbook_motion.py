@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from reference.flipbook import between
 from typer.testing import CliRunner
 
 from wlm import smoke
@@ -11,7 +12,6 @@ from wlm.cli.smoke import app
 from wlm.errors import WlmError
 from wlm.smoke.flipbook.motion import (
     ZERO,
-    between,
     encoded,
     frames_motion,
     mip_levels,

@@ -18,7 +18,7 @@ FRONT = View.of((0.2, 0.1, 1.0))
 def _shifted(mesh, by):
     """The lightmap and a number."""
     read = original(mesh)
-    return lambda uv, triangle, barycentric: read(uv, triangle, barycentric) + by
+    return lambda points, state: read(points, state) + by
 
 
 def test_a_view_shows_the_lightmap(device):
@@ -32,11 +32,11 @@ def test_a_view_shows_the_lightmap(device):
 def test_a_decoder_gets_the_corners_weights():
     mesh = charts()
 
-    def place(uv, number, weight):
-        corner = torch.from_numpy(mesh.uv[mesh.triangle].astype(np.float32))[number.long()]
-        interpolated = (corner * weight[:, :, None]).sum(1)
-        np.testing.assert_allclose(interpolated.numpy(), uv.numpy(), atol=1e-6)
-        return torch.ones(len(uv), 3)
+    def place(points, state):
+        corner = torch.from_numpy(mesh.sheets[0].uv[mesh.sheets[0].triangle].astype(np.float32))
+        interpolated = (corner[points.triangle.long()] * points.weight[:, :, None]).sum(1)
+        np.testing.assert_allclose(interpolated.numpy(), points.uv.numpy(), atol=1e-6)
+        return torch.ones(len(points.uv), 3)
 
     pictures, hit = draw(mesh, {"a": place}, FRONT, 48)
     assert (pictures["a"][hit] == 1).all() and hit.any()
@@ -94,7 +94,7 @@ def test_what_cannot_be_drawn(tmp_path):
         comparison(tmp_path / "a.png", mesh, {}, [FRONT])
     with pytest.raises(ValueError, match="one view"):
         comparison(tmp_path / "a.png", mesh, {"a": original(mesh)}, [])
-    with pytest.raises(WlmError, match="triangle: cannot draw it: it is visible in no view"):
+    with pytest.raises(WlmError, match="triangle: cannot draw it: no view shows it"):
         comparison(tmp_path / "a.png", mesh, {"a": original(mesh)}, [View.of((1, 0, 0))])
     with pytest.raises(WlmError, match="cannot write"):
         save_png(tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.uint8))

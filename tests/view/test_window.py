@@ -194,9 +194,9 @@ def test_a_lightmap_is_upright_and_not_mirrored(tmp_path, show):
 def test_atlases_of_each_method(kind, tmp_path, show):
     mesh = atlas_meshes.sheet()
     model = atlas_models.random_model(mesh, kind)
-    wlm.atlas.export(model, tmp_path / "sheet", mesh)
+    model.save(tmp_path / "sheet.wlm")
     _, light = atlas_meshes.write_files(tmp_path, mesh)
-    window = show(tmp_path / "sheet", original=light)
+    window = show(tmp_path / "sheet.wlm", original=light)
     decoded, original, _ = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.ptp(decoded) > 100 and np.abs(decoded - original).max() > 20
     if kind == "cascade":
@@ -220,7 +220,7 @@ def test_the_input_of_an_atlas(tmp_path, show):
 
 
 def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
-    model = probe_models.random_model(probes=200, positions=True)
+    model = probe_models.whole_model(probes=200, positions=True)
     model.save(tmp_path / "room.wlm")
     places = model.stored_positions()
     save_probes(tmp_path / "room.npz", places, probe_sets.synthetic(200).values)
@@ -428,7 +428,7 @@ def test_the_walls_of_a_room_are_left_out_from_outside(lightmaps, tmp_path, show
 
 
 def test_a_ball_in_a_room_is_under_the_cursor_before_the_wall_behind_it(tmp_path, show):
-    model = probe_models.random_model(count=12, probes=40, positions=True)
+    model = probe_models.whole_model(count=12, probes=40, positions=True)
     model.save(tmp_path / "probe.wlm")
     places = model.stored_positions()
     rooms.write_room(tmp_path / "room.glb", places.min(0) - 1.0, places.max(0) + 1.0)
@@ -474,8 +474,8 @@ def test_the_command_writes_a_picture_and_a_movie(lightmaps, tmp_path, show):
 
 
 def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
-    probe_models.random_model(positions=False).save(tmp_path / "probe.wlm")
-    probe_models.random_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
+    probe_models.whole_model(positions=False).save(tmp_path / "probe.wlm")
+    probe_models.whole_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
     small_sets.write_set(tmp_path / "half", small_sets.moving_light(height=64))
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no archive")
     six_way(tmp_path / "a.exr", size=8)
@@ -486,7 +486,6 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
         ([tmp_path / "absent.wlm"], {}, "absent.wlm: no such file or folder"),
         ([tmp_path / "bad.npz"], {}, "bad.npz"),
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
-        ([FILES / "atlas-tiles.wlm"], {}, "expected the folder"),
         ([four, four], {}, "expected one file"),
         ([four], {"key": "sh"}, "--key means nothing"),
         ([four], {"walk": four}, "--walk means nothing"),

@@ -1,22 +1,24 @@
-"""A mesh's lightmap as a small colour texture, read through a look-up table (lightmap-uv-clustering-cascade)."""
+"""Lightmaps of a scene as a small colour texture, read through a lookup texture (lightmap-uv-clustering-cascade)."""
 
 from wlm._facade import facade
 
 _PLACES = {
     "AtlasModel": "wlm.atlas.model",
     "Decoder": "wlm.atlas.decode",
-    "LightmappedMesh": "wlm.atlas.data",
+    "LightmappedScene": "wlm.atlas.data",
+    "Points": "wlm.atlas.views",
     "Profile": "wlm.atlas.model",
     "Report": "wlm.atlas.evaluation",
+    "Sheet": "wlm.atlas.data",
     "View": "wlm.ops.views",
+    "bundle": "wlm.atlas.bundles",
     "compare": "wlm.atlas.evaluation",
     "compress": "wlm.atlas.fit",
-    "describe": "wlm.atlas.exporter",
     "evaluate": "wlm.atlas.evaluation",
-    "export": "wlm.atlas.exporter",
     "from_arrays": "wlm.atlas.data",
+    "join": "wlm.atlas.data",
     "load": "wlm.atlas.data",
-    "read_folder": "wlm.atlas.exporter",
+    "open_checkpoint": "wlm.atlas.fit",
 }
 
 __all__ = sorted(_PLACES)

@@ -1,210 +1,311 @@
-"""The artifact of an atlas model: both textures in one file.
+"""The file of an atlas model: its textures, triangles and masks.
 
-Parts: `colour` (half [Hp, Wp, 3], uint32 [Hp, Wp] of RGB9E5, or uint8 [B, 16] where T_p is stored as blocks) and, where
-the model has them, `blocks` (uint8 [B, 16], the second texture of "mixed"), `tail` (uint8 [B, 16], the mips), `lut`
-(uint16 [Hc, Wc, 2]) and those of `corners`, or in earlier files `uv` (float32 [F, 3, 2]). Each is a zlib stream where
-that is smaller, `streams`.
+Parts: `colour` (half [pages, Hp, Wp, 3], uint32 [pages, Hp, Wp] for RGB9E5, or uint8 [1, B, 16] where T_p is stored as
+blocks), `mesh` (uint8, a `.glb` file), `mask` (uint8, the bits of all masks) and, where the model has them, `lut`
+(uint16 [Hc, Wc, 2 or 4]), `blocks` (uint8 [pages, B, 16], the second texture of "mixed"), `factor` (float32
+[M, C, 3]), `sheets` (int32 [rows, 7], `AtlasModel.table`), `tail` (uint8 [B, 16], the mips) and those of `corners`.
+Each is a zstd frame where that is smaller.
 """
 
 import math
-import os
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, JsonValue
 
-from wlm import system
 from wlm.atlas import colour
 from wlm.atlas.corners import PARTS, decode_corners, encode_corners
+from wlm.atlas.data import Placed
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
+    ENTRY,
     MOST_SIZE,
-    TAIL_OCTAVES,
+    SHORT_ENTRY,
     AtlasModel,
     Profile,
+    SheetPlace,
     check_area,
-    compression_ratio,
-    disk_ratio,
-    first_block_code,
+    extent,
     tail_blocks,
     tail_shapes,
     tile_counts,
     unpack_entries,
+    unpack_tiles,
 )
-from wlm.atlas.streams import deflated, inflated
+from wlm.atlas.stored import StoredScene
 from wlm.config import check_settings
-from wlm.formats.artifact import Artifact, read_artifact
+from wlm.formats.artifact import Artifact, encode_artifact
 from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.formats.zstd import pack_parts, unpack_parts
 from wlm.system import Header, Name
-from wlm.texels import MOST_SIDE
+from wlm.texels import MOST_SIDE, check_size
 
+_MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # along an axis of a part
+_GEOMETRY = ("mesh", "mask")
 
 _Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
+_Four = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class _Object(Header):
+    node: int = Field(ge=0)
+    label: Name
+    sheet: int = Field(ge=0)
+    scale_offset: _Four = [1.0, 1.0, 0.0, 0.0]
+
+
+class _Header(Header):
+    """The settings of a file. Sizes are rows and columns; `sizes` are those of the lightmaps."""
+
+    name: Name
+    method: Literal["tiles", "cascade", "plain", "shared"]
+    colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"]
+    states: Annotated[list[Name], Field(min_length=1)]
+    sheets: Annotated[list[Name], Field(min_length=1)]
+    sizes: list[_Size]
+    texels: _Size
+    block_texels: _Size | None = None
+    separate: Literal[True] | None = None
+    profile: Profile
+    objects: list[_Object]
+    uv_set: int = Field(ge=0)
+    metres: bool
+    hides: bool
+    report: dict[str, JsonValue]
+    parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Gives the settings, parts and source of a model's file. One seed gives one file: times are left out."""
+    """Gives the settings, parts and source of a model's file. One seed gives one file: times are left out.
+
+    Raises:
+        ValueError: The model holds no triangles.
+    """
+    stored = model.stored
+    if stored is None:
+        raise ValueError(f"{model.name}: expected a model with the triangles of its scene")
     settings = {
         "name": model.name,
         "method": model.method,
         "colour": model.colour,
-        "size": [model.height, model.width],
-        "texels": list(model.texels.shape[:2]),
+        "states": list(model.states),
+        "sheets": [each.name for each in model.sheets],
+        "sizes": [list(each.size) for each in model.sheets],
+        "texels": list(model.texels.shape[1:3]),
         "profile": model.profile.changes(),
+        "objects": [
+            {"node": each.node, "label": each.label, "sheet": each.sheet, "scale_offset": list(each.scale_offset)}
+            for each in stored.objects
+        ],
+        "uv_set": stored.uv_set,
+        "metres": stored.metres,
+        "hides": stored.hides,
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
-    parts = {"colour": model.texels, "lut": model.lut, "tail": model.tail} | encode_corners(model.uv)
+    parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor, "tail": model.tail}
+    parts |= encode_corners(model.uv)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
     elif model.colour != "half":
         parts["colour"] = pack_rgb9e5(model.texels)
-    if len(model.tail):
-        settings["tail"] = list(tail_shapes(model.height, model.width)[0])
     if model.colour == "mixed":
-        settings["block_texels"] = list(model.block_texels.shape[:2])
+        settings["block_texels"] = list(model.block_texels.shape[1:3])
         parts["blocks"] = model.blocks
-    streams, settings["parts"] = deflated({name: part for name, part in parts.items() if part.size})
-    return settings, streams, model.source
+    if model.method == "shared":
+        parts["sheets"] = model.table()
+        settings |= {"separate": True} if model.later else {}
+    parts["mask"] = np.packbits(np.concatenate([mask.ravel() for mask in stored.masks]))
+    parts["mesh"] = np.frombuffer(stored.glb, np.uint8)
+    frames, settings["parts"] = pack_parts({name: part for name, part in parts.items() if part.size})
+    return settings, frames, model.source
+
+
+def sizes(model: AtlasModel) -> tuple[int, int]:
+    """Bytes of a model's file, and of these the triangles and masks."""
+    settings, parts, source = encode(model)
+    whole = sum(memoryview(part).nbytes for part in encode_artifact(model.SYSTEM, settings, parts, source))
+    return whole, sum(parts[name].nbytes for name in _GEOMETRY)
 
 
 def decode(artifact: Artifact) -> AtlasModel:
     """Makes the model of an artifact, to the bit that was written.
 
     Raises:
-        WlmError: A setting is wrong, a block isn't one of its format, or a package that decodes blocks is missing.
+        WlmError: A setting is wrong, a block isn't one of its format, the triangles are damaged, or a package that
+            decodes blocks is missing.
         ValueError: The parts don't fit the settings; so with LookupError, TypeError and AttributeError.
     """
-    fields, size, second, parts = _checked(artifact)
-    stored, blocks = parts.pop("colour"), parts.pop("blocks")
-    textures = {"texels": stored}
-    if fields["colour"] in colour.BLOCK_CODECS:
-        textures = {"texels": colour.decode(stored, *size, fields["colour"]).astype(np.float16), "blocks": stored}
-    elif fields["colour"] != "half":
-        textures = {"texels": unpack_rgb9e5(stored).astype(np.float16)}
-    if fields["colour"] == "mixed":
-        decoded = colour.decode(blocks, *second, BLOCKS).astype(np.float16)
-        textures |= {"blocks": blocks, "block_texels": decoded}
-    return AtlasModel(**fields, **textures, **parts)
-
-
-def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Says what a file holds. It is checked as when it is loaded, but for its blocks, which no package has to decode.
-
-    Returns:
-        JSON's own types: name, method, colour, bytes, sizes as width and height, number of triangles with new UVs,
-        compression ratios by eq. 9 and on disk, source, bytes by part, the model's report and the profile.
-
-    Raises:
-        WlmError: As `wlm.load`, but for the blocks.
-    """
-    artifact = read_artifact(path, AtlasModel.SYSTEM)
-    fields, texels, second, parts = system.decode(path, artifact, _checked)
-    size, lut = (fields["height"], fields["width"]), parts["lut"].shape[:2]
-    return {
-        "name": fields["name"],
-        "method": fields["method"],
-        "colour": fields["colour"],
-        "bytes": artifact.file_bytes,
-        "size": list(size[::-1]),
-        "colour_size": list(texels[::-1]),
-        "block_size": list(second[::-1]),
-        "lut_size": list(lut[::-1]),
-        "new_uvs": len(parts["uv"]),
-        "cr": compression_ratio(texels, lut, size, fields["colour"], second, len(parts["tail"])),
-        "cr_disk": disk_ratio(artifact.file_bytes, size),
-        "source": artifact.source,
-        "parts": {"header": artifact.header_bytes} | artifact.parts,
-        "found": fields["report"],
-        "profile": fields["profile"].model_dump(mode="json"),
-    }
-
-
-class _Header(Header):
-    """The settings of a file.
-
-    `size`, `texels`, `block_texels` and `tail` are rows and columns of the lightmap, of T_p, of its second texture and
-    of the first level of the mips.
-    """
-
-    name: Name
-    method: Literal["tiles", "cascade", "plain"]
-    colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"]
-    size: _Size
-    texels: _Size
-    block_texels: _Size | None = None
-    tail: _Size | None = None
-    profile: Profile
-    report: dict[str, JsonValue]
-    parts: dict[str, list[Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = {}
-
-
-def _checked(
-    artifact: Artifact,
-) -> tuple[dict[str, Any], tuple[int, int], tuple[int, int], dict[str, np.ndarray]]:
-    """Checks the settings and the parts, but not what blocks decode to.
-
-    Returns:
-        The fields of `AtlasModel` but for its arrays; rows and columns of T_p and of the second texture of "mixed",
-        else (0, 0); and the parts.
-    """
     header = check_settings(_Header, artifact.settings, "setting ")
-    (height, width), texels = header.size, tuple(header.texels)
-    blocks = math.prod(colour.block_grid(*texels))
-    mixed, second = header.colour == "mixed", tuple(header.block_texels or (0, 0))
-    if mixed != (header.block_texels is not None) or any(side % BLOCK_SIDE for side in second):
-        raise ValueError("setting block_texels: expected multiples of 4 of colour mixed alone")
-    if mixed and header.method != "tiles":
-        raise ValueError(f"setting colour: expected one texture for method {header.method}, found mixed")
+    for size in header.sizes:
+        check_size(*size)
+    parts = _checked_parts(header, artifact)
+    texels, second = tuple(header.texels), tuple(header.block_texels or (0, 0))
+    stored, blocks = parts["colour"], parts["blocks"]
+    textures = {"texels": stored}
+    if header.colour in colour.BLOCK_CODECS:
+        decoded = colour.decode(stored[0], *texels, header.colour).astype(np.float16)
+        textures = {"texels": decoded[None], "blocks": stored}
+    elif header.colour != "half":
+        textures = {"texels": unpack_rgb9e5(stored).astype(np.float16)}
+    if len(blocks):
+        pages = [colour.decode(page, *second, BLOCKS).astype(np.float16) for page in blocks]
+        textures |= {"blocks": blocks, "block_texels": np.stack(pages)}
+    places = _places(header, parts["sheets"])
+    held = sum(math.prod(each.shape[:3]) for name, each in textures.items() if name.endswith("texels"))
+    for place in places:
+        check_area(place.size, held, math.prod(parts["lut"].shape[:2]))
+    stride = len(places) // (len(header.states) if header.separate else 1)
+    count = len(header.sheets)
+    objects = tuple(Placed(each.node, each.label, each.sheet, tuple(each.scale_offset)) for each in header.objects)
+    kept = StoredScene(
+        parts["mesh"].tobytes(), objects, header.uv_set, header.metres, header.hides, _masks(header, parts["mask"])
+    )
+    model = AtlasModel(
+        name=header.name,
+        source=artifact.source,
+        profile=header.profile,
+        method=header.method,
+        colour=header.colour,
+        states=tuple(header.states),
+        sheets=tuple(places[:count]),
+        lut=parts["lut"],
+        factor=parts["factor"],
+        levels=tuple(places[count:stride]),
+        later=tuple(places[stride:]),
+        tail=parts["tail"],
+        uv=decode_corners({name: parts[name] for name in PARTS}),
+        stored=kept,
+        report=header.report,
+        **textures,
+    )
+    _check_tiles(model)
+    return model
+
+
+def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]:
+    """The parts, of the types and shapes that the settings ask for."""
+    shared, method = header.method == "shared", header.method
+    texels, second = tuple(header.texels), header.block_texels
+    if len(header.sizes) != len(header.sheets):
+        raise ValueError(f"setting sizes: expected {len(header.sheets)}, one for each sheet, found {len(header.sizes)}")
+    height, width = header.sizes[0]
+    if not (shared or len(header.sheets) == len(header.states) == 1):
+        raise ValueError("setting sheets: expected one sheet and one state, or shared tiles")
+    if {each.sheet for each in header.objects} != set(range(len(header.sheets))):
+        raise ValueError(f"setting objects: expected a node for each of {len(header.sheets)} sheets")
+    if header.separate and not shared:
+        raise ValueError("setting separate: expected shared tiles")
+    if (second is None) == (header.colour == "mixed") or any(side % BLOCK_SIDE for side in second or ()):
+        raise ValueError("setting block_texels: expected multiples of 4 with colour mixed, and none without")
+    if header.colour == "mixed" and method in ("cascade", "plain"):
+        raise ValueError(f"setting colour: expected one texture for method {method}, found mixed")
+    if shared and header.colour not in ("rgb9e5", "mixed"):
+        raise ValueError(f"setting colour: expected rgb9e5 or mixed for shared tiles, found {header.colour}")
+    pages = None if shared else 1
+    grid = math.prod(colour.block_grid(*texels))
     colours = {
-        "half": Part(np.float16, (*texels, 3), least=0.0),
-        "bc6h": Part(np.uint8, (blocks, 16)),
-        "astc": Part(np.uint8, (blocks, 16)),
+        "half": Part(np.float16, (1, *texels, 3), least=0.0),
+        "bc6h": Part(np.uint8, (1, grid, 16)),
+        "astc": Part(np.uint8, (1, grid, 16)),
     }
+    luts = {
+        "tiles": (*tile_counts(height, width, header.profile.tile), SHORT_ENTRY),
+        "cascade": (None, None, 2),
+        "plain": (0, 0, 2),
+        "shared": (None, None, None),
+    }
+    tail = sum(tail_blocks(*shape) for shape in tail_shapes(height, width))
+    factors = (len(header.states), None, 3) if shared else (0, 0, 3)
+    rows = (None, 7) if shared else (0, 7)
+    bits = sum(math.prod(size) for size in header.sizes)
     table = {
-        "colour": colours.get(header.colour, Part(np.uint32, texels)),
-        "blocks": Part(np.uint8, (math.prod(second) // BLOCK_SIDE**2, 16), optional=not mixed),
-        "lut": {
-            "tiles": Part(np.uint16, (*tile_counts(height, width, header.profile.tile), 2)),
-            "cascade": Part(np.uint16, (None, None, 2)),
-            "plain": Part(np.uint16, (0, 0, 2)),
-        }[header.method],
-        "tail": Part(np.uint8, (sum(tail_blocks(*shape) for shape in tail_shapes(height, width)), 16), optional=True),
-        "uv": Part(np.float32, (None, 3, 2), optional=True, least=0.0, most=1.0),
+        "colour": colours.get(header.colour, Part(np.uint32, (pages, *texels))),
+        "lut": Part(np.uint16, luts[method]),
+        "factor": Part(np.float32, factors, least=-_MOST_FACTOR, most=_MOST_FACTOR, optional=not shared),
+        "sheets": Part(np.int32, rows, least=0, optional=not shared),
+        "blocks": Part(np.uint8, (pages, math.prod(second or (0,)) // BLOCK_SIDE**2, 16), optional=second is None),
+        "tail": Part(np.uint8, (tail, 16), optional=True),
+        "mesh": Part(np.uint8, (None,)),
+        "mask": Part(np.uint8, (-(-bits // 8),)),
         **PARTS,
     }
-    parts = check_parts(inflated(artifact.tensors, header.parts, table), table)
-    # The first files with mips had levels of any sides.
-    first_level = header.tail or [-(-side >> TAIL_OCTAVES) for side in (height, width)]
-    if len(parts["tail"]) and tuple(first_level) != tail_shapes(height, width)[0]:
-        raise ValueError("setting tail: expected mips of whole blocks; compress again")
-    lut, corners = parts["lut"], decode_corners({name: parts.pop(name) for name in PARTS})
-    if len(corners):
-        if len(parts["uv"]):
-            raise ValueError("part uv: expected corners in one way, found two")
-        parts["uv"] = corners
-    if header.method == "cascade" and not lut.size:
-        raise ValueError("part lut is empty")
-    if header.method == "tiles":
-        code = first_block_code(header.colour, texels)
-        first, size, of_blocks = unpack_entries(lut, code)
+    parts = check_parts(unpack_parts(artifact.tensors, header.parts, table), table)
+    if not parts["colour"].size or (method == "cascade" and not parts["lut"].size):
+        raise ValueError("part colour, part lut: expected textures, found an empty one")
+    if shared and (len(parts["tail"]) or not all(parts[name].size for name in ("lut", "factor", "sheets"))):
+        raise ValueError("part lut, part factor, part sheets: expected all of them for shared tiles, and no tail")
+    if shared and parts["lut"].shape[2] not in (SHORT_ENTRY, ENTRY):
+        raise ValueError(f"part lut: expected entries of 2 or 4 numbers, found {parts['lut'].shape[2]}")
+    return parts
+
+
+def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The masks of all sheets."""
+    whole = np.unpackbits(bits).astype(bool)
+    ends = np.cumsum([0, *(math.prod(size) for size in header.sizes)])
+    masks = tuple(whole[a:b].reshape(size) for a, b, size in zip(ends, ends[1:], header.sizes, strict=False))
+    if not all(mask.any() for mask in masks):
+        raise ValueError("part mask: expected a texel of a chart in each sheet")
+    return masks
+
+
+def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
+    """The places of all sheets and levels, checked except for the bounds of the lookup texture."""
+    if header.method != "shared":
+        (size,), (name,) = header.sizes, header.sheets
+        grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)
+        return [SheetPlace(name, *size, 0, 0, *grid)]
+    count, states = len(header.sheets), len(header.states) if header.separate else 1
+    stride, rest = divmod(len(table), states)
+    if rest or stride < count:
+        raise ValueError(f"part sheets: expected {count} and levels for each state, found {len(table)}")
+    names, places = (list(header.sheets) + [""] * (stride - count)) * states, []
+    for number, row in enumerate(table.tolist()):
+        smaller, first = row[6], number // stride * stride
+        if smaller and not max(number, first + count - 1) < smaller < first + stride:
+            raise ValueError(f"part sheets: {row}: expected a level after it")
+        if smaller:
+            names[smaller] = names[number]
+        place = SheetPlace(names[number], *row)
+        if min(place.size) < 1 or (number - first < count and list(place.size) != header.sizes[number - first]):
+            raise ValueError(f"part sheets: {row}: expected the size of the sheet")
+        if (place.rows, place.columns) != tile_counts(*place.size, header.profile.tile):
+            raise ValueError(f"part sheets: {row}: expected the tiles of its size")
+        places.append(place)
+    return places
+
+
+def _check_tiles(model: AtlasModel) -> None:
+    """Checks that tiles lie within the textures, and sheets within the lookup texture.
+
+    Raises:
+        ValueError: One does not.
+    """
+    pages, texels, second = len(model.texels), model.texels.shape[1:3], model.block_texels.shape[1:3]
+    if model.method in ("tiles", "shared"):
+        code = model.first_block_code
+        most = MOST_SIZE if code else MOST_SIZE * BLOCK_SIDE
+        if max(texels) > most or max(second) > MOST_SIZE * BLOCK_SIDE:
+            raise ValueError(f"part colour: expected at most {most} texels along a side, found {max(texels)}")
+        first, size, of_blocks = unpack_entries(model.lut[..., :2], code)
         if (of_blocks[..., 0] != of_blocks[..., 1]).any():
             raise ValueError("part lut: a tile is of both textures")
-        most = MOST_SIZE if code else MOST_SIZE * BLOCK_SIDE
-        in_second = of_blocks & (header.colour == "mixed")
-        if max(texels) > most or ((first + size) > np.where(in_second, second[::-1], texels[::-1])).any():
+        in_second = of_blocks[..., 0] & (model.colour == "mixed")
+        count, page = np.ones(in_second.shape, np.int64), np.zeros(in_second.shape, np.int64)
+        if model.method == "shared":
+            _, _, component, count, page, _, coarse = unpack_tiles(model.lut, code)
+            if (coarse > np.where(in_second, count, 0)).any():
+                raise ValueError("part lut: expected coarse components of tiles of blocks alone, at most all of them")
+            if (component + count >= model.factor.shape[1]).any():
+                raise ValueError("part lut: a tile reaches beyond the factors")
+            size = np.where(count[..., None] > 0, extent(size, count, coarse), size)
+        beyond = ((first + size) > np.where(in_second[..., None], second[::-1], texels[::-1])).any(-1)
+        beyond |= page >= np.where(in_second, len(model.block_texels), pages)
+        if (beyond & (count > 0)).any():
             raise ValueError("part lut: a tile reaches beyond the colour texture")
-    check_area((height, width), (1, math.prod(texels) + math.prod(second)), lut.shape[:2])
-    fields = {
-        "name": header.name,
-        "source": artifact.source,
-        "profile": header.profile,
-        "method": header.method,
-        "colour": header.colour,
-        "height": height,
-        "width": width,
-        "report": header.report,
-    }
-    return fields, texels, second, parts
+    for place in model.rows:
+        if place.row + place.rows > model.lut.shape[0] or place.column + place.columns > model.lut.shape[1]:
+            raise ValueError(f"part sheets: {place.name}: reaches beyond the lookup texture")

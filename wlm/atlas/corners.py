@@ -1,8 +1,8 @@
-"""New UVs of triangles' corners as a file holds them: places once, triangles that share texels once.
+"""New UVs of triangles' corners in a file: each place once, and triangles that share texels once.
 
 A place has 16 bits along each axis. Triangles of a group read the same texels, in one of the six orders of the corners:
 three places are one stored triangle, in rising order, and each triangle of the mesh names it and its order. Places and
-stored triangles are in the order of their first use. Bytes of equal weight lie together, which a stream of zlib likes.
+stored triangles are in the order of their first use. Bytes of equal weight are stored together, which packs better.
 """
 
 import itertools
@@ -13,7 +13,7 @@ import numpy as np
 from wlm.formats.parts import Part
 
 STEPS = 65535.0
-"""The integer of a coordinate of 1."""
+"""The integer that is a coordinate of 1."""
 
 PARTS = {
     "uv_place": Part(np.uint8, (2, 2, None), optional=True),
@@ -26,21 +26,26 @@ _ORDERS = np.array(list(itertools.permutations(range(3))))
 
 
 def snapped(uv: np.ndarray) -> np.ndarray:
-    """UVs in [0, 1] at the nearest places that a file holds, float32."""
+    """Rounds UVs in [0, 1] to the nearest places that a file holds, float32."""
     return (np.rint(np.asarray(uv, np.float64) * STEPS) / STEPS).astype(np.float32)
 
 
 def encode_corners(uv: np.ndarray) -> dict[str, np.ndarray]:
-    """Encodes corners, or keeps them as they are where they aren't `snapped`: those of earlier files.
+    """Encodes corners.
 
     Args:
-        uv: float32 [F, 3, 2].
+        uv: float32 [F, 3, 2], `snapped`.
 
     Returns:
-        The parts.
+        The parts; none for no corners.
+
+    Raises:
+        ValueError: The corners are not at places that a file holds.
     """
-    if not len(uv) or not np.array_equal(snapped(uv), uv):
-        return {"uv": uv}
+    if not len(uv):
+        return {}
+    if not np.array_equal(snapped(uv), uv):
+        raise ValueError("uv: expected places of 16 bits")
     place = np.rint(uv.reshape(-1, 2).astype(np.float64) * STEPS).astype(np.int64)
     place, corner = _by_first_use(place)
     triangle = corner.reshape(-1, 3)
@@ -67,7 +72,7 @@ def decode_corners(parts: Mapping[str, np.ndarray]) -> np.ndarray:
         float32 [F, 3, 2]; [0, 3, 2] where the parts are empty.
 
     Raises:
-        ValueError: A part is missing or of another length, or a triangle or a place is named that isn't there.
+        ValueError: A part is missing or has another length, or names a triangle or place that isn't there.
     """
     sizes = [parts[name].size for name in PARTS]
     if not any(sizes):
@@ -87,17 +92,17 @@ def decode_corners(parts: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _by_first_use(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows in the order of their first use, and the number of each row among them."""
+    """Gives the distinct rows in the order of their first use, and the number of each row among them."""
     _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return rows[np.sort(first)], rank[number.reshape(-1)]
 
 
 def _planes(values: np.ndarray) -> np.ndarray:
-    """Bytes [itemsize, ...] of numbers, the lowest first."""
+    """Splits numbers into bytes [itemsize, ...], the lowest first."""
     return np.moveaxis(np.ascontiguousarray(values).view(np.uint8).reshape(*values.shape, -1), -1, 0)
 
 
 def _joined(planes: np.ndarray) -> np.ndarray:
-    """`_planes` turned round, int64."""
+    """Inverts `_planes`, int64."""
     return sum(plane.astype(np.int64) << (8 * number) for number, plane in enumerate(planes))

@@ -1,18 +1,29 @@
-"""Input: a mesh with lightmap UVs and its lightmap, read from files or arrays and checked; writing it with new UVs.
+"""Input: triangles with lightmap UVs and their lightmaps, read from files or arrays, checked and repaired.
 
-The stated behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of
-`LightmappedMesh.warnings`, with its count.
+A scene has sheets. A sheet is one layout of charts with a lightmap for each state (an hour, a directional layer, a
+shadow mask); the triangles of one object or of many read it. One mesh with one lightmap is a scene of one sheet and one
+state.
+
+The stated behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of `warnings`, with its
+count.
 
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
 no triangle, no UVs                   error
-several meshes that lie on each       the one that the lightmap fits best (`belonging`), the others left out; warning.
-other in UV space                     Error where none fits clearly better: `node` says which
+several meshes that overlap in UV     the one that the lightmap fits best (`matching`), the others left out;
+                                      warning. Error where none fits clearly better: `node` says which
 a lightmap that fits its charts       warning: `flip` turns it
 better upside down
-six times as long as wide             warning: such are a cube's faces, of a reflection probe
+six times as long as wide             warning: it may be the faces of a cube, of a reflection probe
 a primitive without the UV set        left out, and unchanged in what is written; warning
+nodes without a lightmap, beside a    hide what is behind them, and nothing else
+list of lightmaps
+a node that the list names and the    error that lists the nodes that the mesh has
+mesh lacks
+a sheet that no triangle reads        error
+lightmaps of one sheet that differ    error that names the file
+in size
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
 a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
@@ -20,7 +31,7 @@ triangles without area, in space or   kept, but not `active`: they take no part;
 in UV
 no triangle with area                 error
 UVs of less than a texel in all       warning
-overlapping UVs, a mesh drawn twice   fine: what shares texels is lit alike; warning
+overlapping UVs, a mesh drawn twice   read: all that share texels have one light; warning
 NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
 a speck inside, less than 3 texels    the same
 wide, above 16 times the light's
@@ -31,13 +42,14 @@ touches, its centre outside
 no finite texel inside                error
 negative inside                       the channel is clamped to 0; warning
 above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
-any of these outside                  0, 0 and 65,504, without a warning
+any of these outside                  replaced by the nearest texel inside, without a warning
 a mask of another size                error that names both files
 an empty mask                         error
-a mask that misses over 1% of the     warning: it may be of another UV set
+a mask that misses over 1% of the     warning: it may belong to another UV set
 texels whose centres are in triangles
 no mask                               derived: texels whose centre is in a triangle, and those that a
-                                      triangle touches at all unless they are 0, as texels never baked are
+                                      triangle touches at all unless they are 0 in every state, as texels
+                                      that were never baked are
 ====================================  ================================================================
 
 The method's inputs: lightmap-uv-clustering-cascade, section 3 (mesh, UVs and an HDR lightmap).
@@ -45,21 +57,22 @@ The method's inputs: lightmap-uv-clustering-cascade, section 3 (mesh, UVs and an
 
 import hashlib
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from wlm.atlas.belonging import chart_map, choose_mesh, fits_flipped, named, replace_strays
 from wlm.atlas.coverage import covered_texels, touched_texels
+from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, material_lightmaps, read_listing
+from wlm.atlas.matching import chart_map, choose_mesh, fits_flipped, named, replace_strays
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, document_from_arrays, read_gltf
-from wlm.formats.gltf_writer import Replacement, write_glb
+from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf, reported
 from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
-from wlm.formats.obj import read_obj
+from wlm.formats.meshes import SUFFIXES, read_mesh
 from wlm.ops.indoors import Indoors, indoors
 from wlm.texels import fill_gaps, repair
 
@@ -70,12 +83,12 @@ _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warn
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Where one primitive's vertices and triangles begin in the mesh; they keep their order.
+    """The place of one primitive's vertices and triangles in a sheet; they keep their order.
 
     Attributes:
         primitive: The primitive.
-        vertex: Number of its first vertex in the mesh.
-        triangle: Number of its first triangle in the mesh.
+        vertex: Number of its first vertex in the sheet.
+        triangle: Number of its first triangle in the sheet.
     """
 
     primitive: GltfPrimitive
@@ -83,24 +96,38 @@ class Part:
     triangle: int
 
 
-@dataclass(frozen=True, eq=False)
-class LightmappedMesh:
-    """A mesh and its lightmap, checked and repaired as the module's table says.
+@dataclass(frozen=True)
+class Placed:
+    """A node that reads a sheet.
 
     Attributes:
-        name: The mesh's name.
+        node: Its number in the document.
+        label: Its name.
+        sheet: Number of the sheet.
+        scale_offset: Its rectangle in the sheet, v down: UV times the first two numbers, plus the last two.
+    """
+
+    node: int
+    label: str
+    sheet: int
+    scale_offset: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A layout of charts, the triangles that read it, and its lightmaps.
+
+    Attributes:
+        name: Its name, for messages.
         position: float64 [V, 3], in the scene's space and unit, finite.
-        triangle: int32 [F, 3], at least one; each vertex is of one primitive.
+        triangle: int32 [F, 3], at least one; each vertex belongs to one primitive.
         uv: float64 [V, 2] in [0, 1]; u right, v down from the lightmap's top row.
         active: bool [F], false where a triangle has no area; at least one is true.
-        lightmap: float32 [H, W, 3], linear, finite, in [0, 65504].
+        lightmaps: float32 [M, H, W, 3], the lightmap of each state, linear, in [0, 65504], gaps filled from the
+            nearest texel of a chart. M is 0 for a sheet that was read from a model.
         mask: bool [H, W], true where a texel belongs to a chart; at least one is.
-        uv_set: n of the `TEXCOORD_n` that was read; 0 where the input is no glTF.
-        source: 16 hexadecimal digits of BLAKE2b over the mesh, the lightmap and the mask.
+        parts: The primitives that the triangles come from, in order.
         warnings: Repairs and oddities, one line each.
-        document: The file that the mesh came from, or one made for it.
-        parts: The primitives that make up the mesh, in order.
-        metres: Whether the unit is known to be the metre, as it is in glTF.
     """
 
     name: str
@@ -108,29 +135,94 @@ class LightmappedMesh:
     triangle: np.ndarray
     uv: np.ndarray
     active: np.ndarray
-    lightmap: np.ndarray
+    lightmaps: np.ndarray
     mask: np.ndarray
-    uv_set: int
-    source: str
-    warnings: tuple[str, ...]
-    document: GltfDocument
     parts: tuple[Part, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def lightmap(self) -> np.ndarray:
+        """The lightmap of the first state, float32 [H, W, 3]."""
+        return self.lightmaps[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """All triangles of a scene, sheet by sheet, then those without a lightmap.
+
+    Attributes:
+        position: float64 [V, 3].
+        triangle: int32 [F, 3].
+        uv: float64 [V, 2]; 0 without a lightmap.
+        sheet: int32 [F], the sheet that each triangle reads; -1 for those that only hide what is behind them.
+    """
+
+    position: np.ndarray
+    triangle: np.ndarray
+    uv: np.ndarray
+    sheet: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LightmappedScene:
+    """Triangles and their lightmaps, checked and repaired as the module's table says.
+
+    Attributes:
+        name: Its name, for messages.
+        states: Names of the M states.
+        sheets: At least one.
+        objects: The nodes that read the sheets.
+        blocker: float64 [B, 3, 3], triangles without a lightmap that hide what is behind them.
+        uv_set: n of the `TEXCOORD_n` that was read; 0 where the input is no glTF.
+        metres: Whether the unit is known to be the metre, as it is in glTF.
+        source: 16 hexadecimal digits of BLAKE2b over all sheets.
+        document: The file that the scene came from, or one made for it.
+    """
+
+    name: str
+    states: tuple[str, ...]
+    sheets: tuple[Sheet, ...]
+    objects: tuple[Placed, ...]
+    blocker: np.ndarray
+    uv_set: int
     metres: bool
+    source: str
+    document: GltfDocument
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The warnings of all sheets, each once."""
+        return tuple(dict.fromkeys(line for sheet in self.sheets for line in sheet.warnings))
+
+    @property
+    def texels(self) -> int:
+        """Texels of all lightmaps: of all sheets in all states."""
+        return max(len(self.states), 1) * sum(sheet.mask.size for sheet in self.sheets)
 
     @cached_property
-    def filled(self) -> np.ndarray:
-        """The lightmap with charts dilated into the gaps between them, float32 [H, W, 3]; not to be written to."""
-        return fill_gaps(self.lightmap, self.mask)
+    def triangles(self) -> Triangles:
+        """All triangles of the scene."""
+        first = np.cumsum([0, *(len(sheet.position) for sheet in self.sheets)])
+        owner = [np.where(sheet.active, number, -1) for number, sheet in enumerate(self.sheets)]
+        corners = self.blocker.reshape(-1, 3)
+        rest = first[-1] + np.arange(len(corners)).reshape(-1, 3)
+        moved = [sheet.triangle + start for sheet, start in zip(self.sheets, first, strict=False)]
+        return Triangles(
+            np.concatenate([*(sheet.position for sheet in self.sheets), corners]),
+            np.concatenate([*moved, rest]).astype(np.int32),
+            np.concatenate([*(sheet.uv for sheet in self.sheets), np.zeros((len(corners), 2))]),
+            np.concatenate([*owner, np.full(len(rest), -1)]).astype(np.int32),
+        )
 
     @cached_property
     def indoors(self) -> Indoors:
-        """Where viewers can stand in it, see `wlm.ops.indoors`."""
-        return indoors(self.position, self.triangle, metres=self.metres)
+        """The places where viewers can stand, see `wlm.ops.indoors`."""
+        return indoors(self.triangles.position, self.triangles.triangle, metres=self.metres)
 
 
 def load(
     mesh_path: str | os.PathLike[str],
-    lightmap_path: str | os.PathLike[str],
+    lights_path: str | os.PathLike[str] | None = None,
     *,
     mask_path: str | os.PathLike[str] | None = None,
     uv_set: int | None = None,
@@ -138,60 +230,65 @@ def load(
     encoding: str | None = None,
     flip: bool = False,
     trust: bool = False,
-) -> LightmappedMesh:
-    """Reads a mesh (`.glb`, `.gltf`, `.obj`) and its lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; PNG).
+) -> LightmappedScene:
+    """Reads a mesh or scene and its lightmaps.
 
     Args:
-        mesh_path: The mesh. All primitives that its scene draws and that have the UV set make one mesh, but where
-            they lie on each other in UV space, see the module's table.
-        lightmap_path: Linear RGB; row 0 is v = 0 of glTF, v = 1 of an `.obj`.
-        mask_path: A PNG of the lightmap's size; a texel belongs to a chart where any colour channel is above 0. None
-            derives it from the triangles.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes 1, where engines and viewers look for them, if any
-            primitive has it, else 0. An `.obj` has only 0.
-        node: The node that the lightmap belongs to, by its name, its mesh's name or its number; None: see above.
-        encoding: What the bytes of a PNG stand for, one of `wlm.formats.channels.ENCODINGS`; None: it is no PNG.
-        flip: Whether the lightmap is upside down, its top row v = 1 of glTF.
-        trust: Whether a glTF file may name files outside its folder, and draw more than its bytes account for
+        mesh_path: A `.glb`, `.gltf`, `.obj` or `.ply` file.
+        lights_path: One lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; or PNG), row 0 at v = 0 of glTF
+            and v = 1 of other formats; or a list of lightmaps, a folder of them or a bake, see `wlm.atlas.listing`;
+            None: the lightmaps that the materials name.
+        mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above
+            0. None derives it from the triangles.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes that of the list, else 1, where engines and viewers
+            look for them, if any primitive has it, else 0. Formats other than glTF have only 0.
+        node: With one lightmap, the node that it belongs to, by its name, its mesh's name or its number.
+        encoding: With one lightmap, the meaning of a PNG's bytes, one of `wlm.formats.channels.ENCODINGS`; None: the
+            file is no PNG.
+        flip: With one lightmap, whether its top row is v = 1 of glTF.
+        trust: Whether files may name files outside their folder, and draw more than their bytes account for
             (`wlm.formats.limits`).
-
-    Returns:
-        The mesh, repaired as the module's table says.
 
     Raises:
         WlmError: One line that names the file and the field, for each error of the module's table, and where a file
             is missing or damaged.
     """
     path = Path(mesh_path)
-    suffix = path.suffix.lower()
-    if suffix not in (".glb", ".gltf", ".obj"):
-        raise WlmError(f"{path}: expected a name that ends in .glb, .gltf or .obj, found {suffix or 'none'}")
-    if suffix == ".obj":
-        arrays = read_obj(path)
-        if not len(arrays.triangle):
-            raise WlmError(f"{path}: has no triangles")
-        if arrays.uv is None:
-            raise WlmError(f"{path}: the mesh has no UVs: expected vt, and f with them")
-        document, primitive = _document(str(path), path.stem, arrays.position, arrays.triangle, arrays.uv)
-        primitives = [primitive]
+    document, primitives, metres = _read_triangles(path, trust)
+    alone = not is_listing(lights_path)
+    if alone:
+        listing = lone_lightmap(lights_path, path.stem, mask_path, encoding, flip)
     else:
-        document, primitives = read_gltf(path, trust)
+        for name, value in {"mask": mask_path, "node": node, "encoding": encoding, "flip": flip or None}.items():
+            if value is not None:
+                raise WlmError(f"{name}: expected with one lightmap alone; a list of lightmaps states it")
+        listing = _listed(path, document, lights_path)
     if node is not None:
         primitives = named(str(path), primitives, node)
-    lightmap = read_light(lightmap_path)[0] if encoding is None else read_encoded(lightmap_path, encoding)
-    lightmap = np.array(lightmap[:: -1 if flip else 1, :, :3], np.float32, order="C")
-    mask = None if mask_path is None else read_mask(Path(mask_path), lightmap_path, lightmap.shape[:2])
-    return checked_mesh(
-        str(path),
-        path.stem,
-        document,
-        primitives,
-        uv_set,
-        lightmap,
-        mask,
-        str(lightmap_path),
-        str(mask_path),
-        metres=suffix != ".obj",
+    readers, uv_set, skipped = _select(str(path), primitives, listing.uv_set if uv_set is None else uv_set)
+    placed = None if listing.objects is None else _placed(str(path), readers, listing)
+    sheets, objects, used = [], [], set()
+    for number, files in enumerate(listing.sheets):
+        lightmaps, mask, names = _read_lightmaps(listing, files, trust)
+        label = files.name or Path(files.files[0]).stem
+        if placed is None:
+            chosen, warnings = choose_mesh(str(path), label, readers, uv_set, lightmaps[0])
+            nodes = {each.node: each.label for each in chosen}
+            objects += [Placed(each, name, number) for each, name in nodes.items()]
+        else:
+            chosen, warnings = [_moved(each, uv_set, place) for each, place in placed if place.sheet == number], []
+            objects += [place for _, place in placed if place.sheet == number]
+        if not chosen:
+            raise WlmError(f"{listing.path}: sheets[{number}]: no triangle reads it")
+        used |= {(each.node, each.primitive) for each in chosen}
+        warnings = skipped * alone + warnings
+        sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings))
+    rest = [] if alone else [each for each in primitives if (each.node, each.primitive) not in used]
+    blocker = np.concatenate([np.empty((0, 3, 3)), *(each.position[each.triangle] for each in rest)])
+    objects = tuple(dict.fromkeys(objects))
+    source = _hash(sheets)
+    return LightmappedScene(
+        path.stem, listing.states, tuple(sheets), objects, blocker, uv_set, metres, source, document
     )
 
 
@@ -202,78 +299,135 @@ def from_arrays(
     lightmap: np.ndarray,
     mask: np.ndarray | None = None,
     name: str = "array",
-) -> LightmappedMesh:
-    """Makes a checked mesh of arrays, under the same rules as `load`.
+    *,
+    metres: bool = False,
+) -> LightmappedScene:
+    """Makes a scene of one sheet of arrays, under the same rules as `load`.
 
     Args:
         position: [V, 3] of numbers, in any unit; rounded to float32, as files hold it.
         triangle: [F, 3] of integers, 0 to V - 1.
         uv: [V, 2] of numbers; u right, v down from the lightmap's top row; rounded to float32.
-        lightmap: [H, W, 3] of numbers, linear RGB; copied.
+        lightmap: [H, W, 3] of numbers, linear RGB, or [M, H, W, 3] for M states; copied.
         mask: [H, W], true where a texel belongs to a chart. None derives it from the triangles.
-        name: The mesh's name, used in messages too.
+        name: The scene's name, used in messages too.
+        metres: Whether the unit is the metre.
 
     Returns:
-        The mesh, repaired as the module's table says. Vertices that no triangle uses are left out.
+        The scene. Vertices that no triangle uses are left out.
 
     Raises:
         WlmError: A shape is wrong, or an error of the module's table.
     """
-    lightmap = np.asarray(lightmap)
-    if lightmap.ndim != 3 or lightmap.shape[2] != 3 or 0 in lightmap.shape:
-        raise WlmError(f"{name}: expected a lightmap [H, W, 3], none of them 0, got {lightmap.shape}")
+    light = np.asarray(lightmap)
+    light = light[None] if light.ndim == 3 else light
+    if light.ndim != 4 or light.shape[3] != 3 or 0 in light.shape:
+        raise WlmError(f"{name}: expected a lightmap [H, W, 3], none of them 0, got {np.shape(lightmap)}")
     valid = None if mask is None else np.array(mask).astype(bool)
-    if valid is not None and valid.shape != lightmap.shape[:2]:
-        raise WlmError(f"{name}: expected a mask of {lightmap.shape[:2]}, got {valid.shape}")
-    document, primitive = _document(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
-        copied = np.array(lightmap, np.float32, order="C")
-    return checked_mesh(name, name, document, [primitive], 0, copied, valid, f"{name}: lightmap", f"{name}: mask")
+    if valid is not None and valid.shape != light.shape[1:3]:
+        raise WlmError(f"{name}: expected a mask of {light.shape[1:3]}, got {valid.shape}")
+    mesh = _compact(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
+    document, primitives = document_from_meshes([mesh], name)
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinity and is repaired as infinity
+        copied = np.array(light, np.float32, order="C")
+    states = tuple(str(number) for number in range(len(copied)))
+    names = [f"{name}: lightmap{f' {state}' * (len(states) > 1)}" for state in states]
+    sheet = _checked(name, name, primitives, 0, copied, valid, [*names, f"{name}: mask"])
+    objects = (Placed(0, primitives[0].label, 0),)
+    source = _hash([sheet])
+    return LightmappedScene(name, states, (sheet,), objects, np.empty((0, 3, 3)), 0, metres, source, document)
 
 
-def write_mesh(
-    path: str | os.PathLike[str], mesh: LightmappedMesh, corner_uv: np.ndarray, uv_set: int | None = None
-) -> int:
-    """Writes the mesh's file again, with one more UV set and all else as it was, whole or not at all.
-
-    Corners of one vertex that have the same new UV stay one vertex; the others become vertices of their own with the
-    same attributes.
+def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> LightmappedScene:
+    """Makes one scene of several, with the sheets of all of them.
 
     Args:
-        path: The `.glb` to write; its folder must exist.
-        mesh: The mesh.
-        corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-        uv_set: n of the new `TEXCOORD_n`; None takes the one after the last that a primitive of the mesh has.
-
-    Returns:
-        n of the new set.
+        scenes: At least one, in one space and with the same number of states, whose names are those of the first.
+        name: The name of the new scene.
 
     Raises:
-        ValueError: The shape is wrong, a UV isn't finite, or a primitive has that set already.
-        WlmError: The file can't be written.
+        WlmError: The numbers of states differ.
     """
-    corner_uv = np.asarray(corner_uv, np.float32)
-    if corner_uv.shape != (len(mesh.triangle), 3, 2) or not np.isfinite(corner_uv).all():
-        raise ValueError(f"corner_uv: expected finite numbers [{len(mesh.triangle)}, 3, 2], got {corner_uv.shape}")
-    if uv_set is None:
-        uv_set = 1 + max(number for part in mesh.parts for number in part.primitive.uv)
-    replacements = []
-    for part in mesh.parts:
-        vertex = part.primitive.triangle.reshape(-1)
-        uv = corner_uv[part.triangle : part.triangle + len(part.primitive.triangle)].reshape(-1, 2) + np.float32(0.0)
-        # Compared by their bits; adding 0 above made -0 into 0.
-        key = np.stack([vertex.astype(np.uint32), *uv.view(np.uint32).T], axis=1)
-        distinct, corner = np.unique(key, axis=0, return_inverse=True)
-        new_uv = np.ascontiguousarray(distinct[:, 1:]).view(np.float32)
-        replacements.append(Replacement(part.primitive, distinct[:, 0].astype(np.int64), corner.reshape(-1, 3), new_uv))
-    write_glb(path, mesh.document, replacements, uv_set)
-    return uv_set
+    if len({len(scene.states) for scene in scenes}) != 1:
+        raise WlmError(f"{name}: expected scenes with the same number of states")
+    sheets = [sheet for scene in scenes for sheet in scene.sheets]
+    meshes = [(sheet.name, sheet.position, sheet.triangle, sheet.uv) for sheet in sheets]
+    document, primitives = document_from_meshes(meshes, name)
+    sheets = [replace(sheet, parts=(Part(each, 0, 0),)) for sheet, each in zip(sheets, primitives, strict=True)]
+    return LightmappedScene(
+        name,
+        scenes[0].states,
+        tuple(sheets),
+        tuple(Placed(number, each.label, number) for number, each in enumerate(primitives)),
+        np.concatenate([scene.blocker for scene in scenes]),
+        0,
+        all(scene.metres for scene in scenes),
+        _hash(sheets),
+        document,
+    )
 
 
-def _document(
-    where: str, name: str, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray
-) -> tuple[GltfDocument, GltfPrimitive]:
-    """Checks arrays' shapes and ranges, and makes a document of the vertices that triangles use."""
+def place_objects(
+    where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
+) -> tuple[tuple[Sheet, ...], np.ndarray]:
+    """Makes the sheets of a model, without lightmaps, of the triangles that its file holds.
+
+    Args:
+        where: The file, for messages.
+        primitives: As read.
+        uv_set: n of the lightmaps' `TEXCOORD_n`.
+        objects: The nodes that read the sheets, in the order of the sheets.
+        masks: bool [H, W] for each sheet.
+
+    Returns:
+        The sheets, and the triangles of all other nodes, float64 [B, 3, 3].
+
+    Raises:
+        WlmError: A sheet has no triangle, or an error of the module's table.
+    """
+    by_node: dict[int, list[GltfPrimitive]] = {}
+    for each in primitives:
+        by_node.setdefault(each.node, []).append(each)
+    sheets, used = [], set()
+    for number, mask in enumerate(masks):
+        chosen = [
+            _moved(each, uv_set, place)
+            for place in objects
+            if place.sheet == number
+            for each in by_node.get(place.node, ())
+            if uv_set in each.uv
+        ]
+        if not chosen:
+            raise WlmError(f"{where}: sheet {number}: no triangle reads it")
+        used |= {(each.node, each.primitive) for each in chosen}
+        lightmaps = np.empty((0, *mask.shape, 3), np.float32)
+        sheets.append(_checked(where, f"sheet {number}", chosen, uv_set, lightmaps, mask, [where]))
+    rest = [each.position[each.triangle] for each in primitives if (each.node, each.primitive) not in used]
+    return tuple(sheets), np.concatenate([np.empty((0, 3, 3)), *rest])
+
+
+def _read_triangles(path: Path, trust: bool) -> tuple[GltfDocument, list[GltfPrimitive], bool]:
+    """Reads a mesh file: its document, its primitives, and whether its unit is the metre."""
+    suffix = path.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        document, primitives = read_gltf(path, trust)
+        if not primitives:
+            raise WlmError(f"{path}: has no triangles")
+        return document, primitives, True
+    if suffix not in SUFFIXES:
+        names = ", ".join((".glb", ".gltf", *SUFFIXES))
+        raise WlmError(f"{path}: expected a name that ends in one of {names}, found {suffix or 'none'}")
+    arrays = read_mesh(path)
+    if not len(arrays.triangle):
+        raise WlmError(f"{path}: has no triangles")
+    if arrays.uv is None:
+        raise WlmError(f"{path}: the mesh has no UVs, or some of its triangles have none")
+    mesh = _compact(str(path), path.stem, arrays.position, arrays.triangle, arrays.uv)
+    return *document_from_meshes([mesh], path.stem), False
+
+
+def _compact(where: str, name: str, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray) -> Arrays:
+    """Checks arrays' shapes and ranges, and leaves out vertices that no triangle uses."""
     for field, array, kinds in (("position", position, "iuf"), ("triangle", triangle, "iu"), ("uv", uv, "iuf")):
         width = 2 if field == "uv" else 3
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
@@ -288,40 +442,108 @@ def _document(
         )
     used, corner = np.unique(triangle, return_inverse=True)
     with np.errstate(over="ignore"):  # `_check_finite` reports it as infinite
-        return document_from_arrays(position[used], corner.reshape(-1, 3), uv[used], name)
+        return name, position[used].astype(np.float32), corner.reshape(-1, 3), uv[used].astype(np.float32)
 
 
-def checked_mesh(
+def _listed(path: Path, document: GltfDocument, lights_path: str | os.PathLike[str] | None) -> Listing:
+    if lights_path is not None:
+        return read_listing(lights_path)
+    with reported(path):
+        listing = material_lightmaps(document)
+    if listing is None:
+        raise WlmError(f"{path}: no material has a lightmap (MOZ_lightmap): expected a list of them beside it")
+    return listing
+
+
+def _select(
+    where: str, primitives: list[GltfPrimitive], uv_set: int | None
+) -> tuple[list[GltfPrimitive], int, list[str]]:
+    """Selects the UV set and the primitives that have it; and a warning if some have not."""
+    sets = sorted({number for each in primitives for number in each.uv})
+    if not sets:
+        raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
+    if uv_set is None:
+        uv_set = 1 if 1 in sets else 0
+    selected = [each for each in primitives if uv_set in each.uv]
+    if not selected:
+        names = ", ".join(f"TEXCOORD_{number}" for number in sets)
+        raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {names}")
+    skipped = [each for each in primitives if uv_set not in each.uv]
+    if not skipped:
+        return selected, uv_set, []
+    line = (
+        f"{where}: {_count(len(skipped), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
+        f"{skipped[0].name}: left out"
+    )
+    return selected, uv_set, [line]
+
+
+def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[tuple[GltfPrimitive, Placed]]:
+    """The primitives that the objects of a list name, and their places."""
+    pairs = []
+    for each in listing.objects or ():
+        for primitive in named(where, readers, each.node):
+            pairs.append((primitive, Placed(primitive.node, primitive.label, each.sheet, tuple(each.scale_offset))))
+    places: dict[tuple[int, int], Placed] = {}
+    for primitive, place in pairs:
+        if places.setdefault((primitive.node, primitive.primitive), place) != place:
+            raise WlmError(f"{listing.path}: objects: {primitive.label} is given two lightmaps")
+    return list({(each.node, each.primitive): (each, place) for each, place in pairs}.values())
+
+
+def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitive:
+    """A primitive with UVs of the sheet."""
+    sx, sy, x, y = place.scale_offset
+    if (sx, sy, x, y) == (1.0, 1.0, 0.0, 0.0):
+        return primitive
+    uv = primitive.uv[uv_set] * np.float32([sx, sy]) + np.float32([x, y])
+    return replace(primitive, uv=primitive.uv | {uv_set: uv})
+
+
+def _read_lightmaps(
+    listing: Listing, files: SheetFiles, trust: bool
+) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask if it has one; and the names of these files."""
+    lightmaps: list[np.ndarray] = []
+    names = [str(listing.file(name, trust)) for name in files.files]
+    for path in names:
+        light = read_light(path)[0] if files.encoding is None else read_encoded(path, files.encoding)
+        light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32, order="C")
+        if files.intensity != 1.0:
+            with np.errstate(invalid="ignore", over="ignore"):  # repaired as infinity, as it may be in the file
+                light *= np.float32(files.intensity)
+        if lightmaps and light.shape != lightmaps[0].shape:
+            size, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
+            raise WlmError(f"{path}: expected {first} texels as the sheet's other lightmaps, found {size}")
+        lightmaps.append(light)
+    stack = np.stack(lightmaps) if len(lightmaps) > 1 else lightmaps[0][None]
+    mask_path = None if files.mask is None else listing.file(files.mask, trust)
+    mask = None if mask_path is None else read_mask(mask_path, names[0], stack.shape[1:3])
+    return stack, mask, [*names, str(mask_path)]
+
+
+def _checked(
     where: str,
     name: str,
-    document: GltfDocument,
-    primitives: list[GltfPrimitive],
-    uv_set: int | None,
-    lightmap: np.ndarray,  # [H, W, 3], repaired in place
+    primitives: Sequence[GltfPrimitive],
+    uv_set: int,
+    lightmaps: np.ndarray,  # [M, H, W, 3], repaired in place
     mask: np.ndarray | None,  # [H, W]
-    lightmap_name: str,
-    mask_name: str,
-    metres: bool = False,
-    choose: bool = True,
-) -> LightmappedMesh:
-    """Applies the module's table to the content of the files.
+    names: Sequence[str],
+    warnings: Sequence[str] = (),
+) -> Sheet:
+    """Applies the module's table to the triangles and lightmaps of a sheet.
 
     Args:
-        where, name: The file and the mesh, for messages.
-        document, primitives: As read.
-        uv_set: As for `load`.
-        lightmap: float32 [H, W, 3], repaired in place.
+        where, name: The mesh file and the sheet, for messages.
+        primitives: Those that read the sheet, with UVs of it.
+        uv_set: n of `TEXCOORD_n`.
+        lightmaps: float32 [M, H, W, 3]. With M = 0 the mask has to be given, and no light is checked.
         mask: bool [H, W]; None: derived.
-        lightmap_name, mask_name: For messages.
-        metres: As in `LightmappedMesh`.
-        choose: Whether of meshes that lie on each other in UV space one is chosen.
+        names: Names of the M lightmaps and of the mask, for messages.
+        warnings: Lines that come first.
     """
-    warnings: list[str] = []
-    primitives, uv_set = _select(where, primitives, uv_set, warnings)
-    if choose:
-        primitives, left_out = choose_mesh(where, name, primitives, uv_set, lightmap)
-        warnings += left_out
-    parts, vertices, triangles = [], 0, 0
+    warnings, parts, vertices, triangles = list(warnings), [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)
         parts.append(Part(primitive, vertices, triangles))
@@ -344,81 +566,60 @@ def checked_mesh(
         raise WlmError(f"{where}: no triangle has an area in space and in TEXCOORD_{uv_set}")
     if flat:
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
+    if len(lightmaps):
+        mask, lines = _checked_light(name, position, uv, triangle[active], uv_set, lightmaps, mask, names)
+        warnings += lines
+        lightmaps = fill_gaps(lightmaps, mask)
+    return Sheet(name, position, triangle, uv, active, lightmaps, mask, tuple(parts), tuple(warnings))
 
-    height, width = lightmap.shape[:2]
+
+def _checked_light(
+    name: str,
+    position: np.ndarray,
+    uv: np.ndarray,
+    triangle: np.ndarray,  # active ones
+    uv_set: int,
+    lightmaps: np.ndarray,
+    mask: np.ndarray | None,
+    names: Sequence[str],
+) -> tuple[np.ndarray, list[str]]:
+    """Derives or checks the mask and repairs the lightmaps in place; gives the mask and the warnings."""
+    warnings = []
+    height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):
-        warnings.append(f"{lightmap_name}: {width} x {height}, as a cube's six faces: is it a reflection probe?")
-    texels = _uv_area(uv, triangle[active]) * height * width
+        warnings.append(f"{names[0]}: {width} x {height}, as a cube's six faces: is it a reflection probe?")
+    texels = _uv_area(uv, triangle) * height * width
     if texels < 1.0:
         warnings.append(
             f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in TEXCOORD_{uv_set}: are "
             "its UVs in [0, 1]?"
         )
-    coverage = covered_texels(uv, triangle[active], height, width)
+    coverage = covered_texels(uv, triangle, height, width)
     overlaps = np.count_nonzero(coverage > 1)
     if overlaps:
         warnings.append(f"{name}: {_count(overlaps, 'texel')} in several triangles: their UVs overlap")
     if mask is None:
-        touched = touched_texels(uv, triangle[active], height, width)
+        touched = touched_texels(uv, triangle, height, width)
         # A baker that samples texel centres leaves the fringe of a chart at 0: a gap to fill, not darkness.
-        mask = touched & ((coverage > 0) | (lightmap != 0).any(axis=2))
+        mask = touched & ((coverage > 0) | (lightmaps != 0).any(axis=(0, 3)))
         if not mask.any():
             mask = touched
     else:
         if not mask.any():
-            raise WlmError(f"{mask_name}: the mask is empty: no texel belongs to a chart")
+            raise WlmError(f"{names[-1]}: the mask is empty: no texel belongs to a chart")
         missed, covered = np.count_nonzero((coverage > 0) & ~mask), np.count_nonzero(coverage)
         if missed > _MISSED * covered:
             warnings.append(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
-                f"is it of another UV set than TEXCOORD_{uv_set}, or upside down?"
+                f"does it belong to another UV set than TEXCOORD_{uv_set}, or is it upside down?"
             )
-    if fits_flipped(lightmap, chart_map(position, uv, triangle[active], height, width)):
-        warnings.append(f"{lightmap_name}: fits the mesh's charts better upside down: see flip (--flip)")
-    specks = replace_strays(lightmap, mask, coverage > 0)
-    if specks:
-        warnings.append(f"{lightmap_name}: {_count(specks, 'texel')} in specks far above all other light: replaced")
-    warnings += [f"{lightmap_name}: {text}" for text in repair(lightmap, mask, lightmap_name)]
-    source = _hash(position, triangle, uv, lightmap, mask)
-    return LightmappedMesh(
-        name,
-        position,
-        triangle,
-        uv,
-        active,
-        lightmap,
-        mask,
-        uv_set,
-        source,
-        tuple(warnings),
-        document,
-        tuple(parts),
-        metres,
-    )
-
-
-def _select(
-    where: str, primitives: list[GltfPrimitive], uv_set: int | None, warnings: list[str]
-) -> tuple[list[GltfPrimitive], int]:
-    """Selects the UV set and the primitives that have it."""
-    if not primitives:
-        raise WlmError(f"{where}: has no triangles")
-    sets = sorted({number for each in primitives for number in each.uv})
-    if not sets:
-        raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
-    if uv_set is None:
-        uv_set = 1 if 1 in sets else 0
-    selected = [each for each in primitives if uv_set in each.uv]
-    if not selected:
-        names = ", ".join(f"TEXCOORD_{number}" for number in sets)
-        raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {names}")
-    skipped = [each for each in primitives if uv_set not in each.uv]
-    if skipped:
-        warnings.append(
-            f"{where}: {_count(len(skipped), 'primitive')} of {len(primitives)} without TEXCOORD_{uv_set}, first "
-            f"{skipped[0].name}: left out"
-        )
-    return selected, uv_set
+    if fits_flipped(lightmaps[0], chart_map(position, uv, triangle, height, width)):
+        warnings.append(f"{names[0]}: fits the mesh's charts better upside down: see flip (--flip)")
+    for lightmap, path in zip(lightmaps, names, strict=False):
+        if specks := replace_strays(lightmap, mask, coverage > 0):
+            warnings.append(f"{path}: {_count(specks, 'texel')} in specks far above all other light: replaced")
+        warnings += [f"{path}: {text}" for text in repair(lightmap, mask, path)]
+    return mask, warnings
 
 
 def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
@@ -449,7 +650,7 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
 
 def _uv_area(uv: np.ndarray, triangle: np.ndarray) -> float:
-    """Sum of the triangles' areas in UV."""
+    """The sum of the triangles' areas in UV."""
     ab, ac = uv[triangle[:, 1]] - uv[triangle[:, 0]], uv[triangle[:, 2]] - uv[triangle[:, 0]]
     return 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum())
 
@@ -458,10 +659,11 @@ def _count(number: int, singular: str, plural: str | None = None) -> str:
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
-def _hash(*arrays: np.ndarray) -> str:
+def _hash(sheets: Sequence[Sheet]) -> str:
     """Hashes the input to 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
-    for array in arrays:
-        digest.update(np.asarray(array.shape, "<i8").tobytes())
-        digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
+    for sheet in sheets:
+        for array in (sheet.position, sheet.triangle, sheet.uv, sheet.lightmaps, sheet.mask):
+            digest.update(np.asarray(array.shape, "<i8").tobytes())
+            digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
     return digest.hexdigest()

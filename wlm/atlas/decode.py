@@ -1,14 +1,14 @@
-"""The runtime path: light from a compressed lightmap (lightmap-uv-clustering-cascade, eq. 7)."""
+"""The runtime path: light from compressed lightmaps (lightmap-uv-clustering-cascade, eq. 7)."""
 
 import numpy as np
 import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import Sheet
 from wlm.atlas.mips import Tail
 from wlm.atlas.model import LUT_STEPS, TAIL_OCTAVES, AtlasModel, tail_codec
-from wlm.atlas.views import corner_weights, texel_triangles
+from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas import cascade, decode
@@ -35,51 +35,86 @@ class Decoder:
             WlmError: No such device.
         """
         self.model, self.device = model, interop.check_device(device)
-        lut = model.lut
-        if model.method == "tiles":
+        if model.method in ("tiles", "shared"):
             # As stored: two bytes per number.
-            self._texels = wp.array(np.ascontiguousarray(model.texels), dtype=wp.vec3h, device=self.device)
-            self._lut = wp.array(np.ascontiguousarray(lut), dtype=wp.uint16, device=self.device)
-            self._second = {"first_block_code": model.first_block_code}
+            self._texels = self._blocks = self._halves(model.texels)
             if model.colour == "mixed":
-                blocks = wp.array(np.ascontiguousarray(model.block_texels), dtype=wp.vec3h, device=self.device)
-                self._second["blocks"] = blocks
+                self._blocks = self._halves(model.block_texels)
+            self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
+            self._sheets = wp.array(model.table(), dtype=int, device=self.device)
         else:
-            self._texels = wp.array(model.texels.astype(np.float32), dtype=float, device=self.device)
-            self._lut = wp.array((lut / np.float32(LUT_STEPS)).astype(np.float32), dtype=float, device=self.device)
+            lut = (model.lut / np.float32(LUT_STEPS)).astype(np.float32)
+            self._texels = wp.array(model.texels[0].astype(np.float32), dtype=float, device=self.device)
+            self._lut = wp.array(lut, dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
-        size = model.height, model.width
-        self._tail = Tail(model.tail, *size, tail_codec(model.colour), self.device) if len(model.tail) else None
+        self._tail = None
+        if len(model.tail):
+            self._tail = Tail(model.tail, *model.sheets[0].size, tail_codec(model.colour), self.device)
 
-    def read(self, uv: torch.Tensor, lod: torch.Tensor | None = None, own: torch.Tensor | None = None) -> torch.Tensor:
+    @property
+    def device_bytes(self) -> int:
+        """Memory that textures, tables and UVs take on the device, in bytes."""
+        arrays = {id(each): each for each in vars(self).values() if isinstance(each, wp.array)}
+        return sum(each.capacity for each in arrays.values()) + self._corner.nbytes + self.model.tail.nbytes
+
+    def _halves(self, texels: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
+
+    def factors(self, state: float) -> np.ndarray:
+        """Factors of a state for shared tiles, float32 [C, 3]; between two states, 0.5 for example, they are mixed.
+
+        Raises:
+            ValueError: The state is below 0 or above the last.
+        """
+        last = len(self.model.states) - 1
+        if not 0 <= state <= last:
+            raise ValueError(f"state: expected 0 to {last}, got {state}")
+        low = min(int(state), max(last - 1, 0))
+        near, far = self.model.factor[low], self.model.factor[min(low + 1, last)]
+        return (near + np.float32(state - low) * (far - near)).astype(np.float32)
+
+    def read(
+        self,
+        uv: torch.Tensor,
+        sheet: torch.Tensor | int = 0,
+        state: float = 0.0,
+        lod: torch.Tensor | None = None,
+        own: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Reads light at coordinates, as a shader does.
 
         Args:
-            uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the lightmap's.
-            lod: float32 [N], octaves of the lightmap's texels along a pixel, of a model with mips; None: up close.
-            own: With `lod`, of a model with new UVs: the lightmap's, which the mips are under.
+            uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the sheets'.
+            sheet: int [N], or one number for all points, 0 to S - 1.
+            state: 0 to M - 1, or between two states.
+            lod: float32 [N], octaves of the lightmap's texels along a pixel, for a model with mips; None: up close.
+            own: With `lod` and new UVs: the sheet's own UVs, under which the mips are read.
 
         Returns:
             float32 [N, 3].
 
         Raises:
-            ValueError: The model has no mips, or the lightmap's UVs are missing.
+            ValueError: No such state, the model has no mips, or the sheet's own UVs are missing.
         """
-        if lod is not None:
-            if self._tail is None:
-                raise ValueError("lod: expected a model with mips")
-            if own is None and len(self._corner):
-                raise ValueError("own: expected the lightmap's UVs beside the new ones, found none")
-            near, far = self.read(uv), self._tail.read(uv if own is None else own, lod)
-            return near + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - near)
+        if lod is not None and not self.model.mips:
+            raise ValueError("lod: expected a model with mips")
+        if self.model.method == "shared":
+            return self._read_shared(uv, sheet, state, lod)
+        if state != 0:
+            raise ValueError(f"state: expected 0 to 0, got {state}")
         uv = uv.contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
             self.run(interop.to_warp(uv, wp.vec2), out)
-        return out
+        if lod is None:
+            return out
+        if own is None and len(self._corner):
+            raise ValueError("own: expected the sheet's own UVs beside the new ones, found none")
+        far = self._tail.read(uv if own is None else own, lod)
+        return out + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - out)
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
-        """Reads light into an existing array; on CUDA the work is queued, not awaited.
+        """Reads light of a model with one lightmap into an existing array; on CUDA the work is queued, not awaited.
 
         Args:
             uv: vec2 [N], N at least 1.
@@ -87,84 +122,116 @@ class Decoder:
         """
         model = self.model
         if model.method == "tiles":
-            decode.decode(
-                uv,
-                model.height,
-                model.width,
-                model.profile.tile,
-                self._lut,
-                self._texels,
-                interop.to_warp(out, wp.vec3),
-                **self._second,
-            )
+            size, tile = model.sheets[0].size, model.profile.tile
+            textures = self._lut, self._texels[0], interop.to_warp(out, wp.vec3), self._blocks[0]
+            decode.decode(uv, *size, tile, *textures, model.first_block_code)
         else:
             cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))
 
-    def __call__(self, uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        """Reads light at points of the mesh.
-
-        Args:
-            uv: float32 [N, 2], the mesh's own UVs there.
-            triangle: int [N], the triangle of each point.
-            barycentric: float32 [N, 3], weights of its corners.
-
-        Returns:
-            float32 [N, 3].
-        """
+    def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
+        """Reads light at points of the scene, float32 [N, 3]."""
+        uv = points.uv
         if len(self._corner):
-            uv = (self._corner[triangle.long()] * barycentric[:, :, None]).sum(1)
-        return self.read(uv)
+            uv = (self._corner[points.triangle] * points.weight[:, :, None]).sum(1)
+        return self.read(uv, points.sheet, state)
 
-    def texels(self, mesh: LightmappedMesh) -> torch.Tensor:
-        """Decodes the texels of the mask, as `lightmap`.
+    def _read_shared(
+        self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Light of shared or separate tiles."""
+        factors, stride = self.factors(state), self.model.stride
+        if not isinstance(sheet, torch.Tensor):
+            sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
+        if not stride:
+            return self._read_rows(uv, sheet, factors, lod)
+        before = int(state)
+        light = self._read_rows(uv, sheet + before * stride, self.factors(before), lod)
+        if state == before:
+            return light
+        after = self._read_rows(uv, sheet + (before + 1) * stride, self.factors(before + 1), lod)
+        return light + (state - before) * (after - light)
+
+    def _read_rows(
+        self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Light of rows of the table of sheets, with a state's factors."""
+        if lod is not None:
+            return self._between(uv, row.long(), factors, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
+        uv, row = uv.contiguous(), row.int().contiguous()
+        out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
+        if len(uv):
+            factor = wp.array(factors, dtype=wp.vec3, device=self.device)
+            points = interop.to_warp(uv, wp.vec2), interop.to_warp(row)
+            textures = self._lut, self._texels, self._blocks, self.model.first_block_code
+            table = self._sheets, self.model.profile.tile, factor
+            decode.decode_shared(*points, *table, *textures, interop.to_warp(out, wp.vec3))
+        return out
+
+    def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
+        """Light between two levels of each row; level 0 is the row itself."""
+        smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
+        near, far = row, torch.where(smaller[row] > 0, smaller[row], row)
+        for number in range(1, 1 + len(self.model.levels)):
+            on = (level >= number) & (near != far)
+            if not bool(on.any()):
+                break
+            after = torch.where(smaller[far] > 0, smaller[far], far)
+            near, far = torch.where(on, far, near), torch.where(on, after, far)
+        share = (level - level.floor())[:, None]
+        below = self._read_rows(uv, near, factors)
+        return below + share * (self._read_rows(uv, far, factors) - below)
+
+    def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
+        """Decodes the texels of a sheet's mask, as `lightmap`.
 
         Args:
-            mesh: The mesh that was compressed.
+            sheet: The sheet that was compressed.
+            number: Its number.
+            state: As for `read`.
 
         Returns:
             float32 [K, 3], row by row, on the decoder's device.
 
         Raises:
-            WlmError: The model is of another mesh.
+            WlmError: The sheet has another size than the model's.
         """
+        height, width = sheet.mask.shape
+        if (height, width) != self.model.sheets[number].size:
+            raise WlmError(f"{sheet.name}: expected the sheet that the model was made of")
         if len(self._corner):
-            return torch.from_numpy(self.lightmap(mesh)[mesh.mask]).to(self.device)
-        self._check(mesh)
-        height, width = mesh.mask.shape
+            return torch.from_numpy(self._under_new_uvs(sheet)[sheet.mask]).to(self.device)
         step, parts = max(1, _TEXELS_AT_ONCE // width), []
         for first in range(0, height, step):
-            inside = torch.from_numpy(mesh.mask[first : first + step]).to(self.device)
+            inside = torch.from_numpy(sheet.mask[first : first + step]).to(self.device)
             row, column = torch.nonzero(inside, as_tuple=True)
             uv = torch.stack([(column.double() + 0.5) / width, (row.double() + first + 0.5) / height], 1)
-            parts.append(self.read(uv.float()))
+            parts.append(self.read(uv.float(), number, state))
         return torch.cat(parts)
 
-    def lightmap(self, mesh: LightmappedMesh) -> np.ndarray:
-        """Decodes the lightmap in its original layout.
+    def lightmap(self, sheet: int = 0, state: float = 0.0) -> np.ndarray:
+        """Decodes a lightmap in its original layout.
 
         Args:
-            mesh: The mesh that was compressed.
+            sheet: 0 to S - 1.
+            state: As for `read`.
 
         Returns:
             float32 [H, W, 3], zero outside of the mask. Where the mesh has new UVs, a texel of the mask whose centre is
             in no triangle has the value of the nearest texel whose centre is.
-
-        Raises:
-            WlmError: The model is of another mesh.
         """
-        height, width = mesh.mask.shape
+        own = self.model.scene.sheets[sheet]
+        result = np.zeros((*own.mask.shape, 3), np.float32)
+        result[own.mask] = self.texels(own, sheet, state).cpu().numpy()
+        return result
+
+    def _under_new_uvs(self, sheet: Sheet) -> np.ndarray:
+        """The lightmap of a model with new UVs, float32 [H, W, 3]; texels that no triangle holds are filled."""
+        height, width = sheet.mask.shape
         result = np.zeros((height, width, 3), np.float32)
-        if not len(self._corner):
-            result[mesh.mask] = self.texels(mesh).cpu().numpy()
-            return result
-        self._check(mesh)
-        triangle, barycentric = texel_triangles(mesh, height, width, self.device)
+        triangle, barycentric = texel_triangles(sheet, height, width, self.device)
         hit = triangle >= 0
         covered = hit.cpu().numpy()
-        # A model with new UVs ignores the first argument.
-        result[covered] = self(barycentric[hit], triangle[hit], corner_weights(barycentric[hit])).cpu().numpy()
-        return fill_gaps(result, covered) * mesh.mask[..., None] if covered.any() else result
-
-    def _check(self, mesh: LightmappedMesh) -> None:
-        if mesh.mask.shape != (self.model.height, self.model.width) or mesh.source != self.model.source:
-            raise WlmError(f"{mesh.name}: expected the mesh and lightmap that the model was made of")
+        weight = corner_weights(barycentric[hit])
+        uv = (self._corner[triangle[hit]] * weight[:, :, None]).sum(1)
+        result[covered] = self.read(uv).cpu().numpy()
+        return fill_gaps(result, covered) if covered.any() else result

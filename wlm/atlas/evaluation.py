@@ -1,13 +1,16 @@
-"""Error of a decoded lightmap in views of the mesh (lightmap-uv-clustering-cascade, section 4.1.4).
+"""Error of decoded lightmaps in views of the scene (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The mesh is drawn from cameras around it, `wlm.ops.views`, and as often by viewers who stand in it, where they can,
-`wlm.ops.indoors`. A pixel is the lightmap's linear RGB at its surface
-point, without any shading. The reference is the original lightmap read bilinearly, clamped, its gaps filled from the
-nearest texel of a chart. Only covered pixels count; a view without any is left out.
+The scene is drawn from cameras around it, `wlm.ops.views`, and as often by viewers who stand in it, where they can,
+`wlm.ops.indoors`. A pixel is the lightmap's linear RGB at its surface point, without any shading. The reference is the
+original lightmap read bilinearly, clamped, its gaps filled from the nearest texel of a chart. Only covered pixels
+count; a view without any is left out. A view is scored in every state, and figures are means over states and views.
 
-The peak of every PSNR and the range of SSIM are one number: maximum less minimum of the reference's covered pixels of
-all views. (The paper doesn't name its peak; one per view would change with the cameras.) A maximum above twice the
-99.9th percentile counts as that: one bright texel must not make every error small.
+The peak of every PSNR and the range of SSIM are one number for each state: maximum less minimum of the reference's
+covered pixels of all views. (The paper doesn't name its peak; one per view would change with the cameras.) A maximum
+above twice the 99.9th percentile counts as that: one bright texel must not make every error small.
+
+Errors are also taken as a screen shows them: light is exposed so that nearly all of the original's charts are below
+white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
 
 The stated behaviours:
 
@@ -29,6 +32,7 @@ NaN or Inf in decoded colours         error that names the decoder
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -36,30 +40,48 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from wlm import system
+from wlm.atlas import codec
 from wlm.atlas.charts import charts, welded
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
-from wlm.atlas.display import FLIP_VIEWS, Screen, ScreenTally, screen_exposure
-from wlm.atlas.model import AtlasModel, disk_ratio
+from wlm.atlas.model import AtlasModel
 from wlm.atlas.stages import one_thread
-from wlm.atlas.views import corner_weights, mesh_charts, mesh_views, texel_triangles, visible_uv
+from wlm.atlas.views import (
+    Points,
+    corner_weights,
+    points_at,
+    scene_views,
+    sheet_charts,
+    texel_triangles,
+    visible_uv,
+)
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics import SSIM_WINDOW
+from wlm.metrics import SSIM_WINDOW, flip_display
 from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
 from wlm.ops.views import View, Viewpoint
 from wlm.system import Meter, OnProgress
+from wlm.texels import exposure, to_srgb
 
-Sampler = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
-"""A decoder: the mesh's own UVs float32 [N, 2], triangles int32 [N] and barycentrics float32 [N, 3] of points, to
-linear RGB float [N, 3] or, for labels, to int [N]; all on one device."""
+Sampler = Callable[[Points, int], torch.Tensor]
+"""A decoder: points of a scene, on one device, and the number of a state, to linear RGB float [N, 3]."""
+
+Labels = Callable[[Points], torch.Tensor]
+"""Numbers of a decoder's own charts or tiles at points, int [N]."""
 
 VIEWS, RESOLUTION = 50, 512
 """Cameras of a score, as many as in section 4.1.4, and pixels along a side of a view, which the paper doesn't state."""
 
-_PERCENTILE, _ABOVE = 0.999, 2.0  # of the peak
+SHARED_VIEWS, SHARED_RESOLUTION = 24, 256
+"""The same for a scene of several lightmaps."""
+
+FLIP_VIEWS = 8
+"""FLIP is the mean of about this many views and states, evenly chosen: it takes longer than the rest of a score."""
+
+_PERCENTILE, _ABOVE = 0.999, 2.0  # see the peak
 _BINS, _OCTAVES = 8192, (-32.0, 32.0)  # of a histogram of light
+_ON_DEVICE = 1 << 32  # bytes of reference lightmaps that stay on the device
 
 # Wang et al. 2004, as in `wlm.metrics.structural`.
 _SIGMA, _C1, _C2 = 1.5, 0.01, 0.03
@@ -73,25 +95,27 @@ class Score(system.Report):
     """The error of a decoder.
 
     Attributes:
-        name: The mesh's name.
-        views: Number of views that show the mesh.
+        name: The scene's name.
+        views: Number of views that show a sheet.
         pixels: Covered pixels in all of them.
-        peak: Range of the reference there, of the PSNRs and SSIM, see the module.
-        brightest: Maximum of the reference there.
-        psnr: dB, the mean over views of each view's.
-        around_psnr, inside_psnr: The same of the views from around the mesh and of those from inside it.
-        inside_views: Number of views from inside that show the mesh.
-        eye_height: Of the viewers inside, above their floor, in the scene's unit; NaN where nobody can stand.
-        psnr_worst: dB, of the worst view.
+        peak: Range of the reference there, of the PSNRs and SSIM, see the module; mean over the states.
+        peaks: The same, by state.
+        brightest: Maximum of the reference there, in any state.
+        psnr: dB, the mean over states and views.
+        psnr_by_state: dB, means over the views.
+        around_psnr, inside_psnr: The same as `psnr` for the views from around the scene and for those from inside.
+        inside_views: Number of views from inside that show a sheet.
+        eye_height: Height of the viewers' eyes above their floor, in the scene's unit; NaN where nobody can stand.
+        psnr_worst: dB, of the worst view and state.
         worst_view: Its number among the cameras; -1: no view, or no peak.
-        one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over the views: a Gaussian window
-            of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. Uncovered pixels of both
-            pictures have the reference's nearest covered value.
+        one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over views and states: a Gaussian
+            window of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. Uncovered pixels of
+            both pictures have the reference's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
-        rest_error: Mean absolute error of all others.
+        rest_error: Mean absolute error of all other pixels.
         seam_ratio: `seam_error` over `rest_error`: 1 where seams don't stand out.
-        texel_psnr: dB, over the lightmap's texels that are in the mask and have their centre in a triangle.
-        tone_psnr: dB, the mean over views of each view's as a screen shows it, `wlm.atlas.display`.
+        texel_psnr: dB, over the texels that are in a mask and have their centre in a triangle; mean over the states.
+        tone_psnr: dB, the mean over views and states of each view's as a screen shows it.
         flip: Mean FLIP of some of the views as a screen shows them, 0 to 1.
     """
 
@@ -99,8 +123,10 @@ class Score(system.Report):
     views: int
     pixels: int
     peak: float
+    peaks: tuple[float, ...]
     brightest: float
     psnr: float
+    psnr_by_state: tuple[float, ...]
     around_psnr: float
     inside_psnr: float
     inside_views: int
@@ -121,82 +147,91 @@ class Report(Score):
     """The error and the size of a model.
 
     Attributes:
-        method: The model's.
+        method: The model's method.
         profile: Name of its settings.
         bytes: Size of its file.
-        cr: Compression ratio of both textures (eq. 9).
-        cr_disk: Compression ratio of the file.
+        geometry_bytes: Part of it that holds the triangles and masks.
+        gpu_bytes: Size of its textures and tables on a GPU.
+        cr: Compression ratio of the textures (eq. 9).
+        cr_disk: Compression ratio of the file without triangles and masks.
     """
 
     method: str
     profile: str
     bytes: int
+    geometry_bytes: int
+    gpu_bytes: int
     cr: float
     cr_disk: float
 
 
 def evaluate(
     model: AtlasModel,
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     *,
-    views: int | Sequence[View | Viewpoint] = VIEWS,
-    resolution: int = RESOLUTION,
+    views: int | Sequence[View | Viewpoint] | None = None,
+    resolution: int | None = None,
     device: str = "cpu",
     progress: OnProgress | None = None,
-    file_bytes: int | None = None,
 ) -> Report:
-    """Compares a model with the original lightmap.
+    """Compares a model with the original lightmaps.
 
-    Seams are the borders of the new UVs' charts, or of the lightmap's where the mesh keeps its UVs.
+    Seams are the borders of the new UVs' charts, or of the lightmaps' where the mesh keeps its UVs.
 
     Args:
         model: The model.
-        mesh: The mesh that was compressed, with its original lightmap.
+        scene: The scene that was compressed, with its original lightmaps.
         views, resolution, device, progress: As for `compare`.
-        file_bytes: Size of the model's file; None: `model.file_bytes()`.
 
     Raises:
-        WlmError: There is no such device.
+        WlmError: There is no such device, or the model was made of another scene.
     """
+    if model.source != scene.source:
+        raise WlmError(
+            f"{scene.name}: expected the scene that the model was made of, source {model.source}, found {scene.source}"
+        )
     decoder = Decoder(model, device)
-    labels = {"model": chart_labels(model, mesh, decoder.device)} if len(model.uv) else {}
+    labels = {"model": chart_labels(model, scene, decoder.device)} if len(model.uv) else {}
     options = {"views": views, "resolution": resolution, "device": device, "progress": progress}
-    score = compare(mesh, {"model": decoder}, labels=labels, **options)["model"]
-    size = model.file_bytes() if file_bytes is None else file_bytes
+    score = compare(scene, {"model": decoder}, labels=labels, **options)["model"]
+    whole, geometry = codec.sizes(model)
     return Report(
         **vars(score),
         method=model.method,
         profile=model.profile.name,
-        bytes=size,
+        bytes=whole,
+        geometry_bytes=geometry,
+        gpu_bytes=-(-model.bits // 8),
         cr=model.compression_ratio,
-        cr_disk=disk_ratio(size, (model.height, model.width)),
+        cr_disk=model.disk_ratio(whole - geometry),
     )
 
 
 def compare(
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     decoders: Mapping[str, Sampler],
     *,
-    views: int | Sequence[View | Viewpoint] = VIEWS,
-    resolution: int = RESOLUTION,
+    views: int | Sequence[View | Viewpoint] | None = None,
+    resolution: int | None = None,
     device: str = "cpu",
-    labels: Mapping[str, Sampler] | None = None,
+    labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmap. Each view is drawn once for all of them.
+    """Compares any decoders with the original lightmaps. Each view is drawn twice for all of them.
 
     On the CPU torch has one thread until it returns: 50 views of 512² take some seconds, FLIP about as much a decoder.
 
     Args:
-        mesh: The mesh with its original lightmap.
+        scene: The scene with its original lightmaps.
         decoders: By name; see `Sampler`.
-        views: Number of cameras, spread evenly on the sphere, and of views from inside; or the cameras.
-        resolution: Pixels along a side of a view, 1 to 16,384.
+        views: Number of cameras, spread evenly on the sphere, and of views from inside; or the cameras. None: `VIEWS`,
+            or `SHARED_VIEWS` for several lightmaps.
+        resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
-            Those of the others are the borders of the lightmap's charts, `mesh_charts`. Either way a border lies
-            between neighbouring pixels that show one triangle or two that share a corner in space, so that an outline
-            in front of something else is none.
+            Seams of the others are the borders of the lightmaps' charts. Either way a border lies between neighbouring
+            pixels that show one triangle or two that share a corner in space, so that an outline in front of something
+            else is none.
         progress: Called with the views done.
 
     Returns:
@@ -207,103 +242,153 @@ def compare(
         ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or labels name
             no decoder.
     """
-    device = check_device(device)
-    labels = dict(labels or {})
+    device, labels = check_device(device), dict(labels or {})
     unknown = sorted(labels.keys() - decoders.keys())
     if unknown:
         raise ValueError(f"labels: expected names of decoders, got {', '.join(unknown)}")
-    cameras = mesh_views(mesh, views) if isinstance(views, int) else list(views)
+    several = len(scene.sheets) * len(scene.states) > 1
+    views = (SHARED_VIEWS if several else VIEWS) if views is None else views
+    resolution = (SHARED_RESOLUTION if several else RESOLUTION) if resolution is None else resolution
+    cameras = scene_views(scene, views) if isinstance(views, int) else list(views)
     inside = [isinstance(camera, Viewpoint) for camera in cameras]
-    image = torch.tensor(mesh.filled, device=device)
-    chart = torch.tensor(mesh_charts(mesh), device=device)
+    states, reference = range(len(scene.states)), _Reference(scene, device)
+    chart = torch.tensor(_chart_numbers(scene), device=device)
     # Corners at one place in space have one number.
-    place = torch.tensor(welded(mesh.position, np.zeros_like(mesh.uv), mesh.triangle), device=device)
-    factor, stride = screen_exposure(mesh), max(1, len(cameras) // FLIP_VIEWS)
+    corners = scene.triangles
+    place = torch.tensor(welded(corners.position, np.zeros_like(corners.uv), corners.triangle), device=device)
+    stride = max(1, len(cameras) * len(states) // FLIP_VIEWS)
     meter = Meter(progress, "evaluate", len(cameras))
     with torch.no_grad(), one_thread(device):
-        peak, brightest = _peak(mesh, image, cameras, resolution)
-        tallies = {name: _Tally() for name in decoders}
-        for number, (visible, barycentric, uv) in enumerate(visible_uv(mesh, cameras, resolution, device)):
-            hit = visible >= 0
-            points = uv[hit], visible[hit], corner_weights(barycentric[hit])
-            if len(points[0]):
-                target = raster.texture(image, points[0]).double()
-                similarity = _Similarity(hit, target, peak)
-                screen = Screen(factor, hit, target, number % stride == 0)
-                chart_border = _near_border(visible, chart[visible.clamp(min=0).long()], place)[hit]
-                for name, decoder in decoders.items():
-                    error = _colours(decoder, points, mesh, name) - target
-                    border = chart_border
-                    if name in labels:
-                        label = torch.zeros(visible.shape, dtype=torch.int64, device=device)
-                        label[hit] = _labels(labels[name], points, name)
-                        border = _near_border(visible, label, place)[hit]
-                    tallies[name].add(number, error, border, similarity.mean(target + error))
-                    tallies[name].screen.add(*screen.errors(target + error))
+        peaks, brightest = _peaks(scene, reference, cameras, resolution, device)
+        tallies = {name: _Tally(len(states)) for name in decoders}
+        for number, (visible, barycentric, uv) in enumerate(visible_uv(scene, cameras, resolution, device)):
+            hit, points = points_at(scene, visible, barycentric, uv)
+            if len(points):
+                borders = {}
+                for name in (None, *labels):
+                    label = torch.zeros(visible.shape, dtype=torch.int64, device=device)
+                    label[hit] = chart[points.triangle].long() if name is None else _labels(labels[name], points, name)
+                    borders[name] = _near_border(visible, label, place)[hit]
+                for state in states:
+                    target = reference.light(points, state).double()
+                    similarity = _Similarity(hit, target, peaks[state])
+                    sampled = (number * len(states) + state) % stride == 0
+                    screen = _Screen(reference.exposure(state), hit, target, sampled)
+                    for name, decoder in decoders.items():
+                        error = _colours(decoder, points, state, scene, name) - target
+                        border = borders[name if name in labels else None]
+                        decoded = target + error
+                        figures = similarity.mean(decoded), *screen.errors(decoded)
+                        tallies[name].add(number, state, error, border, *figures)
             if meter.due(number + 1):
                 meter.report(number + 1)
-        texel_errors = _texel_errors(mesh, image, decoders)
-    height = mesh.indoors.height if any(inside) else math.nan
-    facts = {"name": mesh.name, "peak": peak, "brightest": brightest, "eye_height": height}
+        texel_errors = _texel_errors(scene, reference, decoders, device)
+    height = scene.indoors.height if any(inside) else math.nan
+    facts = {"name": scene.name, "peaks": tuple(peaks), "brightest": brightest, "eye_height": height}
     return {name: tally.score(facts, texel_errors[name], inside) for name, tally in tallies.items()}
 
 
-def chart_labels(model: AtlasModel, mesh: LightmappedMesh, device: str) -> Sampler:
+def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
     """Numbers of the charts of a model's own UVs, as `compare` takes labels.
 
     Args:
         model: A model with `uv`.
-        mesh: The mesh that was compressed.
+        scene: The scene that was compressed.
         device: "cpu" or "cuda:N", where the points will be.
     """
+    (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
-    corner = welded(mesh.position[mesh.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
+    corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
     number = torch.from_numpy(charts(corner)).to(device)
-    return lambda uv, triangle, barycentric: number[triangle.long()]
+    return lambda points: number[points.triangle]
 
 
-def _peak(
-    mesh: LightmappedMesh, image: torch.Tensor, cameras: Sequence[View | Viewpoint], resolution: int
-) -> tuple[float, float]:
-    """The range of the reference in all views, see the module, and its maximum.
+def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
+    """The chart of each of the scene's triangles, int64 [F], different in each sheet."""
+    result, count = np.full(len(scene.triangles.triangle), -1, np.int64), 0
+    first = 0
+    for sheet in scene.sheets:
+        number = sheet_charts(sheet)
+        result[first : first + len(number)] = np.where(number < 0, -1, number + count)
+        first, count = first + len(number), count + int(number.max(initial=-1)) + 1
+    return result
+
+
+class _Reference:
+    """The original lightmaps, on the device unless they are too large."""
+
+    def __init__(self, scene: LightmappedScene, device: str) -> None:
+        self._device = device
+        self._images = [torch.from_numpy(sheet.lightmaps) for sheet in scene.sheets]
+        if sum(image.nbytes for image in self._images) <= _ON_DEVICE:
+            self._images = [image.to(device) for image in self._images]
+        self._charts = [sheet.lightmaps[:, sheet.mask] for sheet in scene.sheets]
+
+    def light(self, points: Points, state: int) -> torch.Tensor:
+        """Reads the lightmaps bilinearly at points, float32 [N, 3]."""
+        if len(self._images) == 1:
+            return raster.texture(self._image(0, state), points.uv)
+        light = torch.empty((len(points), 3), dtype=torch.float32, device=self._device)
+        for number in torch.unique(points.sheet).tolist():
+            at = points.sheet == number
+            light[at] = raster.texture(self._image(number, state), points.uv[at].contiguous())
+        return light
+
+    def exposure(self, state: int) -> float:
+        """The factor from light to what a screen shows."""
+        return exposure(np.concatenate([chart[state] for chart in self._charts]))
+
+    def _image(self, number: int, state: int) -> torch.Tensor:
+        return self._images[number][state].to(self._device)
+
+
+def _peaks(
+    scene: LightmappedScene,
+    reference: _Reference,
+    cameras: Sequence[View | Viewpoint],
+    resolution: int,
+    device: str,
+) -> tuple[list[float], float]:
+    """The range of the reference in all views, see the module, for each state, and its maximum.
 
     Drawing twice is cheaper than storing all views.
     """
-    low, high = math.inf, -math.inf
-    count = torch.zeros(_BINS, dtype=torch.float64)
-    for visible, _, uv in visible_uv(mesh, cameras, resolution, str(image.device)):
-        colour = raster.texture(image, uv[visible >= 0])
-        if len(colour):
-            low, high = min(low, float(colour.min())), max(high, float(colour.max()))
+    states = range(len(scene.states))
+    low, high = [math.inf] * len(states), [-math.inf] * len(states)
+    count = torch.zeros((len(states), _BINS), dtype=torch.float64)
+    for drawn in visible_uv(scene, cameras, resolution, device):
+        points = points_at(scene, *drawn)[1]
+        for state in states if len(points) else ():
+            colour = reference.light(points, state)
+            low[state], high[state] = min(low[state], float(colour.min())), max(high[state], float(colour.max()))
             octave = colour.clamp(min=2.0 ** _OCTAVES[0]).log2().float().cpu()
-            count += torch.histc(octave, _BINS, *_OCTAVES)
-    if high < low:
-        return math.nan, math.nan
-    share = count.cumsum(0) / count.sum()
-    top = int(torch.searchsorted(share, _PERCENTILE)) + 1
-    top = 2.0 ** (_OCTAVES[0] + (_OCTAVES[1] - _OCTAVES[0]) * top / _BINS)
-    peak = min(high, max(_ABOVE * top, low)) - low
-    return (peak if peak > _ROUNDING * high else 0.0), high
+            count[state] += torch.histc(octave, _BINS, *_OCTAVES)
+    if high[0] < low[0]:
+        return [math.nan] * len(states), math.nan
+    peaks = []
+    for a, b, histogram in zip(low, high, count, strict=True):
+        share = histogram.cumsum(0) / histogram.sum()
+        top = int(torch.searchsorted(share, _PERCENTILE)) + 1
+        top = 2.0 ** (_OCTAVES[0] + (_OCTAVES[1] - _OCTAVES[0]) * top / _BINS)
+        peak = min(b, max(_ABOVE * top, a)) - a
+        peaks.append(peak if peak > _ROUNDING * b else 0.0)
+    return peaks, max(high)
 
 
-_Points = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""The arguments of a `Sampler`: UVs, triangles and corner weights of points."""
-
-
-def _colours(decoder: Sampler, points: _Points, mesh: LightmappedMesh, name: str) -> torch.Tensor:
+def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
     """The decoded colours, float64 [N, 3], checked."""
-    colour, count = decoder(*points), len(points[0])
+    colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
         raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
     broken = int((~torch.isfinite(colour).all(dim=1)).sum())
     if broken:
-        raise WlmError(f"{mesh.name}: {name} decodes to NaN or infinity at {broken} of {count} points")
+        raise WlmError(f"{scene.name}: {name} decodes to NaN or infinity at {broken} of {count} points")
     return colour.double()
 
 
-def _labels(labels: Sampler, points: _Points, name: str) -> torch.Tensor:
+def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
     """The labels, int64 [N], checked."""
-    label, count = labels(*points), len(points[0])
+    label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
         raise ValueError(f"{name}: expected labels, integers [{count}], got {label.dtype} {tuple(label.shape)}")
     return label.long()
@@ -311,52 +396,68 @@ def _labels(labels: Sampler, points: _Points, name: str) -> torch.Tensor:
 
 @dataclass
 class _Tally:
-    """Sums over the views of a decoder."""
+    """The errors of a decoder, and sums over views and states."""
 
-    mse: list[float] = field(default_factory=list)
+    states: int
     view: list[int] = field(default_factory=list)
+    state: list[int] = field(default_factory=list)
+    mse: list[float] = field(default_factory=list)
     ssim: list[float] = field(default_factory=list)
+    tone_mse: list[float] = field(default_factory=list)
+    flip: list[float] = field(default_factory=list)
     pixels: int = 0
     seam: float = 0.0
     seam_pixels: int = 0
     rest: float = 0.0
-    screen: ScreenTally = field(default_factory=ScreenTally)
 
-    def add(self, view: int, error: torch.Tensor, border: torch.Tensor, ssim: float) -> None:
+    def add(
+        self,
+        view: int,
+        state: int,
+        error: torch.Tensor,
+        border: torch.Tensor,
+        ssim: float,
+        tone_mse: float,
+        flip: float,
+    ) -> None:
         absolute = error.abs().mean(dim=1)
         self.view.append(view)
+        self.state.append(state)
         self.mse.append(float(error.square().mean()))
         self.ssim.append(ssim)
+        self.tone_mse.append(tone_mse)
+        self.flip.append(flip)
         self.pixels += len(error)
         self.seam += float(absolute[border].sum())
         self.rest += float(absolute[~border].sum())
         self.seam_pixels += int(border.sum())
 
-    def score(self, facts: dict[str, Any], texel_mse: float, inside: Sequence[bool]) -> Score:
-        peak = facts["peak"]
-        psnr = [psnr_from_mse(mse, peak) for mse in self.mse]
-        kinds: tuple[list[float], list[float]] = [], []  # around the mesh, inside
-        for each, number in zip(psnr, self.view, strict=True):
-            kinds[inside[number]].append(each)
-        ssim = [value for value in self.ssim if not math.isnan(value)]
+    def score(self, facts: dict[str, Any], texel_mse: Sequence[float], inside: Sequence[bool]) -> Score:
+        peaks, states = facts["peaks"], range(self.states)
+        psnr = [psnr_from_mse(mse, peaks[state]) for mse, state in zip(self.mse, self.state, strict=True)]
+        pairs = list(zip(psnr, self.view, self.state, strict=True))
+        known = [(value, view) for value, view, _ in pairs if not math.isnan(value)]
         seam, rest = _ratio(self.seam, self.seam_pixels), _ratio(self.rest, self.pixels - self.seam_pixels)
-        measured = bool(psnr) and peak > 0.0
+        seen = set(self.view)
         return Score(
             **facts,
-            views=len(psnr),
-            pixels=self.pixels,
-            psnr=_ratio(sum(psnr), len(psnr)),
-            around_psnr=_ratio(sum(kinds[0]), len(kinds[0])),
-            inside_psnr=_ratio(sum(kinds[1]), len(kinds[1])),
-            inside_views=len(kinds[1]),
-            psnr_worst=min(psnr, default=math.nan),
-            worst_view=self.view[int(np.argmin(psnr))] if measured else -1,
-            one_minus_ssim=1.0 - _ratio(sum(ssim), len(ssim)),
+            peak=_mean(peaks),
+            views=len(seen),
+            pixels=self.pixels // self.states,
+            psnr=_mean(psnr),
+            psnr_by_state=tuple(_mean([value for value, _, each in pairs if each == state]) for state in states),
+            around_psnr=_mean([value for value, view, _ in pairs if not inside[view]]),
+            inside_psnr=_mean([value for value, view, _ in pairs if inside[view]]),
+            inside_views=sum(inside[view] for view in seen),
+            psnr_worst=min(known)[0] if known else math.nan,
+            worst_view=min(known)[1] if known else -1,
+            one_minus_ssim=1.0 - _mean(self.ssim),
             seam_error=seam,
             rest_error=rest,
             seam_ratio=math.inf if rest == 0.0 and seam > 0.0 else _ratio(seam, rest),
-            texel_psnr=psnr_from_mse(texel_mse, peak),
-            **self.screen.figures(),
+            texel_psnr=_mean([psnr_from_mse(mse, peak) for mse, peak in zip(texel_mse, peaks, strict=True)]),
+            tone_psnr=_mean([psnr_from_mse(mse, 1.0) for mse in self.tone_mse]),
+            flip=_mean(self.flip),
         )
 
 
@@ -364,27 +465,37 @@ def _ratio(a: float, b: float) -> float:
     return a / b if b else math.nan
 
 
-def _texel_errors(mesh: LightmappedMesh, image: torch.Tensor, decoders: Mapping[str, Sampler]) -> dict[str, float]:
-    """Mean squared errors over the texels in the mask with their centre in an active triangle; NaN without any."""
-    height, width = mesh.mask.shape
-    device = image.device
-    triangle, barycentric = texel_triangles(mesh, height, width, str(device))
-    hit = (triangle >= 0) & torch.tensor(mesh.mask, device=device)
-    row, column = torch.nonzero(hit, as_tuple=True)
-    # At the centre itself, where the reference is the texel, not at the interpolated UV.
-    uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], dim=1).float()
-    points = uv, triangle[hit].int(), corner_weights(barycentric[hit])
-    if not len(uv):
-        return dict.fromkeys(decoders, math.nan)
-    target = raster.texture(image, uv).double()
-    return {
-        name: float((_colours(decoder, points, mesh, name) - target).square().mean())
-        for name, decoder in decoders.items()
-    }
+def _mean(values: Sequence[float]) -> float:
+    """The mean of the numbers that aren't NaN; NaN for none."""
+    known = [value for value in values if not math.isnan(value)]
+    return fmean(known) if known else math.nan
+
+
+def _texel_errors(
+    scene: LightmappedScene, reference: _Reference, decoders: Mapping[str, Sampler], device: str
+) -> dict[str, list[float]]:
+    """Mean squared errors over the texels in a mask with their centre in an active triangle, by decoder and state."""
+    sums, total, first = {name: [0.0] * len(scene.states) for name in decoders}, 0, 0
+    for number, sheet in enumerate(scene.sheets):
+        height, width = sheet.mask.shape
+        triangle, barycentric = texel_triangles(sheet, height, width, device)
+        hit = (triangle >= 0) & torch.tensor(sheet.mask, device=device)
+        row, column = torch.nonzero(hit, as_tuple=True)
+        # At the centre itself, where the reference is the texel, not at the interpolated UV.
+        uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], dim=1).float()
+        owner = torch.full((len(uv),), number, dtype=torch.int32, device=device)
+        points = Points(uv, owner, triangle[hit] + first, corner_weights(barycentric[hit]))
+        for state in range(len(scene.states)) if len(uv) else ():
+            target = reference.light(points, state).double()
+            for name, decoder in decoders.items():
+                error = _colours(decoder, points, state, scene, name) - target
+                sums[name][state] += float(error.square().mean()) * len(uv)
+        first, total = first + len(sheet.triangle), total + len(uv)
+    return {name: [_ratio(each, total) for each in values] for name, values in sums.items()}
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """The pixels within 2 pixels of a border.
+    """Finds the pixels within 2 pixels of a border.
 
     Args:
         visible: int [h, w], triangles, -1 for none.
@@ -405,15 +516,15 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
         row, column = (index[touch] for index in pairs)
         border[row, column] = True
         border[row + (axis == 0), column + (axis == 1)] = True
-    # These pixels are the first ones from the border; their neighbours, also diagonal ones, the second ones.
+    # These pixels are the first from the border; their neighbours, also diagonal ones, are the second.
     return torch.nn.functional.max_pool2d(border[None].float(), 3, stride=1, padding=1)[0] > 0
 
 
 class _Similarity:
     """SSIM of one view's decoders, equal to `wlm.metrics.ssim` of the whole pictures.
 
-    That one compares two images on the host; this one computes the reference's part once for all decoders, on their
-    device, and only where the mesh is.
+    That function compares two images on the host; this class computes the reference's part once for all decoders, on
+    their device, and only where the scene covers the picture.
 
     Args:
         hit: bool [h, w], the covered pixels, at least one.
@@ -461,7 +572,7 @@ class _Similarity:
 
 
 def _blur(image: torch.Tensor) -> torch.Tensor:
-    """Gaussian means of [..., h, w] where the whole window is inside: [..., h - 10, w - 10]."""
+    """Computes Gaussian means of [..., h, w] where the whole window is inside: [..., h - 10, w - 10]."""
     offset = torch.arange(-_HALF, _HALF + 1, dtype=image.dtype)
     weight = torch.exp(-0.5 * (offset / _SIGMA) ** 2)
     weight = (weight / weight.sum()).tolist()
@@ -473,3 +584,39 @@ def _blur(image: torch.Tensor) -> torch.Tensor:
             blurred.add_(pair, alpha=weight[k])
         image = blurred
     return image
+
+
+class _Screen:
+    """The original in a view, as a screen shows it.
+
+    Args:
+        factor: The exposure.
+        hit: bool [h, w], the covered pixels.
+        target: float [N, 3], the original's linear light there, row by row.
+        flip: Whether FLIP is computed too.
+    """
+
+    def __init__(self, factor: float, hit: torch.Tensor, target: torch.Tensor, flip: bool) -> None:
+        self._factor, self._shown = factor, self._coded(target, factor)
+        hit = hit.cpu().numpy()
+        rows, columns = (np.flatnonzero(hit.any(axis=axis)) for axis in (1, 0))
+        self._hit = hit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        self._flip = flip
+
+    def errors(self, light: torch.Tensor) -> tuple[float, float]:
+        """Mean squared error, and FLIP or NaN, of the covered pixels.
+
+        Args:
+            light: float [N, 3], decoded.
+        """
+        shown = self._coded(light, self._factor)
+        mse = float(np.square(shown - self._shown).mean())
+        if not self._flip:
+            return mse, math.nan
+        pictures = np.zeros((2, *self._hit.shape, 3))
+        pictures[0][self._hit], pictures[1][self._hit] = self._shown, shown
+        return mse, float(flip_display(*pictures)[self._hit].mean())
+
+    @staticmethod
+    def _coded(light: torch.Tensor, factor: float) -> np.ndarray:
+        return to_srgb(light.cpu().numpy() * factor)

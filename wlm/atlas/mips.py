@@ -1,14 +1,13 @@
-"""Mips of an atlas: a small lightmap for what is far away.
+"""Mips of one lightmap, the tail: a small lightmap for surfaces that are far away.
 
-What is beside each other in the lightmap, tiles or a cascade's triangles, isn't in T_p, so that its own mips would mix
-what doesn't belong together. In place of them the tail is the lightmap at a quarter of its resolution with all smaller
-levels, one texture under the mesh's own UVs: blocks of BC6H, or of ASTC where the colours are. With `lod` the octaves
-of the lightmap's texels along a pixel, light is
+Neighbours in the lightmap are not neighbours in T_p, so mip levels of T_p would mix unrelated texels. Instead, the tail
+is the lightmap at a quarter of its resolution with all smaller levels, one texture under the mesh's own UVs, in blocks
+of BC6H, or of ASTC beside ASTC. With `lod` the octaves of the lightmap's texels along a pixel, light is
 
     mix(tiles, tail, clamp(lod - 1, 0, 1)),    the tail read at its own level lod - 2,
 
-which has no step: up to 1, where a bilinear read still meets all texels, it is the tiles', from 2 on the tail's. The
-tail takes 1.4% of the lightmap's bits.
+which is continuous: up to 1, where a bilinear read still meets all texels, it is that of the tiles, from 2 on that of
+the tail. The tail takes 1.4% of the lightmap's bits.
 """
 
 import numpy as np
@@ -16,18 +15,18 @@ import torch
 from torch.nn.functional import pad
 
 from wlm.atlas import colour
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import Sheet
 from wlm.atlas.model import TAIL_OCTAVES, tail_blocks, tail_shapes, tail_share
 from wlm.atlas.resize import box
 from wlm.ops.raster import texture
 from wlm.texels import fill_gaps
 
 
-def make_tail(mesh: LightmappedMesh, codec: str, device: str = "cpu") -> np.ndarray:
+def make_tail(sheet: Sheet, codec: str, device: str = "cpu") -> np.ndarray:
     """Makes the tail of a lightmap.
 
     Args:
-        mesh: The mesh.
+        sheet: The sheet, of one state.
         codec: `tail_codec`.
         device: "cpu" or "cuda:N".
 
@@ -37,14 +36,14 @@ def make_tail(mesh: LightmappedMesh, codec: str, device: str = "cpu") -> np.ndar
     Raises:
         WlmError: A package for ASTC is missing.
     """
-    levels = tail_light(mesh.lightmap, mesh.mask, device)
+    levels = tail_light(sheet.lightmap, sheet.mask, device)
     return np.concatenate([colour.encode(light, codec, weight, device)[0] for light, weight in levels])
 
 
 def tail_light(light: np.ndarray, mask: np.ndarray, device: str = "cpu") -> list[tuple[np.ndarray, np.ndarray]]:
-    """The levels of a tail before they are stored.
+    """Computes the levels of a tail before they are stored.
 
-    A texel is the mean of those of the mask that it covers; one that covers none has the nearest's.
+    A texel is the mean of the texels of the mask that it covers; one that covers none takes the nearest.
 
     Args:
         light: [H, W, 3].
@@ -74,8 +73,8 @@ class Tail:
         """Decodes a tail.
 
         Args:
-            blocks: As of `make_tail`.
-            height, width: Of the lightmap.
+            blocks: uint8 [B, 16], from `make_tail`.
+            height, width: Size of the lightmap.
             codec: `tail_codec`.
             device: "cpu" or "cuda:N".
 
@@ -95,7 +94,7 @@ class Tail:
 
         Args:
             uv: float32 [N, 2], the mesh's own.
-            lod: float32 [N], octaves of the lightmap; up to 2 the tail's first level.
+            lod: float32 [N], octaves of the lightmap; up to 2 reads the tail's first level.
 
         Returns:
             float32 [N, 3].
@@ -105,7 +104,7 @@ class Tail:
         low = place.floor().long()
         light = torch.zeros((len(uv), 3), device=uv.device)
         for number, level in enumerate(self._levels):
-            # Of its weight, that of the level above or below is the rest.
+            # The level above or below has the rest of the weight.
             weight = torch.where(low == number, 1.0 - (place - low), torch.where(low + 1 == number, place - low, 0.0))
             at = torch.nonzero(weight)[:, 0]
             if len(at):

@@ -1,19 +1,32 @@
-"""The model of a lightmap atlas: its settings and its arrays, as stored and as used.
+"""The model of a scene's lightmaps: its settings and its arrays, as a file and a GPU hold them.
 
-A lightmap is read through a look-up table (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), with T_c the
-small table, T_p the small colour texture and one of these for F:
+A lightmap is read through a lookup texture (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), with T_c the
+lookup texture, T_p the colour texture, and F by the method:
 
-    tiles    u lies in a tile of the lightmap. The tile's entry of T_c, read without a filter, names a rectangle of T_p;
-             relative position in the tile is relative position in the rectangle. Ours.
-    cascade  T_c, read bilinearly at the mesh's new, shared UVs, gives a coordinate, which a triangle wave folds into
-             [0, 1] (eq. 8). The paper's.
-    plain    No table: the lightmap at a lower resolution, or under new UVs.
+    tiles    A point lies in a tile of the lightmap. The tile's entry of T_c, read without a filter, names a rectangle
+             of T_p; relative position in the tile is relative position in the rectangle. Our method.
+    cascade  T_c, read bilinearly at new UVs in which triangles share texels, gives a coordinate, which a triangle wave
+             folds into [0, 1] (eq. 8). The paper's method.
+    plain    No lookup texture: the lightmap at a lower resolution, or under new UVs.
+    shared   The lightmaps of several sheets or states share tiles. A tile has a few components, K rectangles of one
+             size beside each other in T_p, and a mixture. Light in state m is
+
+                 C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place by T_c, k rectangles to the right),
+
+             with f a constant and a factor of each component, for each state and channel; negative sums become 0.
+             Tiles whose light changes alike share a mixture (`shared.mixture`). Between two states f is linear. Of
+             tiles in blocks the last components may be *coarse*, of one block of 4 x 4 texels each. Where states
+             have little in common, a sheet has *separate* tiles in each state, of one component, and light is linear
+             between two states.
+
+With mips, `shared` has smaller levels of each sheet, read in the same way; the other methods have a tail (`mips`).
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -22,12 +35,16 @@ from wlm.errors import WlmError
 from wlm.system import Model, Settings
 from wlm.texels import check_size
 
+if TYPE_CHECKING:
+    from wlm.atlas.data import LightmappedScene
+    from wlm.atlas.stored import StoredScene
+
 SOURCE_BITS = 48
-"""Bits per texel of the lightmap: three half floats (eq. 9)."""
+"""Bits per texel of a lightmap: three half floats (eq. 9)."""
 
 COLOUR_BITS = {"half": 64, "rgb9e5": 32, "bc6h": 8, "astc": 8}
-"""Bits per texel of a texture on a GPU, by how it is stored: half floats, which desktop GPUs have of four channels and
-not of three; RGB9E5; BC6H; ASTC 4x4."""
+"""Bits per texel of a texture on a GPU, by format: half floats, which desktop GPUs have with four channels and not with
+three; RGB9E5; BC6H; ASTC 4x4."""
 
 TEXELS, BLOCKS = "rgb9e5", "bc6h"
 """The formats of the two textures of colour "mixed"."""
@@ -36,22 +53,39 @@ BLOCK_SIDE = 4
 """Texels along a block of BC6H or ASTC."""
 
 LUT_BITS = 32
-"""Bits per entry of T_c: two numbers of 16 bits."""
+"""Bits per entry of T_c of two numbers."""
 
 LUT_STEPS = 65535.0
 """The integer that is a coordinate of 1 in T_c of method "cascade"."""
 
+FACTOR_BITS = 128
+"""Bits of a component's factors in a state: three floats, in a texel of four."""
+
+SHEET_BITS = 128
+"""Bits of the row of a sheet or level in the table of sheets: eight numbers of 16 bits."""
+
+ENTRY, SHORT_ENTRY = 4, 2
+"""Numbers of an entry of T_c; and of an entry where all tiles have one component on one page."""
+
 # An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
-"""Most places along an axis that entries of method "tiles" can name: texels of T_p, or blocks."""
+"""Most places along an axis that entries can name: texels of T_p, or blocks."""
+
+COUNT_BITS, COARSE_BITS = 8, 4
+"""Bits of an entry's fourth number: the lowest hold the number of components, the next the number of coarse ones; the
+page is above them."""
+
+MOST_PAGES, MOST_COARSE = 1 << (16 - COUNT_BITS - COARSE_BITS), (1 << COARSE_BITS) - 1
 
 TAIL_OCTAVES = 2
-"""Of mips: how much smaller than the lightmap the tail's first level is, a power of two."""
+"""Octaves from a lightmap to the first level of its mips, which has a quarter of its sides."""
 
 FIRST_BLOCK_CODE, NO_BLOCKS = 12, 1 << SIDE_BITS
-"""Of colour "mixed": the size's code from which on an entry names blocks, 1 to 4 along an axis, and not texels; a code
-that no entry has."""
+"""The size code from which on an entry of colour "mixed" names 1 to 4 blocks along an axis instead of texels; and a
+code that no entry has."""
+
+_BUDGET, _SHARED_BUDGET = 0.17, 0.05
 
 
 class Profile(Settings):
@@ -59,40 +93,48 @@ class Profile(Settings):
 
     Attributes:
         name: Shown in reports.
-        method: "tiles" or "cascade", see the module.
-        colour: How T_p is stored: "half" floats, "rgb9e5", "bc6h" or "astc" (4x4); or, for "tiles", "mixed": two
-            textures, RGB9E5 and BC6H, and each tile in one of them.
-        budget: For "tiles": bits of T_p and T_c as a fraction of the lightmap's at 48 bits per texel, 1 - CR of eq. 9.
-        tile: For "tiles": texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more per axis, and
+        method: "tiles" or "cascade", see the module. Several sheets or states always share tiles.
+        colour: Format of T_p: "half" floats, "rgb9e5", "bc6h" or "astc" (4x4); or, for tiles, "mixed": two textures,
+            RGB9E5 and BC6H, and each tile in one of them. Shared tiles are "rgb9e5" or "mixed".
+        budget: For tiles: bits of the textures as a fraction of all lightmaps' at 48 bits per texel, 1 - CR of eq. 9.
+            None: 0.17 for one lightmap, 0.05 for several.
+        tile: For tiles: texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more per axis, and
             with these it keeps every texel.
-        views: Random views of the unit sphere; a texel counts by the pixels that show it. 0: by its area on the mesh.
-        unseen: Weight of what no view shows, as a fraction of the mean weight.
-        border: Factor on the weight within a texel of a chart's border: an error there is a seam.
-        relative: How much of the weight is of the relative error, 0 to 1; the rest is of the error in linear light.
-        mips: Whether there is a tail of smaller levels, `wlm.atlas.mips`; for "tiles" its bits are part of the budget.
-        fallback: Whether a plain smaller lightmap of as many bits replaces the result if its error is no larger.
-        threshold: lambda of eq. 4; 0 shares no triangles.
-        colour_threshold: lambda_h of section 3.2.1.
-        max_radiance: Triangles with a brighter texel are not shared, and lambda and lambda_h are fractions of it
-            (section 4.1.1); null: the brightest texel of the charts, which treats dark and bright lightmaps alike.
-        scale: epsilon, of the repacked lightmap (section 3.3.1).
-        colour_scale: epsilon_p, sides of T_p over those of the repacked lightmap.
-        lut_scale: epsilon_c, the same for T_c; 0: no table, method "plain".
-        space: Where T_p and T_c are tuned: in random "views", or in "uv" at points of the mesh's surface.
-        steps: Steps of Adam.
-        colour_rate, lut_rate: Initial learning rates of T_p, in units of the lightmap's mean, and of T_c.
-        final_rate: Learning rates of the last step as a fraction of the initial ones.
-        resolution: Pixels along a side of a view.
-        gradient: Weight of the image gradients' L1 in the loss beside the colours' L1 (section 3.3.3).
+        views: Random views of the scene from around, and as many from inside; a texel counts by the pixels that show
+            it.
+        unseen: For one lightmap: weight of texels that no view shows, as a fraction of the mean weight.
+        border: For one lightmap: factor on the weight within a texel of a chart's border, where an error is a seam.
+        relative: For one lightmap: how much of the weight is of the relative error, 0 to 1; the rest is of the error
+            in linear light.
+        mips: Whether smaller levels are stored for surfaces that are far away; for tiles their bits are part of the
+            budget.
+        fallback: For one lightmap: whether a plain smaller lightmap of as many bits replaces the result if its error
+            is no larger.
+        threshold: For the cascade: lambda of eq. 4; 0 shares no triangles.
+        colour_threshold: For the cascade: lambda_h of section 3.2.1.
+        max_radiance: For the cascade: triangles with a brighter texel are not shared, and lambda and lambda_h are
+            fractions of it (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright
+            lightmaps alike.
+        scale: For the cascade: epsilon, of the repacked lightmap (section 3.3.1).
+        colour_scale: For the cascade: epsilon_p, sides of T_p over those of the repacked lightmap.
+        lut_scale: For the cascade: epsilon_c, the same for T_c; 0: no T_c, method "plain".
+        space: For the cascade: T_p and T_c are tuned in random "views", or in "uv" at points of the mesh's surface.
+        steps: For the cascade: steps of Adam.
+        colour_rate: For the cascade: initial learning rate of T_p, in units of the lightmap's mean.
+        lut_rate: For the cascade: initial learning rate of T_c.
+        final_rate: For the cascade: learning rates of the last step as a fraction of the initial ones.
+        resolution: For the cascade: pixels along a side of a view.
+        gradient: For the cascade: weight of the image gradients' L1 in the loss beside the colours' L1 (section
+            3.3.3).
     """
 
     FILES: ClassVar[str] = "atlas"
 
     method: Literal["tiles", "cascade"] = "tiles"
     colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"] = "half"
-    budget: float = Field(0.17, gt=0.0, le=2.0)
+    budget: float | None = Field(None, gt=0.0, le=2.0)
     tile: int = Field(7, ge=3, le=15)
-    views: int = Field(64, ge=0, le=4096)
+    views: int = Field(64, ge=1, le=4096)
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     border: float = Field(16.0, gt=0.0, le=100.0)
     relative: float = Field(0.0, ge=0.0, le=1.0)
@@ -121,11 +163,60 @@ class Profile(Settings):
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
                 raise WlmError(
-                    f"{prefix}budget: profiles of the cascade have sizes of their own; expected one of tiles, or none"
+                    f"{prefix}budget: profiles of the cascade state their sizes; expected a profile of tiles, or no "
+                    "budget"
                 )
             if (values.get("colour") or self.colour) == "mixed":
                 raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
         return super().override(values, prefix)
+
+    def checked(self, lightmaps: int) -> tuple[Self, str]:
+        """Fills in the budget and chooses the method.
+
+        Args:
+            lightmaps: Number of lightmaps, sheets times states.
+
+        Returns:
+            The settings, with a budget unless the method is the cascade; and "tiles", "cascade" or "shared".
+
+        Raises:
+            WlmError: The method or colour can't have several lightmaps.
+        """
+        if lightmaps == 1:
+            budget = self.budget or (_BUDGET if self.method == "tiles" else None)
+            return self.model_copy(update={"budget": budget}), self.method
+        if self.method != "tiles":
+            raise WlmError(f"method: {self.method} takes one lightmap, found {lightmaps}: expected tiles")
+        if self.colour not in (TEXELS, "mixed"):
+            raise WlmError(f"colour: expected rgb9e5 or mixed for several lightmaps, found {self.colour}")
+        return self.model_copy(update={"budget": self.budget or _SHARED_BUDGET}), "shared"
+
+
+@dataclass(frozen=True)
+class SheetPlace:
+    """The place of a sheet, or of a level of one, in the lookup texture.
+
+    Attributes:
+        name: The sheet's name.
+        height, width: Texels of its lightmaps.
+        row, column: Its first entry in T_c.
+        rows, columns: Its tiles; 0 where the method has none.
+        smaller: Row in `AtlasModel.table` of the next smaller level; 0: there is none.
+    """
+
+    name: str
+    height: int
+    width: int
+    row: int = 0
+    column: int = 0
+    rows: int = 0
+    columns: int = 0
+    smaller: int = 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of texels."""
+        return self.height, self.width
 
 
 _FREE_TEXELS = 1 << 24  # 4,096 x 4,096, of which a decoded lightmap takes 192 MiB
@@ -134,25 +225,33 @@ _MOST_SHARE = 65536
 
 @dataclass(frozen=True, eq=False)
 class AtlasModel(Model):
-    """A compressed lightmap.
+    """Compressed lightmaps: S sheets in M states.
 
     Attributes:
-        name: The mesh's name.
-        source: `LightmappedMesh.source`.
+        name: The scene's name.
+        source: `LightmappedScene.source`.
         profile: The settings of the compression.
-        method: "tiles", "cascade" or "plain"; "plain" also where the profile's method does not pay.
-        colour: How T_p is stored, as in `Profile`; "plain" is never "mixed".
-        height, width: Texels of the lightmap.
-        texels: half [Hp, Wp, 3], T_p, finite, not negative; what is stored decodes to just that. Of "mixed" the
-            texture in RGB9E5.
-        blocks: uint8 [B, 16], the blocks of T_p, row by row; of "mixed" those of its second texture; [0, 16] for none.
-        block_texels: half [Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 3] for none.
-        lut: uint16 [Hc, Wc, 2], T_c: for "tiles" `pack_entries`' [ty, tx, 2]; for "cascade" coordinates in units of
-            1 / `LUT_STEPS`; [0, 0, 2] for "plain".
-        tail: uint8 [B, 16], the mips' blocks, level by level, of ASTC beside it and else of BC6H; [0, 16] for none.
+        method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also where the profile's method does
+            not pay. All but "shared" have one sheet and one state.
+        colour: Format of T_p, as in `Profile`; "plain" is never "mixed".
+        states: Names of the states.
+        sheets: The places of the sheets.
+        texels: half [pages, Hp, Wp, 3], T_p, finite, not negative; the stored texture decodes to exactly these. With
+            "mixed" the texture in RGB9E5.
+        lut: uint16 [Hc, Wc, 2 or 4], T_c: `pack_entries` for "tiles", coordinates in units of 1 / `LUT_STEPS` for
+            "cascade", `pack_tiles` or their first two numbers for "shared"; [0, 0, 2] for "plain".
+        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; with "mixed" those of its second texture; [0, 0, 16]
+            for none.
+        block_texels: half [pages, Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 0, 3] for none.
+        factor: float32 [M, C, 3], finite, of any sign, for "shared": a constant of each mixture, then its components'
+            factors; else [0, 0, 3].
+        levels: For "shared" with mips, the smaller levels of all sheets, for each sheet a quarter, then halves.
+        later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
+        tail: uint8 [B, 16], the other methods' mips, level by level, ASTC beside ASTC and else BC6H; [0, 16] for none.
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
+        stored: The scene's triangles and masks; None for a model that no file holds.
         report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
-            run), groups, why it is plain.
+            run), groups, the reason why it is plain.
     """
 
     SYSTEM: ClassVar[str] = "atlas"
@@ -162,80 +261,132 @@ class AtlasModel(Model):
     profile: Profile
     method: str
     colour: str
-    height: int
-    width: int
+    states: tuple[str, ...]
+    sheets: tuple[SheetPlace, ...]
     texels: np.ndarray
-    blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
-    block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float16))
     lut: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 2), np.uint16))
+    blocks: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 16), np.uint8))
+    block_texels: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0, 3), np.float16))
+    factor: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
+    levels: tuple[SheetPlace, ...] = ()
+    later: tuple[SheetPlace, ...] = ()
     tail: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
     uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
+    stored: "StoredScene | None" = None
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def compression_ratio(self) -> float:
-        """CR of eq. 9."""
-        textures = (self.texels.shape[:2], self.lut.shape[:2], (self.height, self.width), self.colour)
-        return compression_ratio(*textures, self.block_texels.shape[:2], len(self.tail))
+    def rows(self) -> tuple[SheetPlace, ...]:
+        """All sheets and levels, as in `table`."""
+        return (*self.sheets, *self.levels, *self.later)
+
+    @property
+    def stride(self) -> int:
+        """Rows from a sheet in one state to the same sheet in the next; 0: all states have one row."""
+        return len(self.sheets) + len(self.levels) if self.later else 0
+
+    @property
+    def mips(self) -> bool:
+        """Whether the model has smaller levels."""
+        return bool(self.levels) or len(self.tail) > 0
 
     @property
     def first_block_code(self) -> int:
-        """That of the entries of T_c, `first_block_code`."""
-        return first_block_code(self.colour, self.texels.shape[:2])
+        """`first_block_code` of the entries of T_c."""
+        return first_block_code(self.colour, self.texels.shape[1:3])
+
+    @property
+    def bits(self) -> int:
+        """Bits on a GPU: T_p, T_c and mips and, for "shared", factors and the table of sheets."""
+        side = BLOCK_SIDE if self.colour in ("bc6h", "astc") else 1
+        pages, rows, columns = self.texels.shape[:3]
+        first = COLOUR_BITS[TEXELS if self.colour == "mixed" else self.colour]
+        bits = pages * -(-rows // side) * -(-columns // side) * side**2 * first
+        bits += math.prod(self.block_texels.shape[:3]) * COLOUR_BITS[BLOCKS] + self.lut.nbytes * 8
+        bits += len(self.tail) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
+        if self.method == "shared":
+            bits += self.factor.size // 3 * FACTOR_BITS + len(self.rows) * SHEET_BITS
+        return bits
+
+    @property
+    def source_bits(self) -> int:
+        """Bits of all lightmaps at 48 per texel (eq. 9)."""
+        return sum(math.prod(each.size) for each in self.sheets) * len(self.states) * SOURCE_BITS
+
+    @property
+    def compression_ratio(self) -> float:
+        """CR of eq. 9 over all lightmaps: 1 less the bits on a GPU over theirs."""
+        return 1.0 - self.bits / self.source_bits
+
+    def disk_ratio(self, file_bytes: int) -> float:
+        """CR of a file without its triangles and masks: 1 less its bits over the lightmaps'.
+
+        Args:
+            file_bytes: Size of the file less `stored_bytes`.
+        """
+        return 1.0 - file_bytes * 8 / self.source_bits
+
+    @cached_property
+    def scene(self) -> "LightmappedScene":
+        """The scene without lightmaps, read from the stored triangles and masks.
+
+        Raises:
+            WlmError: The stored triangles are damaged.
+            ValueError: The model has none.
+        """
+        from wlm.atlas.stored import restore
+
+        return restore(self)
+
+    def table(self) -> np.ndarray:
+        """The table of sheets as kernels and shaders read it, int32 [rows, 7].
+
+        Sheets come first, then levels; with separate tiles those of one state after the other. A row holds rows and
+        columns of texels, first row and column in T_c, rows and columns of tiles, and the row of the next smaller
+        level.
+        """
+        rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
+        return np.array(rows, np.int32)
+
+    def without_mips(self) -> "AtlasModel":
+        """The same model without its smaller levels; the texels of shared levels stay in the textures."""
+        kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
+        sheets, later = (tuple(replace(row, smaller=0) for row in rows) for rows in (self.sheets, kept))
+        return replace(self, sheets=sheets, levels=(), later=later, tail=self.tail[:0])
+
+    def bundle(self, device: str = "cpu") -> Any:
+        """The textures, shader and mesh of this model, see `wlm.atlas.bundles`."""
+        from wlm.atlas.bundles import bundle
+
+        return bundle(self, device=device)
 
 
-def check_area(size: tuple[int, int], texels: tuple[int, int], lut: tuple[int, int]) -> None:
+def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     """Checks that a lightmap is no larger than its textures can make plausible: a few bytes must not claim gigabytes.
 
     Args:
         size: Rows and columns of the lightmap.
-        texels: Those of T_p.
-        lut: Those of T_c, (0, 0) for none.
+        texels: Number of texels of T_p.
+        entries: Number of entries of T_c.
 
     Raises:
         WlmError: The lightmap is beyond what `wlm.texels.check_size` allows; or it has more than 2^24 texels, and more
             than 65,536 for each texel of T_p and T_c.
     """
     check_size(*size)
-    stored = math.prod(texels) + math.prod(lut)
+    stored = texels + entries
     if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):
         raise WlmError(
-            f"size: expected a lightmap of at most {_MOST_SHARE} texels for each of the {stored} that its textures "
-            f"hold, found {size[1]}x{size[0]}"
+            f"size: expected a lightmap of at most {_MOST_SHARE} texels for each of the {stored} of its textures, "
+            f"found {size[1]}x{size[0]}"
         )
-
-
-def compression_ratio(
-    texels: tuple[int, int],
-    lut: tuple[int, int],
-    size: tuple[int, int],
-    colour: str,
-    block_texels: tuple[int, int] = (0, 0),
-    tail: int = 0,
-) -> float:
-    """CR of eq. 9: 1 less the bits of the textures on a GPU over the lightmap's at 48 a texel.
-
-    Args:
-        texels: Rows and columns of T_p. Blocks count whole.
-        lut: Rows and columns of T_c, (0, 0) for none.
-        size: Rows and columns of the lightmap.
-        colour: How T_p is stored, as in `Profile`.
-        block_texels: Rows and columns of the second texture of "mixed".
-        tail: Blocks of the mips.
-    """
-    first = TEXELS if colour == "mixed" else colour
-    side = BLOCK_SIDE if first in ("bc6h", "astc") else 1
-    rows, columns = (-(-count // side) * side for count in texels)
-    bits = rows * columns * COLOUR_BITS[first] + lut[0] * lut[1] * LUT_BITS
-    bits += (math.prod(block_texels) + tail * BLOCK_SIDE**2) * COLOUR_BITS[BLOCKS]
-    return 1.0 - bits / (size[0] * size[1] * SOURCE_BITS)
 
 
 def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
     """Rows and columns of the mips of a lightmap: a quarter, in whole blocks, then halves, rounded down, to one texel.
 
-    The first level is a margin larger than a quarter where that isn't of whole blocks, which Direct3D and browsers ask
-    for: `tail_share` of it is the lightmap.
+    The first level is a margin larger than a quarter where a quarter isn't of whole blocks, which Direct3D and browsers
+    ask for: `tail_share` of it is the lightmap.
     """
     step = BLOCK_SIDE << TAIL_OCTAVES
     height, width = (-(-side // step) * BLOCK_SIDE for side in (height, width))
@@ -244,18 +395,18 @@ def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
 
 
 def tail_share(height: int, width: int) -> tuple[float, float]:
-    """How much of the mips is the lightmap, from the first texel on, along v and u."""
+    """Fractions of the mips that are the lightmap, from the first texel on, along v and u."""
     first = tail_shapes(height, width)[0]
     return height / (first[0] << TAIL_OCTAVES), width / (first[1] << TAIL_OCTAVES)
 
 
 def tail_codec(colour: str) -> str:
-    """The format of the mips' blocks, by `colour` of the model: that which its GPU has."""
+    """The format of the mips' blocks beside a colour texture: one that the same GPUs have."""
     return "astc" if colour == "astc" else BLOCKS
 
 
 def tail_blocks(height: int, width: int) -> int:
-    """Blocks of a level of so many rows and columns."""
+    """Number of blocks of a level."""
     return -(-height // BLOCK_SIDE) * -(-width // BLOCK_SIDE)
 
 
@@ -264,18 +415,8 @@ def tail_bits(height: int, width: int) -> int:
     return sum(tail_blocks(*shape) for shape in tail_shapes(height, width)) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
 
 
-def disk_ratio(file_bytes: int, size: tuple[int, int]) -> float:
-    """CR of a model's file: 1 less its bits over the lightmap's.
-
-    Args:
-        file_bytes: The file's size.
-        size: Rows and columns of the lightmap.
-    """
-    return 1.0 - file_bytes * 8 / (size[0] * size[1] * SOURCE_BITS)
-
-
 def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
-    """Rows and columns of the grid of tiles over a lightmap: the shape of T_c for "tiles".
+    """Rows and columns of the grid of tiles over a lightmap.
 
     Tiles span texel centres; the last ones may reach beyond the lightmap.
     """
@@ -283,12 +424,12 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
 
 
 def first_block_code(colour: str, shape: tuple[int, ...]) -> int:
-    """The size's code from which on an entry of T_c names blocks, and not texels; `NO_BLOCKS` if none does.
+    """The size code from which on an entry of T_c names blocks instead of texels; `NO_BLOCKS` if none does.
 
     Args:
-        colour: How T_p is stored, as in `Profile`.
-        shape: Rows and columns of T_p. Of BC6H and ASTC all entries name blocks where it has more than `MOST_SIZE`
-            texels along a side: of lightmaps above some 5,000 x 5,000.
+        colour: Format of T_p, as in `Profile`.
+        shape: Rows and columns of T_p. With BC6H and ASTC all entries name blocks where it has more than `MOST_SIZE`
+            texels along a side, for lightmaps above some 5,000 x 5,000.
     """
     if colour == "mixed":
         return FIRST_BLOCK_CODE
@@ -301,15 +442,15 @@ def pack_entries(
     """Encodes entries of T_c for tiles.
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, of blocks below four times that.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`; four times that for blocks.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
-        blocks: bool [...], where an entry names blocks: first texel and size are multiples of 4, and sizes of other
-            entries are at most `code`.
+        blocks: bool [...], where an entry names blocks: its first texel and size are multiples of 4. The sizes of
+            other entries are at most `code`.
         code: `first_block_code`.
 
     Returns:
-        uint16 [..., 2]: the first texel shifted left by 4, plus the size less 1. Of blocks, their numbers in place of
-        texels', and the size's part is `code` more.
+        uint16 [..., 2]: the first texel shifted left by 4, plus the size less 1. For blocks, both count blocks, and
+        `code` is added.
 
     Raises:
         ValueError: A number is out of range.
@@ -333,10 +474,77 @@ def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, 
         code: `first_block_code`.
 
     Returns:
-        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2]: of a sound file the
+        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2]: in a sound file the
         same along both axes.
     """
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
     return np.where(blocks, first * BLOCK_SIDE, first), np.where(blocks, (size - code) * BLOCK_SIDE, size), blocks
+
+
+def pack_tiles(
+    first: np.ndarray,
+    size: np.ndarray,
+    component: np.ndarray,
+    count: np.ndarray,
+    page: np.ndarray,
+    blocks: np.ndarray | bool = False,
+    coarse: np.ndarray | int = 0,
+) -> np.ndarray:
+    """Encodes entries of T_c for shared tiles.
+
+    Args:
+        first, size, blocks: As for `pack_entries`: the rectangle of the first component.
+        component: int [...], number of the mixture's constant among the factors, below 65,536.
+        count: int [...], components, 0 to 255; 0: the tile is black.
+        page: int [...], below `MOST_PAGES`.
+        coarse: int [...], number of coarse components, 0 to `MOST_COARSE`; 0 except for tiles in blocks.
+
+    Returns:
+        uint16 [..., 4].
+    """
+    above = (np.asarray(page) << COARSE_BITS) + coarse
+    rest = np.stack(np.broadcast_arrays(component, (above << COUNT_BITS) + count), -1).astype(np.uint16)
+    return np.concatenate([pack_entries(first, size, blocks), rest], -1)
+
+
+def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
+    """Decodes `pack_tiles`, or entries of two numbers, which have one component.
+
+    Args:
+        lut: uint16 [..., 2 or 4].
+        code: `first_block_code`.
+
+    Returns:
+        Arrays int64 in the order of the arguments of `pack_tiles`, of these `blocks` bool [...].
+    """
+    first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
+    if lut.shape[-1] == SHORT_ENTRY:
+        zeros = np.zeros(lut.shape[:-1], np.int64)
+        return first, size, zeros, zeros + 1, zeros, blocks[..., 0], zeros
+    last = lut[..., 3].astype(np.int64)
+    count, above = last & ((1 << COUNT_BITS) - 1), last >> COUNT_BITS
+    component, page, coarse = lut[..., 2].astype(np.int64), above >> COARSE_BITS, above & MOST_COARSE
+    return first, size, component, count, page, blocks[..., 0], coarse
+
+
+def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
+    """The place of a coarse component of a tile; coarse components are stacked in columns beside the others.
+
+    Args:
+        size: int [..., 2], texels of the other components along x and y.
+        whole: int [...], number of the other components.
+        number: int [...], number of the coarse component, from 0.
+
+    Returns:
+        int [..., 2], x and y of the first texel, from that of the tile's first component.
+    """
+    column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
+    return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
+
+
+def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
+    """Texels along x and y of all components of tiles, int [..., 2], with arguments as for `pack_tiles`."""
+    columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
+    return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

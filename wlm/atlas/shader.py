@@ -1,16 +1,27 @@
-"""The GLSL that reads an exported atlas (lightmap-uv-clustering-cascade, eq. 7); `wlm.atlas.exporter` writes it."""
+"""The GLSL that reads a model's textures (lightmap-uv-clustering-cascade, eq. 7)."""
 
-from wlm.atlas.model import BLOCK_SIDE, FIRST_BLOCK_CODE, SIDE_BITS, TAIL_OCTAVES, AtlasModel
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    COARSE_BITS,
+    COUNT_BITS,
+    FIRST_BLOCK_CODE,
+    MOST_COARSE,
+    SHORT_ENTRY,
+    SIDE_BITS,
+    TAIL_OCTAVES,
+    AtlasModel,
+)
 from wlm.bundle import sampler
 
 EXACT = "WLM_ATLAS_EXACT"
-"""Macro that has texels fetched and mixed in floats."""
+"""Macro with which texels are fetched and mixed in floats."""
 
 _HEAD = """\
 // Light from a compressed lightmap: {what}
 // (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).
-// For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES below the precisions
-// of what it declares. Call wlm_atlas with {coordinate}: u to the right, v down, (0, 0) at the first row's first texel.
+// For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES below the
+// precision statements of the types that it declares. Call wlm_atlas with {coordinate}: u to the right, v down, (0, 0)
+// at the first texel of the first row.
 //
 {textures}
 // {mips} have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
@@ -28,7 +39,7 @@ vec3 wlm_atlas_grad({parameters}, vec2 dx, vec2 dy)
     float share = log2(max(texels, 1.0)) - {octaves}.0;
     if (share <= 0.0)
         return wlm_atlas(uv);
-    // Of the tail the lightmap is the part that begins at its first texel: its sides are those of whole blocks.
+    // The lightmap is a part of the tail, from its first texel on: the tail's sides are those of whole blocks.
     vec2 part = size / ({scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)));
     vec3 far = textureGrad(WLM_ATLAS_TAIL, {own} * part, dx * part, dy * part).rgb;
     return share < 1.0 ? mix(wlm_atlas(uv), far, share) : far;
@@ -43,10 +54,10 @@ _NEAR_OWN = """\
 
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
-    "tiles": "// lut: the table of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
+    "tiles": "// lut: the lookup texture of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
     "mixed": "// blocks: the small texture's blocks, sampler2D, filter linear, clamped to its edge.",
     "tail": "// tail: smaller levels, sampler2D, filter linear, between mips too, clamped to its edge, anisotropic.",
-    "cascade": "// lut: the table of coordinates, sampler2D, filter linear, clamped to its edge.",
+    "cascade": "// lut: the lookup texture of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
 """Textures of each method, of colour "mixed" and of mips; all have that of "plain"."""
 
@@ -120,21 +131,15 @@ vec3 wlm_atlas(vec2 uv)
 """
 
 _WHAT = {
-    "tiles": "each of its tiles is a rectangle of a small texture, found by a table",
-    "cascade": "a table of coordinates leads into a small texture",
+    "tiles": "each of its tiles is a rectangle of a small texture, found by a lookup texture",
+    "cascade": "a lookup texture of coordinates leads into a small texture",
     "plain": "a smaller lightmap",
 }
 
 
-def atlas_glsl(model: AtlasModel) -> str:
-    """The shader text for a model: functions alone, to be included below `#version`.
-
-    Args:
-        model: Its method chooses the text; of tiles the lightmap's size and the tile's are constants in it.
-
-    Returns:
-        GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined.
-    """
+def _one_lightmap(model: AtlasModel) -> str:
+    """The text for a model with one lightmap; the sizes of lightmap and tiles are constants in it."""
+    height, width = model.sheets[0].size
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
     kinds = ["plain", *(["mixed"] if mixed else []), *(["tail"] if len(model.tail) else []), model.method]
     textures = [_TEXTURES[kind] for kind in kinds]
@@ -159,8 +164,8 @@ def atlas_glsl(model: AtlasModel) -> str:
         lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
         blocks = lines.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1)
         body = _TILES.format(
-            width=model.width,
-            height=model.height,
+            width=width,
+            height=height,
             tile=model.profile.tile,
             bits=SIDE_BITS,
             mask=(1 << SIDE_BITS) - 1,
@@ -172,9 +177,198 @@ def atlas_glsl(model: AtlasModel) -> str:
         names = ("vec2 uv, vec2 own", "own", _NEAR_OWN) if len(model.uv) else ("vec2 uv", "uv", _NEAR)
         body += _GRAD.format(
             **dict(zip(("parameters", "own", "comment"), names, strict=True)),
-            width=model.width,
-            height=model.height,
+            width=width,
+            height=height,
             scale=1 << TAIL_OCTAVES,
             octaves=TAIL_OCTAVES - 1,
         )
     return text + body
+
+
+_OBJECT = """
+// The light of an object: `place` is its scale and offset, and `sheet` its number, in `objects` of the document.
+vec3 wlm_object(vec2 uv, vec4 place, int sheet, float state)
+{
+    return wlm_scene(uv * place.xy + place.zw, sheet, max(state, 0.0));
+}
+"""
+
+_SHARED_TEXT = """\
+// Light from the compressed lightmaps of a scene: each tile of each lightmap is a few rectangles of a texture array,
+// found by one lookup texture. For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below
+// #version, in ES below the precision statements of the types that it declares.
+//
+// wlm_scene_sheets: the texture sheets, usampler2D, filter nearest.
+// wlm_scene_lut: the texture lut, usampler2D, filter nearest.
+// wlm_scene_factors: the texture factors, sampler2D of 32-bit floats, filter nearest.
+// wlm_scene_colour: the texture colour, sampler2DArray, filter linear, clamped to its edge.
+{second}//
+// Call wlm_scene with the lightmap's UVs, u to the right, v down, after the object's scale and offset; the number of
+// the sheet that the object reads; and the number of the state, 1.5 for example half-way from the second to the third.
+
+{samplers}
+const float WLM_SCENE_TILE = {tile}.0; // texels of a lightmap along a tile
+
+vec3 {name}(vec2 uv, int sheet, float state)
+{{
+    uvec4 place = texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0); // texels of its lightmap, first entry
+    uvec4 tiles = texelFetch(WLM_SCENE_SHEETS, ivec2(1, sheet), 0);
+    vec2 size = vec2(place.xy);
+    // Tiles begin and end on centres of the lightmap's texels.
+    vec2 x = clamp(uv * size - vec2(0.5, 0.5), vec2(0.0, 0.0), size - vec2(1.0, 1.0)) / WLM_SCENE_TILE;
+    ivec2 tile = min(ivec2(floor(x)), ivec2(tiles.xy) - ivec2(1, 1));
+    uvec4 entry = texelFetch(WLM_SCENE_LUT, ivec2(place.zw) + tile, 0);
+    // {entry}
+    vec2 first = vec2(entry.xy >> uvec2({bits}u, {bits}u));
+    vec2 steps = vec2(entry.xy & uvec2({mask}u, {mask}u));
+    vec2 extent = vec2({width}.0, {height}.0); // of a page
+{blocks}    vec2 at = first + (x - vec2(tile)) * steps + vec2(0.5, 0.5);
+    int components = {components};
+    int component = {component};
+    float page = {page};
+    int before = min(int(state), {last});
+    int after = min(before + 1, {last});
+    float share = state - float(before);
+    // A constant, and then a factor for each component.
+    vec3 light = vec3(0.0, 0.0, 0.0);
+    for (int k = 0; k <= components; k++) {{
+        vec3 factor = texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, before), 0).rgb;
+        factor = mix(factor, texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, after), 0).rgb, share);
+        vec2 spot = at + vec2(float(k - 1) * (steps.x + 1.0), 0.0);
+{coarse}        spot = spot / extent;
+        if (k > 0)
+            {read}
+        if (components > 0)
+            light += factor;
+    }}
+    return max(light, vec3(0.0, 0.0, 0.0));
+}}
+"""
+
+_SHARED_BLOCKS = """\
+    bool blocks = steps.x >= {code}.0;
+    if (blocks) {{
+        // Its first block, and from {code} on its blocks less one, of {side} texels a side.
+        first *= {side}.0;
+        steps = (steps - vec2({code}.0, {code}.0)) * {side}.0 + vec2({last}.0, {last}.0);
+        extent = vec2({width}.0, {height}.0);
+    }}
+"""
+_COARSE = """\
+        int small = k - 1 - components + {small}; // number of the coarse component, of one block
+        if (small >= 0) {{
+            int rows = int(steps.y + 1.0) / {side};
+            vec2 aside = vec2(float(components - {small}) * (steps.x + 1.0) + {side}.0 * float(small / rows),
+                              {side}.0 * float(small % rows));
+            spot = first + aside + (x - vec2(tile)) * {last}.0 + vec2(0.5, 0.5);
+        }}
+"""
+_SHARED_READ = "factor = factor * textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb;"
+_SHARED_READ_MIXED = """\
+factor = factor * (blocks ? textureLod(WLM_SCENE_BLOCKS, vec3(spot, page), 0.0).rgb
+                                     : textureLod(WLM_SCENE_COLOUR, vec3(spot, page), 0.0).rgb);"""
+
+_LONG = {
+    "entry": "The first texel of the tile's first rectangle, and in the low bits its texels less one; its first\n"
+    "    // component's number; its page, its coarse components, and in the lowest bits all its components.",
+    "components": f"int(entry.w & {(1 << COUNT_BITS) - 1}u)",
+    "component": "int(entry.z)",
+    "page": f"float(entry.w >> {COUNT_BITS + COARSE_BITS}u)",
+    "small": f"int((entry.w >> {COUNT_BITS}u) & {MOST_COARSE}u)",
+}
+_SHORT = {
+    "entry": "The first texel of the tile's rectangle, and in the low bits its texels less one.",
+    "components": "1",
+    "component": "0",
+    "page": "0.0",
+}
+
+_SHARED_GRAD = """
+// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_scene(uv, sheet, state).
+vec3 {name}(vec2 uv, vec2 dx, vec2 dy, int sheet, float state)
+{{
+    vec2 size = vec2(texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0).xy); // of the lightmap, in texels
+    float texels = max(length(dx * size), length(dy * size)); // along the pixel
+    // A bilinear read still meets all texels where a pixel is two of them. The first smaller level is a quarter.
+    float level = clamp(log2(max(texels, 1.0)) - {octaves}.0, 0.0, 32.0);
+    int near = sheet;
+    int far = int(texelFetch(WLM_SCENE_SHEETS, ivec2(1, sheet), 0).z); // 0: there is none
+    int steps = int(level);
+    for (int i = 0; i < steps; i++) {{
+        if (far > 0) {{
+            near = far;
+            far = int(texelFetch(WLM_SCENE_SHEETS, ivec2(1, near), 0).z);
+        }}
+    }}
+    float share = level - float(steps);
+    vec3 light = {read}(uv, near, state);
+    if (share <= 0.0 || far == 0)
+        return light;
+    return mix(light, {read}(uv, far, state), share);
+}}
+"""
+
+_SEPARATE = """
+// Each state has its own rows of sheets.
+vec3 {name}({declared}, int sheet, float state)
+{{
+    int before = min(int(state), {last});
+    int after = min(before + 1, {last});
+    float share = state - float(before);
+    vec3 light = {row}({given}, sheet + {stride} * before, float(before));
+    if (share <= 0.0)
+        return light;
+    return mix(light, {row}({given}, sheet + {stride} * after, float(after)), share);
+}}
+"""
+_FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 dx, vec2 dy", "uv, dx, dy")}
+"""Functions, with the arguments before the sheet as they are declared and passed on."""
+
+
+def _shared(model: AtlasModel) -> str:
+    """The text for shared tiles, with a function of the object's rectangle, sheet and state."""
+    height, width = model.texels.shape[1:3]
+    kinds = {"sheets": "usampler2D", "lut": "usampler2D", "factors": "sampler2D", "colour": "sampler2DArray"}
+    mixed = model.colour == "mixed"
+    if mixed:
+        kinds["blocks"] = "sampler2DArray"
+    rows, columns = model.block_texels.shape[1:3]
+    sizes = {"code": FIRST_BLOCK_CODE, "side": BLOCK_SIDE, "last": BLOCK_SIDE - 1, "width": columns, "height": rows}
+    short = model.lut.shape[2] == SHORT_ENTRY
+    numbers = _SHORT if short else _LONG
+    names = {name: f"{name}_row" if model.later else name for name in _FUNCTIONS}
+    text = _SHARED_TEXT.format(
+        name=names["wlm_scene"],
+        blocks=_SHARED_BLOCKS.format(**sizes) if mixed else "",
+        coarse=_COARSE.format(**sizes, **numbers) if mixed and not short else "",
+        read=_SHARED_READ_MIXED if mixed else _SHARED_READ,
+        second="// wlm_scene_blocks: the texture blocks, likewise.\n" if mixed else "",
+        last=len(model.states) - 1,
+        tile=model.profile.tile,
+        width=width,
+        height=height,
+        samplers="".join(sampler(f"wlm_scene_{name}", kind) for name, kind in kinds.items()),
+        bits=SIDE_BITS,
+        mask=(1 << SIDE_BITS) - 1,
+        **numbers,
+    )
+    if model.levels:
+        text += _SHARED_GRAD.format(octaves=TAIL_OCTAVES - 1, name=names["wlm_scene_grad"], read=names["wlm_scene"])
+    if not model.later:
+        return text
+    states = {"last": len(model.states) - 1, "stride": model.stride}
+    for name, (declared, given) in _FUNCTIONS.items():
+        if name == "wlm_scene" or model.levels:
+            text += _SEPARATE.format(name=name, row=names[name], declared=declared, given=given, **states)
+    return text
+
+
+def glsl(model: AtlasModel) -> str:
+    """The shader text for a model: functions alone, to be included below `#version`.
+
+    Returns:
+        GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined: `wlm_atlas(uv)` for one lightmap,
+        `wlm_scene(uv, sheet, state)` and `wlm_object(uv, place, sheet, state)` for several; with mips also
+        `wlm_atlas_grad` or `wlm_scene_grad`.
+    """
+    return _shared(model) + _OBJECT if model.method == "shared" else _one_lightmap(model)

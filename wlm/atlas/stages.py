@@ -1,4 +1,4 @@
-"""The stages of a compression: reported as they begin, timed, and what takes long in them kept."""
+"""The stages of a compression: they are reported as they begin, timed, and the long ones kept in a checkpoint."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,13 +12,13 @@ from wlm.system import Meter, OnProgress
 class Stages:
     """Reports and times stages.
 
-    A checkpoint has the stages that take long as batches, by number: 0 is the first of the method's, 1 the second.
+    A checkpoint keeps the long stages of a method as batches, numbered in their order.
 
     Attributes:
         device: "cpu" or "cuda:N".
-        progress: The callback, which a stage of many steps calls on its own; or None.
-        checkpoint: What is kept of an interrupted compression; or None.
-        seconds: By name, of the stages that are over.
+        progress: The callback, which a stage of many steps calls too; or None.
+        checkpoint: The checkpoint, or None.
+        seconds: Seconds of the finished stages, by name.
     """
 
     def __init__(self, device: str, progress: OnProgress | None = None, checkpoint: Checkpoint | None = None) -> None:
@@ -38,8 +38,11 @@ class Stages:
 
 @contextmanager
 def one_thread(device: str) -> Iterator[None]:
-    """Keeps torch to one thread on the CPU: its calls are short, and on a busy machine a second thread makes an
-    evaluation ten times slower, while on a free machine it gains little."""
+    """Keeps torch to one thread on the CPU.
+
+    Its calls are short: on a busy machine a second thread makes an evaluation ten times slower, while on an idle one it
+    gains little.
+    """
     threads = torch.get_num_threads()
     try:
         if device == "cpu":

@@ -1,59 +1,93 @@
-"""A mesh and its lightmap, seen: the surface point at each pixel of a view, and at each texel.
+"""The surface point at each pixel of a view of a scene, and at each texel of a sheet.
 
-The cameras are those of `wlm.ops.views`, and viewers who stand in the mesh, `wlm.ops.indoors`. A triangle that isn't
-`active` hides what is behind it, but its pixels count as uncovered.
+The cameras are those of `wlm.ops.views`, and viewers who stand in the scene, `wlm.ops.indoors`. Triangles that read no
+sheet, and those that aren't `active`, hide what is behind them, and their pixels count as uncovered.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from wlm.atlas.charts import charts, welded
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.interop import check_device
 from wlm.ops import raster as ops_raster
 from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
 
 
-def mesh_views(mesh: LightmappedMesh, count: int, seed: int | None = None) -> list[View | Viewpoint]:
-    """Makes the views of a mesh: cameras around it and, where viewers can stand in it, as many views from inside.
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of a scene's surface, on one device.
+
+    Attributes:
+        uv: float32 [N, 2], the UVs in the sheet.
+        sheet: int32 [N], the sheet.
+        triangle: int64 [N], the triangle, by its number among all of the scene's.
+        weight: float32 [N, 3], the weights of its corners.
+    """
+
+    uv: torch.Tensor
+    sheet: torch.Tensor
+    triangle: torch.Tensor
+    weight: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
+    """Makes views of a scene: cameras around it and, where viewers can stand in it, as many views from inside.
 
     Args:
-        mesh: The mesh.
+        scene: The scene.
         count: Number of cameras around it, at least 0.
         seed: None spreads them evenly; else they are random. Views from inside follow it too.
     """
-    return [*sphere_views(count, seed), *mesh.indoors.views(count, 0 if seed is None else seed)]
+    return [*sphere_views(count, seed), *scene.indoors.views(count, 0 if seed is None else seed)]
 
 
 def visible_uv(
-    mesh: LightmappedMesh, views: Sequence[View | Viewpoint], resolution: int, device: str
+    scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Draws the mesh from each camera.
+    """Draws a scene from each camera.
 
     Args:
-        mesh: The mesh.
+        scene: The scene.
         views: The cameras.
         resolution: Pixels along a side, 1 to 16,384.
         device: "cpu" or "cuda:N".
 
     Yields:
-        For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
-        of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the mesh's own UVs there. The latter two are
-        0 in uncovered pixels.
+        For each camera, on the device: int32 [h, w], the visible triangle of a sheet, -1 for none; float32 [h, w, 2],
+        the weights of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the UVs there. The latter two
+        are 0 in uncovered pixels.
 
     Raises:
         WlmError: There is no such device.
         ValueError: The resolution is out of range.
     """
-    active = torch.tensor(mesh.active, device=check_device(device))
-    for visible, barycentric, uv in visible_points(mesh.position, mesh.triangle, mesh.uv, views, resolution, device):
-        if not mesh.active.all():
-            covered = (visible >= 0) & active[visible.clamp(min=0).long()]
+    all_of = scene.triangles
+    lit = torch.tensor(all_of.sheet >= 0, device=check_device(device))
+    hidden = bool((all_of.sheet < 0).any())
+    drawn = visible_points(all_of.position, all_of.triangle, all_of.uv, views, resolution, device)
+    for visible, barycentric, uv in drawn:
+        if hidden:
+            covered = (visible >= 0) & lit[visible.clamp(min=0).long()]
             visible = torch.where(covered, visible, -1)
             barycentric, uv = barycentric * covered[..., None], uv * covered[..., None]
         yield visible, barycentric, uv
+
+
+def points_at(
+    scene: LightmappedScene, visible: torch.Tensor, barycentric: torch.Tensor, uv: torch.Tensor
+) -> tuple[torch.Tensor, Points]:
+    """The covered pixels of what `visible_uv` yields, bool [h, w], and their points, row by row."""
+    hit = visible >= 0
+    triangle = visible[hit].long()
+    sheet = torch.from_numpy(scene.triangles.sheet).to(visible.device)[triangle]
+    return hit, Points(uv[hit], sheet, triangle, corner_weights(barycentric[hit]))
 
 
 def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
@@ -62,12 +96,12 @@ def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
 
 
 def visibility(
-    mesh: LightmappedMesh, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
+    scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
-    """Counts the pixels that show each part of UV space.
+    """Counts the pixels that show each part of the UV space of a scene's only sheet.
 
     Args:
-        mesh: The mesh.
+        scene: The scene.
         views: The cameras.
         resolution: Pixels along a side of their pictures.
         height, width: Size of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
@@ -86,64 +120,42 @@ def visibility(
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
     # Pixels without a triangle count as nothing, each in a cell of its own: choosing the others would wait for the GPU.
     own = torch.arange(resolution**2, device=count.device) % count.numel()
-    for visible, _, uv in visible_uv(mesh, views, resolution, device):
+    for visible, _, uv in visible_uv(scene, views, resolution, device):
         u, v = uv.reshape(-1, 2).double().T
         column = (u * width).long().clamp(0, width - 1)
         row = (v * height).long().clamp(0, height - 1)
-        seen = visible.reshape(-1) >= 0
-        count.index_add_(0, torch.where(seen, row * width + column, own), seen.long())
+        shown = visible.reshape(-1) >= 0
+        count.index_add_(0, torch.where(shown, row * width + column, own), shown.long())
     return count.reshape(height, width).double()
 
 
-def texel_triangles(mesh: LightmappedMesh, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Finds the active triangle that holds the centre of each cell of a grid over UV space.
 
     Args:
-        mesh: The mesh.
+        sheet: The sheet.
         height, width: Size of the grid, row 0 at v = 0.
         device: "cpu" or "cuda:N".
 
     Returns:
-        On the device: int64 [height, width], the triangle, the first of several, -1 for none; float32 [height, width,
-        2], the weights of its corners 0 and 1.
+        On the device: int64 [height, width], the triangle of the sheet, the first of several, -1 for none; float32
+        [height, width, 2], the weights of its corners 0 and 1.
     """
-    active = torch.tensor(np.flatnonzero(mesh.active), device=device)
+    active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(
-        torch.tensor(mesh.uv, dtype=torch.float32, device=device),
-        torch.tensor(mesh.triangle, device=device)[active],
+        torch.tensor(sheet.uv, dtype=torch.float32, device=device),
+        torch.tensor(sheet.triangle, device=device)[active],
         height,
         width,
     )
     return torch.where(raster.triangle >= 0, active[raster.triangle.clamp(min=0).long()], -1), raster.barycentric
 
 
-def surface_points(mesh: LightmappedMesh, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws random points of the active triangles, uniform over the surface.
-
-    Args:
-        mesh: The mesh.
-        count: Number of points, N.
-        random: The generator.
-
-    Returns:
-        int64 [N], their triangles; float64 [N, 3], the weights of the corners.
-    """
-    corner = mesh.position[mesh.triangle]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * mesh.active
-    ends = np.cumsum(area)
-    triangle = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
-    root, share = np.sqrt(random.random(count)), random.random(count)
-    return triangle, np.stack([1.0 - root, root * (1.0 - share), root * share], 1)
-
-
-def mesh_charts(mesh: LightmappedMesh) -> np.ndarray:
-    """Numbers the charts of the lightmap's UVs.
-
-    Args:
-        mesh: The mesh.
+def sheet_charts(sheet: Sheet) -> np.ndarray:
+    """Numbers the charts of a sheet.
 
     Returns:
         int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space are one chart; -1
         where a triangle isn't active.
     """
-    return charts(welded(mesh.position, mesh.uv, mesh.triangle), mesh.active)
+    return charts(welded(sheet.position, sheet.uv, sheet.triangle), sheet.active)

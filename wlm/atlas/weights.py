@@ -7,49 +7,49 @@ import torch
 from torch.nn.functional import max_pool2d
 
 from wlm.atlas.coverage import covered_on
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import Profile
-from wlm.atlas.views import mesh_charts, mesh_views, surface_points, texel_triangles, visibility
+from wlm.atlas.views import scene_views, sheet_charts, texel_triangles, visibility
+
+RESOLUTION = 768
+"""Pixels along a side of a view that visibility is counted in."""
 
 _BORDER = 2  # cells of the fine grid: one texel
-_RESOLUTION = 768  # pixels along a side of a view that visibility is counted in
-_POINTS = 4  # random points of the surface per cell, where there are no views
-_POINTS_AT_ONCE = 1 << 20
-# Relative error is that over the light and this share of what all but a hundredth of the texels stay below: darker
-# light is black on a screen that shows the brighter.
+# The relative error is the error over the light plus this share of the 99th percentile of the texels: darker light is
+# black on a screen that shows the brighter.
 _DARK, _BRIGHT = 0.05, 99.0
-_SAMPLES = 1 << 22  # texels that this is found of
+_SAMPLES = 1 << 22  # texels of which the percentile is taken
 
 
 class FineGrid:
-    """The lightmap's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once.
+    """A sheet's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once.
 
     Attributes:
-        mesh: The mesh.
+        sheet: The sheet.
         device: "cpu" or "cuda:N".
         height, width: Cells, 2 H and 2 W.
     """
 
-    def __init__(self, mesh: LightmappedMesh, device: str) -> None:
-        self.mesh, self.device = mesh, device
-        self.height, self.width = (2 * count for count in mesh.mask.shape)
+    def __init__(self, sheet: Sheet, device: str) -> None:
+        self.sheet, self.device = sheet, device
+        self.height, self.width = (2 * count for count in sheet.mask.shape)
 
     @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The triangle that holds each cell's centre, and the weights of its corners, as `texel_triangles`."""
-        return texel_triangles(self.mesh, self.height, self.width, self.device)
+        return texel_triangles(self.sheet, self.height, self.width, self.device)
 
     @cached_property
     def covered(self) -> torch.Tensor:
         """bool [2 H, 2 W], whether a triangle holds the centre, exactly."""
-        mesh = self.mesh
-        return covered_on(mesh.uv, mesh.triangle[mesh.active], self.height, self.width, self.device) > 0
+        sheet = self.sheet
+        return covered_on(sheet.uv, sheet.triangle[sheet.active], self.height, self.width, self.device) > 0
 
     @cached_property
     def border(self) -> torch.Tensor:
-        """bool [2 H, 2 W], within a texel of a chart's border."""
+        """bool [2 H, 2 W], whether a chart's border is within a texel."""
         triangle = self.triangle[0]
-        chart = torch.from_numpy(mesh_charts(self.mesh)).to(self.device)
+        chart = torch.from_numpy(sheet_charts(self.sheet)).to(self.device)
         chart = torch.where(triangle < 0, -1, chart[triangle.clamp(min=0)])
         # Numbers of charts are whole in float32 up to 2 ** 24.
         return _largest(chart.float()) != -_largest(-chart.float())
@@ -57,16 +57,17 @@ class FineGrid:
     @cached_property
     def texels(self) -> torch.Tensor:
         """bool [2 H, 2 W], the quarters of the texels of the mask whose own centres a triangle holds."""
-        mesh = self.mesh
-        inside = covered_on(mesh.uv, mesh.triangle[mesh.active], *mesh.mask.shape, self.device) > 0
-        return _quarters(inside & torch.from_numpy(mesh.mask).to(self.device))
+        sheet = self.sheet
+        inside = covered_on(sheet.uv, sheet.triangle[sheet.active], *sheet.mask.shape, self.device) > 0
+        return _quarters(inside & torch.from_numpy(sheet.mask).to(self.device))
 
     @cached_property
     def relative(self) -> torch.Tensor:
-        """float64 [2 H, 2 W], what a squared error of linear light counts as one of relative light, up to a factor."""
-        mesh = self.mesh
-        light = torch.from_numpy(mesh.filled).to(self.device).mean(2, dtype=torch.float64)
-        bright = light[torch.from_numpy(mesh.mask).to(self.device)]
+        """float64 [2 H, 2 W], the factor from squared error of linear light to squared relative error, up to a
+        constant."""
+        sheet = self.sheet
+        light = torch.from_numpy(sheet.lightmap).to(self.device).mean(2, dtype=torch.float64)
+        bright = light[torch.from_numpy(sheet.mask).to(self.device)]
         dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)].cpu().numpy(), _BRIGHT))
         return _quarters(1.0 / (light + (dark or 1.0)).square())
 
@@ -83,67 +84,50 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
     return max_pool2d(across, (window, 1), 1, (_BORDER, 0))[0, 0]
 
 
-def weights(grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
-    """How much each cell counts: the pixels that show it in random views, and a little for those that none shows.
+def weights(scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
+    """Counts for each cell of a scene's only sheet the pixels that show it in random views, see `spread`.
+
+    Views from inside count as much as views from around.
 
     Returns:
         float64 [2 H, 2 W] on the grid's device, 0 where there is no triangle; at least one is above 0.
     """
-    mesh, height, width = grid.mesh, grid.height, grid.width
-    if not profile.views:
-        visible = torch.from_numpy(_areas(mesh, height, width, seed)).double().to(grid.device)
-    else:
-        visible = _seen(grid, profile.views, seed)
-    return spread(grid, visible, profile)
+    count, shape = profile.views, (grid.height, grid.width, grid.device)
+    views = scene_views(scene, count, seed)
+    around, inside = (visibility(scene, each, RESOLUTION, *shape) for each in (views[:count], views[count:]))
+    if around.any() and inside.any():
+        inside *= around.sum() / inside.sum()
+    return spread(grid, around + inside, profile.unseen, profile.border, profile.relative)
 
 
-def spread(grid: FineGrid, visible: torch.Tensor, profile: Profile, mean: float | None = None) -> torch.Tensor:
-    """Weights by counts of pixels: those, a little where there are none, and more at borders of charts.
+def spread(
+    grid: FineGrid,
+    visible: torch.Tensor,
+    unseen: float,
+    border: float,
+    relative: float = 0.0,
+    mean: float | None = None,
+) -> torch.Tensor:
+    """Makes weights of counts of pixels: the counts, a little where there are none, and more at borders of charts.
 
     Args:
         grid: The grid.
         visible: float64 [2 H, 2 W] on its device, pixels that show each cell.
-        profile: `unseen` and `border`.
-        mean: Of the pixels of a cell, of which what isn't seen has a fraction; None: this lightmap's.
+        unseen, border, relative: As in `Profile`.
+        mean: Mean count of a cell, of which unseen cells have a fraction; None: this sheet's.
 
     Returns:
         As `weights`.
     """
-    # A texel is read at its centre too, of which a small triangle may hold no quarter's.
+    # A texel is read at its centre too, and a small triangle may hold that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
-        used = _quarters(torch.from_numpy(grid.mesh.mask).to(grid.device))
+        used = _quarters(torch.from_numpy(grid.sheet.mask).to(grid.device))
     if mean is None:
         mean = float(visible[used].mean()) or 1.0
-    result = torch.where(used, visible + profile.unseen * mean, 0.0)
-    result = torch.where(grid.border, profile.border * result, result)
-    if profile.relative:
-        share = profile.relative * result.sum() / (result * grid.relative).sum()
-        result = result * (1.0 - profile.relative + share * grid.relative)
+    result = torch.where(used, visible + unseen * mean, 0.0)
+    result = torch.where(grid.border, border * result, result)
+    if relative:
+        share = relative * result.sum() / (result * grid.relative).sum()
+        result = result * (1.0 - relative + share * grid.relative)
     return result
-
-
-def _seen(grid: FineGrid, count: int, seed: int) -> torch.Tensor:
-    """Pixels of random views that show each cell, float64 [2 H, 2 W]; views from inside count as much as the others."""
-    views = mesh_views(grid.mesh, count, seed)
-    around, inside = (
-        visibility(grid.mesh, each, _RESOLUTION, grid.height, grid.width, grid.device)
-        for each in (views[:count], views[count:])
-    )
-    if around.any() and inside.any():
-        inside *= around.sum() / inside.sum()
-    return around + inside
-
-
-def _areas(mesh: LightmappedMesh, height: int, width: int, seed: int) -> np.ndarray:
-    """How many random points of the mesh's surface lie in each cell of UV space, int64 [height, width]."""
-    random = np.random.default_rng(seed)
-    count = np.zeros(height * width, np.int64)
-    total = _POINTS * height * width
-    for first in range(0, total, _POINTS_AT_ONCE):
-        points = min(_POINTS_AT_ONCE, total - first)
-        triangle, weight = surface_points(mesh, points, random)
-        uv = np.einsum("nk,nkc->nc", weight, mesh.uv[mesh.triangle[triangle]])
-        column, row = ((uv[:, i] * n).astype(np.int64).clip(0, n - 1) for i, n in enumerate((width, height)))
-        count += np.bincount(row * width + column, minlength=height * width)
-    return count.reshape(height, width)

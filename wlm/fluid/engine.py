@@ -1,4 +1,4 @@
-"""The arrays of a lattice on its device, and the launches that make a step; `lattice` checks what goes in."""
+"""Arrays of a lattice on its device, and the kernel launches of a step; `wlm.fluid.lattice` validates the input."""
 
 import math
 from collections.abc import Mapping
@@ -17,17 +17,17 @@ from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 BODIES = 256
-"""Bodies that uint8 can number, the fluid counted in."""
+"""Number of bodies that uint8 can index, including the fluid."""
 
 PERIOD = 2
-"""Steps after which the two buffers have changed places and back: a CUDA graph must hold a multiple of it."""
+"""Steps after which the two buffers have swapped back; a CUDA graph must contain a multiple of it."""
 
 
 def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
-    """Checks that a grid's bytes are free.
+    """Checks that there is enough free memory for a grid.
 
     Raises:
-        WlmError: They aren't; the line names the grid, both sizes and a remedy.
+        WlmError: There is not; the message names the grid, both sizes and a remedy.
     """
     free = free_memory(device)
     if needed > free:
@@ -45,10 +45,10 @@ class Engine:
         spec: The settings that change the code of a step.
         device: The device.
         cells: X Y Z.
-        done: Steps done by this object's own launches; replays of a graph that a user made count in `clock` alone.
+        done: Steps done by this object's own launches; replays of a user's graph are counted only in `clock`.
         clock, trouble: See `wlm_kernels.fluid.lattice.step_kernel`.
-        solid: uint8 [N], or [0] as long as no cell was ever solid.
-        bodies: The motion of the solids.
+        solid: uint8 [N], or [0] while no cell has ever been solid.
+        bodies: Motion of the solids.
     """
 
     def __init__(self, shape: tuple[int, int, int], spec: Spec, tau: float, eddy: float, rise: float, device) -> None:
@@ -74,13 +74,13 @@ class Engine:
 
     @staticmethod
     def bytes_needed(cells: int, lattice: str, storage: str) -> int:
-        """Memory of the populations, by far the largest part."""
+        """Returns the memory of the populations in bytes, by far the largest part."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
         return 2 * len(velocity_set(lattice).c) * cells * size
 
     @property
     def buffers(self) -> tuple[wp.array, wp.array]:
-        """The populations that the next step reads, and those that it writes."""
+        """The populations that the next step reads, and the populations that it writes."""
         return self._f[self.done % 2], self._f[1 - self.done % 2]
 
     def zeros(self, size: int, dtype) -> wp.array:
@@ -89,13 +89,13 @@ class Engine:
     # Setting up.
 
     def set_faces(self, faces: Mapping[str, Face]) -> None:
-        """Sets the conditions at the domain's faces; `prepare` makes their links."""
+        """Sets the boundary conditions at the domain's faces; `prepare` makes their links."""
         self._faces = dict(faces)
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
 
     def set_force(self, force: wp.vec3 | None, forces: wp.array | None) -> None:
-        """Sets one force for all cells, or one for each, or none."""
+        """Sets one force for all cells, a force per cell, or no force."""
         kind = "uniform" if force is not None else "field" if forces is not None else "none"
         self.spec = replace(self.spec, force=kind)
         self._force = wp.vec3() if force is None else force
@@ -103,7 +103,7 @@ class Engine:
         self._graph = None
 
     def prepare(self) -> float:
-        """Makes the links of faces that were set anew, and returns the speed of the fastest solid."""
+        """Makes the links if faces have been set, and returns the speed of the fastest solid."""
         if self._links is not None:
             return 0.0
         self._bounded = wp.vec3i(*bounded_axes(self._faces))
@@ -127,7 +127,7 @@ class Engine:
         self._apply_links(0, now)
 
     def cover(self, new: wp.array) -> float:
-        """Sets which cells are solid, uint8 [N], and returns the speed of the fastest."""
+        """Sets which cells are solid, uint8 [N], and returns the speed of the fastest solid."""
         if self.solid.shape[0] == 0:
             self.solid = self.zeros(self.cells, wp.uint8)
             self._graph = None
@@ -144,7 +144,7 @@ class Engine:
         return fastest
 
     def restore(self, populations: np.ndarray, solid: np.ndarray, done: int) -> float:
-        """Sets a stored state, the bodies' motion being set already, and returns the speed of the fastest solid."""
+        """Sets a stored state and returns the speed of the fastest solid; the bodies' motion must be set before."""
         self.done, self._graph = done, None
         self.clock.fill_(done)
         self.trouble.fill_(QUIET)
@@ -156,15 +156,15 @@ class Engine:
         return self.find_links()
 
     def find_links(self) -> float:
-        """Lists the links of solids, in larger arrays if they don't fit, and returns the speed of the fastest."""
-        # Without solids: a state may follow one that had some.
+        """Lists the links of solids, enlarging the arrays if needed, and returns the speed of the fastest solid."""
+        # The count is also set without solids: the state before may have had some.
         count, fastest = 0, 0.0
         if self.solid.shape[0] > 0:
             count, fastest = self._search()
             links = self._links
             if count > links.cell.shape[0] - links.faces:
                 columns = [array.numpy()[: links.faces] for array in (links.cell, links.code, links.term)]
-                # Room to spare: a body that moves has now more links, now fewer.
+                # Spare elements: the number of links of a moving body varies.
                 self._links = self._make_links(columns, links.faces + count + count // 4)
                 self._graph = None
                 self._search()
@@ -172,7 +172,7 @@ class Engine:
         return fastest
 
     def _make_links(self, columns, size: int) -> lattice_links.Links:
-        """Puts the links of faces on the device, in arrays of `size` elements."""
+        """Uploads the links of faces, in arrays of `size` elements."""
         links = lattice_links.Links()
         links.faces = len(columns[0])
         dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
@@ -192,15 +192,15 @@ class Engine:
     # Running.
 
     def run(self, steps: int) -> None:
-        """Queues some steps."""
+        """Queues steps."""
         for _ in range(steps):
             self._step()
 
     def run_in_graphs(self, steps: int) -> None:
-        """Does the same by replays of a CUDA graph of `PERIOD` steps; what remains runs without it."""
+        """Queues steps as replays of a CUDA graph of `PERIOD` steps; remaining steps run without the graph."""
         while steps > 0:
             if steps < PERIOD or self.done % PERIOD or self._graph is None:
-                # The first steps load the kernels' modules, which a capture must not.
+                # The first steps load the kernels' modules, which is not allowed during a capture.
                 eager = min(steps, PERIOD - self.done % PERIOD)
                 self.run(eager)
                 steps -= eager
@@ -214,12 +214,12 @@ class Engine:
                 steps -= PERIOD
 
     def fields(self, drho: wp.array, u: wp.array) -> None:
-        """Writes the density less 1 and the velocity, each unless its array is empty."""
+        """Writes the density minus 1 and the velocity, each unless its array is empty."""
         inputs = [self._n, self.buffers[0], self.solid, self.bodies, self._force, self._forces]
         self._launch(self._fluid_kernels.fields, self.cells, inputs, [drho, u])
 
     def force_on_bodies(self) -> np.ndarray:
-        """The force on every body in the last step, float64 [BODIES, 3]."""
+        """Returns the force on every body in the last step, float64 [BODIES, 3]."""
         total = self.zeros(BODIES, wp.vec3d)
         if self.solid.shape[0] > 0:
             inputs = [self._tables, self._n, self._bounded, self._links, self.solid, self.buffers[0]]

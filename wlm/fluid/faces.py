@@ -12,7 +12,7 @@ from wlm_kernels.fluid.lattice_sets import VelocitySet
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 
-# Where a link crosses two faces, along an edge of the domain, the lower rank decides, then the order of FACES.
+# A link along an edge of the domain crosses two faces: the face of lower rank decides, then the order of FACES.
 _STILL, _MOVING, _INLET, _OUTLET, _SLIP = range(5)
 
 
@@ -23,8 +23,8 @@ class Face:
     Attributes:
         rank: uint8 [A, B], precedence along the domain's edges.
         kind: uint8 [A, B], kinds of `lattice_links`.
-        velocity: float64 [A, B, 3], of a wall or an inlet, cells a step.
-        excess: Density less 1 of an outlet with a given density.
+        velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
+        excess: Density minus 1 of an outlet with a given density.
     """
 
     rank: np.ndarray
@@ -51,7 +51,7 @@ def _velocity(size: tuple[int, int], velocity) -> np.ndarray:
 
 
 def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip: bool = False) -> Face:
-    """A wall without slip, or with it, which has no velocity."""
+    """Makes a no-slip wall, or a slip wall, which has no velocity."""
     size = _size(shape, face)
     velocity = _velocity(size, velocity)
     if slip:
@@ -60,7 +60,7 @@ def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip:
 
 
 def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
-    """An inlet where `where` (bool [A, B], None: all) is true, a wall elsewhere."""
+    """Makes an inlet where `where` (bool [A, B], None: everywhere) is true, and a wall elsewhere."""
     size = _size(shape, face)
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
@@ -70,7 +70,7 @@ def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
 
 
 def outlet(shape: tuple[int, int, int], face: str, density: float | None = None) -> Face:
-    """An outlet that conserves mass, or one that relaxes to a density."""
+    """Makes an outlet that conserves mass, or one that relaxes to a density."""
     size = _size(shape, face)
     if density is not None and not (np.isfinite(density) and density > 0.0):
         raise ValueError(f"density: expected a positive number, got {density}")
@@ -79,7 +79,7 @@ def outlet(shape: tuple[int, int, int], face: str, density: float | None = None)
 
 
 def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
-    """1 for each axis that has faces, 0 for a periodic one.
+    """Returns 1 for each axis that has faces and 0 for each periodic axis.
 
     Raises:
         ValueError: Only one end of an axis has a face.
@@ -94,13 +94,14 @@ def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
 
 
 def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
-    """Whether each axis is closed by walls at rest, which need no links."""
+    """Returns whether each axis is closed by walls at rest, which need no links."""
     still = [name in faces and bool((faces[name].rank == _STILL).all()) for name in FACES]
     return still[0] and still[1], still[2] and still[3], still[4] and still[5]
 
 
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
-    """The kinds of each axis' two ends for smoke, see `advection_places`; a face that isn't all wall is open."""
+    """Returns the kinds of the two ends of each axis for smoke, see `advection_places`; a face that is not entirely a
+    wall is open."""
     ends = []
     for name in FACES:
         walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()
@@ -111,9 +112,9 @@ def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
 def face_links(
     shape: tuple[int, int, int], lattice: VelocitySet, faces: Mapping[str, Face]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The links of all faces but those of walled axes, direction by direction, each in the order of the cells.
+    """Lists the links of all faces except those of walled axes, by direction and then in the order of the cells.
 
-    They include those of solid cells, which the kernels skip.
+    Links of solid cells are included; the kernels skip them.
 
     Returns:
         `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`.

@@ -1,9 +1,9 @@
-"""Grids of a file, each with a map from its voxels to the world, on one lattice of cubic voxels along the axes.
+"""Grids of a file on one lattice of cubic voxels along the axes; the grids of NanoVDB files.
 
-A grid whose voxels are cubic and lie along the axes, in any order and direction, stays as it is, but for the order of
-its axes. Any other map, of voxels that are longer along one axis, turned or sheared, is resampled: linearly between the
-centres of the grid's voxels, at voxels as long as its shortest edge. Its box then grows by the voxels which the smoke
-between two centres reaches into.
+A grid has a map from its voxels to the world. A grid whose voxels are cubes along the axes, in any order and direction,
+is only permuted and flipped. Other grids, with longer, rotated or sheared voxels, are resampled: linearly between the
+centres of their voxels, at cubic voxels of their shortest edge. The box then grows by the voxels that the interpolated
+smoke reaches.
 """
 
 import math
@@ -27,12 +27,12 @@ UPS = {
     "y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 }
-"""Turns of a world in which x, y or z is up to one in which +y is, by that axis."""
+"""Rotations from a world in which the axis x, y or z is up to one in which +y is up, by that axis."""
 
-_CUBIC = 1e-5  # of an edge, by which it may differ from that of a cube along the axes
-_FLAT = 1e-9  # volume of a parallelepiped of edges of length 1
-_FARTHEST = 1 << 30  # of voxels from the world's origin: beyond, rounding would move them
-_APART = 1e-4  # of a voxel, by which two grids' voxels may differ and still be the same
+_CUBIC = 1e-5  # relative deviation of an edge from that of a cube along the axes
+_FLAT = 1e-9  # least volume of a voxel with edges scaled to length 1
+_FARTHEST = 1 << 30  # largest distance from the world's origin in voxels; beyond, rounding would move them
+_APART = 1e-4  # offset in voxels up to which the voxels of two grids coincide
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class Grid:
     """A grid over the box of its active voxels.
 
     Attributes:
-        name: As messages name it.
+        name: Name in messages.
         values: float32 tensor [X, Y, Z].
-        matrix: float64 [4, 4], from the indices of voxel centres, 0 the first of the box, to the world.
+        matrix: float64 [4, 4], from the indices of voxel centres, 0 for the first of the box, to the world.
     """
 
     name: str
@@ -66,23 +66,23 @@ class Lattice:
 
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
-    """Puts grids on one lattice, that of the first, over the box of all.
+    """Puts grids on one lattice, aligned with the first grid, over the bounding box of all grids.
 
     Args:
         grids: At least one.
-        most: Voxels that the lattice may have.
+        most: Largest number of voxels of the lattice.
         up: "x", "y" or "z", the axis of the grids' world that becomes +y.
 
     Returns:
         The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
 
     Raises:
-        WlmError: A map without volume, or the lattice has too many voxels.
+        WlmError: A map has no volume, or the lattice has too many voxels.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]
     voxel = float(np.linalg.norm(matrix[:3, :3], axis=0).min())
-    # A lattice through the first grid's corner: its own voxels, if they are cubes along the axes.
+    # A lattice through the first grid's corner: the grid's own voxels if they are cubes along the axes.
     corner = _ends(first, matrix, 0.0)[0]
     kept = [_is_kept(_between(voxel, corner, matrix)) for _, matrix in turned]
     ends = [_ends(grid, matrix, 0.0 if same else 0.5) for (grid, matrix), same in zip(turned, kept, strict=True)]
@@ -102,33 +102,33 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
 
 def _turned(grid: Grid, up: str) -> np.ndarray:
-    """The map of the corners of a grid's voxels, rather than their centres, to the turned world, [4, 4]."""
+    """Returns the map from the corners of a grid's voxels, instead of their centres, to the rotated world, [4, 4]."""
     matrix = np.eye(4)
     matrix[:3, :3] = UPS[up]
     matrix = matrix @ grid.matrix
     matrix[:3, 3] -= 0.5 * matrix[:3, :3].sum(1)
     edges = np.linalg.norm(matrix[:3, :3], axis=0)
-    # Of unit edges, so that small voxels have a volume too.
+    # Edges are scaled to length 1, so that the test does not depend on the size of a voxel.
     if not (np.isfinite(edges).all() and edges.all() and abs(np.linalg.det(matrix[:3, :3] / edges)) > _FLAT):
         raise WlmError(f"{grid.name}: expected a map to the world that keeps a volume, found {grid.matrix.tolist()}")
     return matrix
 
 
 def _ends(grid: Grid, matrix: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of a grid's box in the world, which is `margin` voxels larger on each side, two of [3]."""
+    """Returns the low and the high corner in the world, [3] each, of a grid's box enlarged by `margin` voxels."""
     box = np.stack(np.meshgrid(*[(-margin, n + margin) for n in grid.values.shape], indexing="ij"), -1).reshape(8, 3)
     corners = box @ matrix[:3, :3].T + matrix[:3, 3]
     return corners.min(0), corners.max(0)
 
 
 def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The map from a lattice's voxels to a grid's, of corners: its linear part [3, 3] and its shift [3]."""
+    """Returns the map from corners of a lattice's voxels to those of a grid: linear part [3, 3] and shift [3]."""
     turn = np.linalg.inv(matrix[:3, :3])
     return turn * voxel, turn @ (origin - matrix[:3, 3])
 
 
 def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Whether each voxel of the lattice is one of the grid."""
+    """Whether each voxel of the lattice is a voxel of the grid."""
     turn, shift = between
     axes = np.abs(turn).round()
     straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()
@@ -136,13 +136,13 @@ def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
 
 
 def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
-    """A grid's values on the lattice."""
+    """Returns a grid's values on the lattice."""
     turn, shift = _between(lattice.voxel, np.asarray(lattice.origin), matrix)
     if not _is_kept((turn, shift)):
         return _resampled(lattice, grid.values, turn, shift)
     signs = turn.round().astype(int)
-    order = np.abs(signs).argmax(0).tolist()  # for each axis of the lattice that of the grid
-    begin = (shift + 0.5 * signs.sum(1) - 0.5).round().astype(int)  # the grid's voxel at the lattice's first
+    order = np.abs(signs).argmax(0).tolist()  # the grid's axis for each axis of the lattice
+    begin = (shift + 0.5 * signs.sum(1) - 0.5).round().astype(int)  # the grid's voxel at the lattice's first voxel
     backwards = [axis for axis in range(3) if signs[order[axis], axis] < 0]
     values = grid.values.permute(order).flip(backwards)
     first = [
@@ -164,26 +164,26 @@ def _resampled(lattice: Lattice, values: torch.Tensor, turn: np.ndarray, shift: 
 
 
 BAD_GRID = (RuntimeError, TypeError, ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
-"""What a NanoVDB file raises that is none, is cut short, or lies about its sizes."""
+"""Exceptions for data that is not NanoVDB, is truncated, or has wrong sizes."""
 
-# Bytes of a file's header and of what it says of each grid; in the latter the places of the grid's bytes, those in the
-# file, and its name's length.
+# Sizes of a file's header and of a grid's metadata; offsets in the metadata of the grid's size, its size in the file,
+# and the length of its name.
 _FILE_HEADER, _META, _GRID_BYTES, _FILE_BYTES, _NAME_LENGTH = 16, 176, 0, 8, 136
 _ZIP, _BLOSC = 1, 2
-# Of a grid's own header: the map's linear part and its shift, in doubles; the tree, and in that the way to its root.
+# Offsets in a grid's header: the map's linear part and shift in doubles; the tree, and in it the offset of the root.
 _LINEAR, _SHIFT, _TREE, _ROOT = 384, 528, 672, 24
 _LONGEST_NAME = 1 << 12
 
 
 @dataclass(frozen=True)
 class NanoVdbEntry:
-    """A grid of a file, still packed.
+    """A grid of a file, still compressed.
 
     Attributes:
-        name: As the file has it.
-        data: Its bytes in the file.
-        head, meta: The header of its segment, and what that says of the grid.
-        size: Bytes of the grid unpacked.
+        name: Name in the file.
+        data: Bytes in the file.
+        head, meta: Header of its segment, and the grid's metadata in it.
+        size: Uncompressed size in bytes.
         codec: 0 none, 1 zlib, 2 Blosc.
     """
 
@@ -195,14 +195,14 @@ class NanoVdbEntry:
     codec: int
 
     def load(self, where: str, trust: bool) -> wp.Volume:
-        """Unpacks it.
+        """Decompresses the grid.
 
         Args:
-            where: The file, by which messages name it.
-            trust: Whether it may become as large as it says.
+            where: Name of the file in messages.
+            trust: Whether the grid may be as large as it claims.
 
         Raises:
-            WlmError: It becomes more than it may.
+            WlmError: The grid is too large for its compressed size.
             RuntimeError, ValueError and others: `BAD_GRID`.
         """
         if self.codec and not trust:
@@ -212,7 +212,7 @@ class NanoVdbEntry:
             raise ValueError(f"expected {self.size} bytes of {self.name}, found {len(grid)}")
         meta = bytearray(self.meta)
         struct.pack_into("<Q", meta, _FILE_BYTES, len(grid))
-        # Which of the file's it is doesn't matter any more, and Warp would look for the others.
+        # The header must claim a single grid: Warp would look for the others.
         return wp.Volume.load_from_nvdb(b"".join((self.head[:12], struct.pack("<2H", 1, 0), meta, grid)), device="cpu")
 
     def _unpacked(self) -> bytes:
@@ -237,7 +237,7 @@ class NanoVdbEntry:
 
 
 def entries(data: bytes) -> Iterator[NanoVdbEntry]:
-    """The grids of a file, which may have several segments, each of several grids.
+    """Yields the grids of a file, which may have several segments with several grids each.
 
     Raises:
         RuntimeError, ValueError and others: `BAD_GRID`.
@@ -268,19 +268,19 @@ def entries(data: bytes) -> Iterator[NanoVdbEntry]:
 
 
 def dense(volume: wp.Volume, name: str, most: int) -> Grid:
-    """Makes a grid dense over the box of its active voxels, on its device; where there are none, over voxel 0.
+    """Makes a grid dense over the box of its active voxels, on its device; over voxel 0 if none is active.
 
     Args:
         volume: A grid of floats.
-        name: By which messages name it.
-        most: Voxels that its box may have.
+        name: Name in messages.
+        most: Largest number of voxels of the box.
 
     Raises:
-        WlmError: Not of floats, or too large.
+        WlmError: The grid does not contain floats, or is too large.
     """
     if volume.dtype is not wp.float32:
         raise WlmError(f"{name}: expected a grid of floats, found {volume.get_grid_info().type_str}")
-    # Warp exposes neither the box nor the map in doubles.
+    # Warp exposes neither the box nor the map in double precision.
     head = volume.array()[: _TREE + _ROOT + 8].numpy()
     matrix = np.eye(4)
     matrix[:3, :3] = np.array(struct.unpack_from("<9d", head, _LINEAR)).reshape(3, 3)
@@ -291,7 +291,7 @@ def dense(volume: wp.Volume, name: str, most: int) -> Grid:
     corners = np.frombuffer(volume.array()[root : root + 24].numpy().tobytes(), "<i4").reshape(2, 3).astype(np.int64)
     low, size = corners[0], corners[1] - corners[0] + 1
     if (size < 1).any():
-        # Smoke that hasn't begun: one voxel, which is empty.
+        # No active voxel: one empty voxel.
         low, size = np.zeros(3, np.int64), np.ones(3, np.int64)
     if math.prod(size.tolist()) > most:
         raise WlmError(

@@ -1,15 +1,15 @@
 """A lattice Boltzmann solver of air (neural-six-way-lightmaps, section 5).
 
 Lengths are in cells, times in steps, and the density of air at rest is 1; `Domain` converts. Arrays are [X, Y, Z],
-cell centres at half integers. Stated behaviours:
+cell centres at half integers. Special cases:
 
 ====================================  =================================================================
-a flow that blows up                  error within `CHECK_EVERY` steps: the first step and cell, and why
+a flow that blows up                  error within `CHECK_EVERY` steps: first step and cell, and the cause
 a wall, body or inlet too fast        error: the speed and `MAX_SPEED`
-a body over an inlet                  nothing comes in where it lies; with all covered, nothing at all
-a body over everything                nothing moves
-a grid of one voxel                   fine, as is any axis of one cell
-a domain too large for the memory     error before anything is allocated: what it needs and what there is
+a body over an inlet                  no inflow through the covered part
+a body over the whole domain          no motion
+a grid or an axis of one cell         valid
+a domain too large for the memory     error before the allocation: required and available memory
 a cell freed with no fluid around it  at rest at density 1
 ====================================  =================================================================
 """
@@ -29,21 +29,21 @@ from wlm.formats.parts import Part, check_parts
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
 
 CHECK_EVERY = 48
-"""Steps between two checks for a flow that blew up; a multiple of what a graph holds."""
+"""Steps between two checks for a flow that blew up; a multiple of the steps in a graph."""
 
 MAX_SPEED = 0.3
-"""Limit of the speed of walls, bodies and inlets, cells a step: half the speed of sound, where the error of order Ma^2
-reaches a quarter."""
+"""Largest speed of walls, bodies and inlets, cells per step: half the speed of sound, at which the error of order Ma^2
+is a quarter."""
 
-_MOST_STEPS = 2**31 - 1  # that a device counts
+_MOST_STEPS = 2**31 - 1  # limit of the device's counter
 _MOTION = ("velocity", "spin", "centre")
-# From this many steps on a graph repays its capture.
+# Least number of steps for which capturing a graph saves time.
 _GRAPH_FROM = 16
 
 
 @dataclass(frozen=True)
 class Domain:
-    """The size of a cell and of a step, which converts SI units to those of a lattice.
+    """Sizes of a cell and of a step, which convert SI units to units of a lattice.
 
     Attributes:
         cell: Metres.
@@ -59,47 +59,43 @@ class Domain:
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name}: expected a positive number, got {value}")
 
-    @classmethod
-    def of_speed(cls, cell: float, speed: float, lattice_speed: float = 0.1) -> "Domain":
-        """The domain in which `speed` (m/s) is `lattice_speed` (cells a step)."""
-        return cls(cell, lattice_speed * cell / speed)
-
     def speed(self, value: float) -> float:
-        """A speed in m/s as cells a step."""
+        """Converts a speed from m/s to cells per step."""
         return value * self.step / self.cell
 
     def viscosity(self, value: float) -> float:
-        """A kinematic viscosity in m^2/s as square cells a step."""
+        """Converts a kinematic viscosity from m^2/s to square cells per step."""
         return value * self.step / self.cell**2
 
     def acceleration(self, value: float) -> float:
-        """An acceleration in m/s^2 as cells a step squared."""
+        """Converts an acceleration from m/s^2 to cells per step squared."""
         return value * self.step**2 / self.cell
 
 
 class Lattice:
-    """A box of air, at rest at first, periodic along every axis without faces.
+    """A box of air, initially at rest, periodic along every axis without faces.
 
-    Set faces first, then `set_flow` unless the air begins at rest, then step; bodies and forces at any time.
+    Set the faces first, then call `set_flow` unless the air begins at rest, then step. Bodies and forces can be set at
+    any time.
 
     Args:
         shape: Cells along x, y and z.
-        viscosity: Kinematic, square cells a step; above 0.
-        operator: Of collision: "bgk", "regularised" or "recursive", see `wlm_kernels.fluid.lattice`.
-        smagorinsky: C of the eddy viscosity; 0 is none. With 0.17 the default operator is stable at viscosity 1e-6.
-        storage: "float32" or "float16": half the memory and traffic; a jet's velocity then differs by less than 0.2% of
-            its speed (RMS, until chaos separates the two), and its mass drifts by some 3e-5 in 5,000 steps.
+        viscosity: Kinematic viscosity in square cells per step; above 0.
+        operator: Collision operator, "bgk" or "regularised", see `wlm_kernels.fluid.lattice`.
+        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the default operator is stable at viscosity 1e-6.
+        storage: "float32" or "float16", which halves memory and traffic; a jet's velocity then differs by less than
+            0.2% of its speed (RMS, before the chaotic flows diverge), and its mass drifts by about 3e-5 in 5,000 steps.
         lattice: "D2Q9" (Z = 1), "D3Q19" or "D3Q27".
         device: "cpu" or "cuda:N".
-        ramp: Steps in which inlets rise to their velocity. A sudden start sends a sound wave through the box, which
-            walls and outlets that conserve mass reflect: four times the longest axis makes it weak.
+        ramp: Steps in which inlets rise to their velocity. A sudden start causes a sound wave, which walls and
+            mass-conserving outlets reflect; a ramp of four times the longest axis makes it weak.
 
     Attributes:
-        period: Steps after which a CUDA graph of them can be replayed, see `step`.
+        period: A CUDA graph must contain a multiple of this number of steps, see `step`.
 
     Raises:
-        ValueError: A wrong argument.
-        WlmError: The memory isn't enough.
+        ValueError: An argument is wrong.
+        WlmError: There is not enough memory.
     """
 
     period = PERIOD
@@ -127,14 +123,14 @@ class Lattice:
         needed = self.bytes_needed(self.shape, storage, lattice)
         require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
         tau, eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
-        # A ramp of one step is none: the first air comes in after it.
+        # A ramp of one step is no ramp: inflow begins after it.
         self._engine = Engine(self.shape, spec, tau, eddy, 1.0 / max(ramp, 1), self.device)
         self._faces: dict[str, fluid_faces.Face] = {}
         self._begun = False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
-        """Memory of a lattice without its small parts, bytes; arguments as for the class."""
+        """Returns the memory of a lattice without its small arrays, in bytes; arguments as for the class."""
         return Engine.bytes_needed(math.prod(shape), lattice, storage)
 
     # Setting up.
@@ -144,28 +140,28 @@ class Lattice:
 
         Args:
             face: One of `wlm.fluid.faces.FACES`, "-x" for example.
-            velocity: Of the wall, cells a step, along it; (3,) or [A, B, 3] for the face's cells.
-            slip: Whether it is without friction, and so without a velocity.
+            velocity: Tangential velocity of the wall in cells per step; (3,) or [A, B, 3] for the face's cells.
+            slip: Whether the wall has no friction, and therefore no velocity.
         """
         self._set_face(face, fluid_faces.wall(self.shape, face, velocity, slip))
 
     def set_inlet(self, face: str, velocity: ArrayLike, where: ArrayLike | None = None) -> None:
-        """Lets air in through a face, or a part of it.
+        """Makes a face, or a part of it, an inlet.
 
         Args:
             face: As for `set_wall`.
-            velocity: Cells a step; (3,) or [A, B, 3] for the face's cells.
-            where: bool [A, B], the part that is open; None: the whole face. The rest is a wall.
+            velocity: Cells per step; (3,) or [A, B, 3] for the face's cells.
+            where: bool [A, B], the open part; None: the whole face. The rest is a wall.
         """
         self._set_face(face, fluid_faces.inlet(self.shape, face, velocity, where))
 
     def set_outlet(self, face: str, density: float | None = None) -> None:
-        """Lets air out through a face.
+        """Makes a face an outlet.
 
         Args:
             face: As for `set_wall`.
-            density: None: as much leaves, through all such outlets together, as comes in elsewhere, which conserves
-                mass. A number: the density relaxes to it, slowly enough to let sound out, and mass isn't conserved.
+            density: None: the outflow through all such outlets together equals the inflow, so that mass is conserved. A
+                number: the density relaxes to it, slowly enough to transmit sound, and mass is not conserved.
         """
         self._set_face(face, fluid_faces.outlet(self.shape, face, density))
 
@@ -177,17 +173,17 @@ class Lattice:
         spin: ArrayLike = (0.0, 0.0, 0.0),
         centre: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Sets which cells are solid and how they move; call it again when they have moved.
+        """Sets which cells are solid and how they move; must be called again after they have moved.
 
-        Cells that are no longer solid get the equilibrium of the mean of their neighbours. It syncs with the device and
-        can't be captured in a graph.
+        Cells that become fluid get the equilibrium of the mean of their neighbours. The call waits for the device and
+        cannot be captured in a graph.
 
         Args:
-            mask: bool, or the bodies' numbers 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
-                uint8 on the device as `wlm_kernels.fluid.lattice_fields` makes it.
-            velocity: Of the bodies' centres, cells a step; (3,) for body 1 or [K, 3] for bodies 1 to K.
-            spin: Angular velocity, radians a step, likewise.
-            centre: Cells, likewise; used where a body spins.
+            mask: bool, or numbers of bodies 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
+                uint8 on the device, see `wlm_kernels.fluid.lattice_fields`.
+            velocity: Velocity of the bodies' centres, cells per step; (3,) for body 1 or [K, 3] for bodies 1 to K.
+            spin: Angular velocity, radians per step, (3,) or [K, 3].
+            centre: Centres of rotation in cells, (3,) or [K, 3].
 
         Raises:
             WlmError: A surface is faster than `MAX_SPEED`.
@@ -207,8 +203,8 @@ class Lattice:
         """Sets the force on the air.
 
         Args:
-            force: An acceleration, cells a step squared: (3,) for all cells, or [X, Y, Z, 3]; a Warp array of vec3
-                [X, Y, Z] on the device isn't copied, so that it may change between steps. None: no force.
+            force: Acceleration in cells per step squared: (3,) for all cells, or [X, Y, Z, 3]. A Warp array of vec3
+                [X, Y, Z] on the device is not copied and may change between steps. None: no force.
         """
         if force is None:
             self._engine.set_force(None, None)
@@ -230,8 +226,8 @@ class Lattice:
         """Sets all air to the equilibrium of a velocity and a density.
 
         Args:
-            velocity: Cells a step; (3,) or [X, Y, Z, 3].
-            density: A number or [X, Y, Z]; 1 is at rest.
+            velocity: Cells per step; (3,) or [X, Y, Z, 3].
+            density: A number or [X, Y, Z]; air at rest has 1.
         """
         self._prepare()
         u = np.broadcast_to(np.asarray(velocity, np.float32), (*self.shape, 3)).reshape(-1, 3)
@@ -244,16 +240,16 @@ class Lattice:
 
     @property
     def faces(self) -> dict[str, fluid_faces.Face]:
-        """The faces that were set, by their names; an axis without any is periodic."""
+        """The faces that have been set, by name; an axis without faces is periodic."""
         return dict(self._faces)
 
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Runs some steps, and `check` after every `CHECK_EVERY` of them.
+        """Runs steps, and `check` after every `CHECK_EVERY` of them.
 
-        Within the capture of a CUDA graph it doesn't check: call `check` between replays. The number of steps must
-        be a multiple of `period` there, and so must be those done before.
+        During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps and the
+        number of earlier steps must then be multiples of `period`.
 
         Raises:
             WlmError: As `check`.
@@ -280,14 +276,14 @@ class Lattice:
 
     @property
     def steps(self) -> int:
-        """Steps done, by replays of a graph too; syncs with the device."""
+        """Number of steps done, including replays of graphs; waits for the device."""
         return int(self._engine.clock.numpy()[self._engine.done % 2])
 
     def check(self) -> None:
-        """Checks that the flow hasn't blown up, which every step records on the device; syncs with it.
+        """Checks that the flow has not blown up, which every step records on the device; waits for the device.
 
         Raises:
-            WlmError: It has; the line names the first step, the cell and the cause.
+            WlmError: The flow has blown up; the message names the first step, the cell and the cause.
         """
         key = int(self._engine.trouble.numpy()[0])
         if key == QUIET:
@@ -296,38 +292,38 @@ class Lattice:
         indices = tuple(int(a) for a in np.unravel_index(cell, self.shape))
         raise WlmError(
             f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-            f" viscosity that the operator bears: use a shorter time step, a larger viscosity or smagorinsky=0.17"
+            f" viscosity at which the operator is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
         )
 
     # Results.
 
     def velocity(self, out: wp.array | None = None) -> wp.array:
-        """The velocity, vec3 [X, Y, Z], cells a step; in a solid cell the body's."""
+        """Returns the velocity, vec3 [X, Y, Z], in cells per step; the body's velocity in a solid cell."""
         self._prepare()
         out = wp.empty(self.shape, dtype=wp.vec3, device=self.device) if out is None else out
         self._engine.fields(self._engine.zeros(0, float), out.flatten())
         return out
 
     def excess_density(self, out: wp.array | None = None) -> wp.array:
-        """The density less 1, float [X, Y, Z], which float32 resolves better; 0 in a solid cell."""
+        """Returns the density minus 1, float [X, Y, Z], which float32 resolves better; 0 in a solid cell."""
         self._prepare()
         out = wp.empty(self.shape, dtype=float, device=self.device) if out is None else out
         self._engine.fields(out.flatten(), self._engine.zeros(0, wp.vec3))
         return out
 
     def density(self) -> np.ndarray:
-        """The density, float64 [X, Y, Z]; 1 in a solid cell. Pressure is a third of it."""
+        """Returns the density, float64 [X, Y, Z]; 1 in a solid cell. The pressure is a third of it."""
         return 1.0 + self.excess_density().numpy().astype(np.float64)
 
     def mass(self) -> float:
-        """The mass of all fluid cells, summed in float64."""
+        """Returns the mass of all fluid cells, summed in float64."""
         solid = int(np.count_nonzero(self._engine.solid.numpy()))
         return self._engine.cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
 
     def force_on_solid(self, body: int = 1) -> np.ndarray:
-        """The force of the air on a body in the last step, by momentum exchange, float64 (3,).
+        """Returns the force of the air on a body in the last step, by momentum exchange, float64 (3,).
 
-        The pressure of air at rest at density 1 is left out; on a body that the air surrounds it sums to zero anyway.
+        The pressure of air at rest at density 1 is excluded; on a body that air surrounds its sum is 0.
         """
         if not 0 < body < BODIES:
             raise ValueError(f"body: expected 1 to {BODIES - 1}, got {body}")
@@ -335,9 +331,9 @@ class Lattice:
         return self._engine.force_on_bodies()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """The state, for `load`: scaled populations, solid cells and their motion, steps done."""
+        """Returns the state, for `load`: scaled populations, solid cells and their motion, steps done."""
         engine = self._engine
-        # On a CPU .numpy() shares the array's memory, which the next step changes.
+        # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
             "populations": engine.buffers[0].numpy().copy(),
             "solid": engine.solid.numpy().copy(),
@@ -346,18 +342,18 @@ class Lattice:
         }
 
     def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the state of a lattice of the same settings, faces and force.
+        """Continues from the state of a lattice with the same settings, faces and force.
 
-        On a CPU the steps that follow are bit for bit the same; on a GPU but for the order of its outlets' atomic sums.
+        On a CPU the following steps are bit for bit the same; on a GPU up to the order of the outlets' atomic sums.
 
         Raises:
-            WlmError: The state is of another shape, lattice or storage, or holds NaN or infinity.
+            WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
         """
         engine = self._engine
         now = engine.buffers[0]
         table = {
             "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
-            # Empty before the first step.
+            # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else engine.cells,)),
             "bodies": Part(np.float32, (len(_MOTION), BODIES, 3)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
@@ -410,5 +406,5 @@ def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:
 def _check_speed(speed: float, what: str) -> None:
     if speed > MAX_SPEED:
         raise WlmError(
-            f"lattice: {what} moves at {speed:.3g} cells a step: expected at most {MAX_SPEED}: use a shorter time step"
+            f"lattice: {what} moves at {speed:.3g} cells per step: expected at most {MAX_SPEED}: use a shorter step"
         )

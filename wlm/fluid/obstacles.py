@@ -1,4 +1,8 @@
-"""Closed surfaces as triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [F, 3]."""
+"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, their surfaces and paths.
+
+Lengths are in cells of the lattice, times in its steps, as in `wlm.fluid.lattice`. Surfaces are closed and consist of
+triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [F, 3].
+"""
 
 import hashlib
 from collections.abc import Sequence
@@ -9,29 +13,29 @@ import warp as wp
 
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
-_SIDES = 24  # of a sphere, from pole to pole; twice as many around it
+_SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
 def sphere() -> tuple[np.ndarray, np.ndarray]:
-    """A sphere of radius 1, in rings from pole to pole."""
+    """Makes a sphere of radius 1."""
     polar = np.linspace(0.0, np.pi, _SIDES + 1)
     return _revolved(np.sin(polar), np.cos(polar))
 
 
 def cylinder() -> tuple[np.ndarray, np.ndarray]:
-    """A cylinder along y of radius and half height 1."""
+    """Makes a cylinder along y of radius and half height 1."""
     return _revolved(np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0]))
 
 
 def box() -> tuple[np.ndarray, np.ndarray]:
-    """A cube of half edge 1."""
+    """Makes a cube of half edge 1."""
     points = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) * 2.0 - 1.0
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return points, np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))])
 
 
 def _revolved(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A surface of revolution about y, of rings from above; the first and the last ring are points."""
+    """Makes a surface of revolution about y from rings, top first; the first and the last ring are points."""
     columns = 2 * _SIDES
     angle = np.linspace(0.0, 2.0 * np.pi, columns, endpoint=False)
     middle = slice(1, -1)
@@ -52,11 +56,11 @@ def _revolved(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Positions over time, linear between keys; at rest before the first key and after the last.
+    """Positions over time, linear between keys, constant before the first key and after the last.
 
     Attributes:
         positions: float64 [K, 3], cells.
-        times: float64 [K], steps, each greater than the last.
+        times: float64 [K], steps, increasing.
     """
 
     positions: np.ndarray
@@ -67,11 +71,11 @@ class Trajectory:
         """Makes a trajectory.
 
         Args:
-            positions: [K, 3], or one position (3,) to stay at, cells.
+            positions: [K, 3], or one constant position (3,), cells.
             times: [K], steps.
 
         Raises:
-            ValueError: Wrong shapes, numbers that aren't finite, or times that don't increase.
+            ValueError: A shape is wrong, a number is not finite, or the times do not increase.
         """
         p, t = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(times, np.float64)
         if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
@@ -84,15 +88,15 @@ class Trajectory:
 
     @property
     def moves(self) -> bool:
-        """Whether its positions differ."""
+        """Whether the positions differ."""
         return bool((self.positions != self.positions[0]).any())
 
     def at(self, time: float) -> np.ndarray:
-        """The position at a time, float64 (3,)."""
+        """Returns the position at a time, float64 (3,)."""
         return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
 
     def describe(self) -> dict:
-        """Its settings as JSON values."""
+        """Returns the settings as JSON values."""
         return {"positions": self.positions.tolist(), "times": self.times.tolist()}
 
 
@@ -101,8 +105,8 @@ class Sphere:
     """A spherical obstacle.
 
     Attributes:
-        path: Of its centre.
-        radius: Cells, above 0.
+        path: Path of the centre.
+        radius: Radius in cells, above 0.
     """
 
     path: Trajectory
@@ -113,29 +117,29 @@ class Sphere:
             raise ValueError(f"radius: expected a length above 0, got {self.radius}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres lie in it at a position, and frees those marked before.
+        """Marks the cells whose centres are inside the obstacle at a position, and clears its earlier marks.
 
         Args:
-            solid: uint8 [X, Y, Z], changed.
-            body: Its number, 1 to 255.
-            position: (3,), cells.
+            solid: uint8 [X, Y, Z], modified.
+            body: Number of the obstacle, 1 to 255.
+            position: Position (3,) in cells.
         """
         voxelise_sphere(solid, body, position.tolist(), self.radius)
 
     def describe(self) -> dict:
-        """Its settings as JSON values, by which a checkpoint is recognised."""
+        """Returns the settings as JSON values, by which a checkpoint is verified."""
         return self.path.describe() | {"radius": self.radius}
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """An obstacle bounded by a closed mesh, which moves without turning.
+    """An obstacle bounded by a closed mesh, which moves without rotation.
 
-    A cell whose centre lies exactly on the surface may be in it or not.
+    A cell whose centre is exactly on the surface may count as inside or outside.
 
     Attributes:
-        path: Of its origin.
-        vertices: float32 [V, 3] around its origin, in units of `scale` cells.
+        path: Path of the mesh's origin.
+        vertices: float32 [V, 3] relative to the origin, in units of `scale` cells.
         triangles: int32 [T, 3], anticlockwise from outside.
         scale: Cells per unit.
     """
@@ -156,7 +160,7 @@ class Mesh:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """As `Sphere.cover`."""
+        """Marks cells; see `Sphere.cover`."""
         device = str(solid.device)
         if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
@@ -165,25 +169,25 @@ class Mesh:
         voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
 
     def describe(self) -> dict:
-        """As `Sphere.describe`, with a hash of its arrays."""
+        """Returns the settings as JSON values, with a hash of the arrays."""
         digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
         digest.update(np.asarray(self.triangles, np.int32).tobytes())
         return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}
 
 
 Obstacle = Sphere | Mesh
-"""In cells and steps of the lattice."""
+"""An obstacle, in cells and steps of the lattice."""
 
 
 def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
-    """A box with its edges along the axes.
+    """Makes a box with its edges along the axes.
 
     Args:
-        path: Of its centre.
-        size: (3,), lengths of the edges, cells, above 0.
+        path: Path of the centre.
+        size: (3,), lengths of the edges in cells, above 0.
 
     Raises:
-        ValueError: A size that isn't above 0.
+        ValueError: A length is not above 0.
     """
     edges = np.asarray(size, np.float64)
     if edges.shape != (3,) or not ((edges > 0.0) & np.isfinite(edges)).all():

@@ -2,21 +2,21 @@
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
-order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources give. Stated
-behaviours:
+order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
+Special cases:
 
 =====================================  ===================================================================
-no smoke                               fine: the air moves, every density is 0
-an obstacle that covers an inlet       nothing comes in where it lies
+no smoke                               valid: the air moves, every density is 0
+an obstacle that covers an inlet       no inflow through the covered part
 an obstacle or an inlet too fast       error of the lattice: the speed and its limit
 air that blows up                      error of the lattice, within `wlm.fluid.lattice.CHECK_EVERY` of its
-                                       steps: step, cell and cause, and the last good checkpoint, which stays
-smoke in an obstacle                   none; smoke that a moving one covers is lost, cells that it frees get
-                                       the mean of the cells beside them
-smoke at faces                         leaves through inlets and outlets, and clean air comes in; held at walls. A
-                                       face with an inlet is open as a whole, beside the inlet too
-a grid of one voxel                    fine
-grids too large for the memory         error before any smoke is allocated: what it needs and what there is
+                                       steps: step, cell, cause, and the last saved state, which is kept
+smoke in an obstacle                   none; smoke that a moving obstacle covers is lost, cells that it
+                                       frees get the mean of the cells beside them
+smoke at faces                         leaves through inlets and outlets, where clean air comes in; stays at
+                                       walls. A face with an inlet is open as a whole
+a grid of one voxel                    valid
+grids too large for the memory         error before the allocation: required and available memory
 =====================================  ===================================================================
 """
 
@@ -46,24 +46,24 @@ from wlm_kernels.fluid.advection_places import DENSE
 SCHEMES = ("maccormack", "semi-lagrangian")
 
 LEAST_HALF_LOSS = 2.0**-10
-"""The least relative decay in a step that half floats, of 11 bits, can store: less would be rounded away each time."""
+"""Smallest relative decay per step that half floats of 11 bits can represent; less would be lost to rounding."""
 
 _SYSTEM = "smoke-checkpoint"
-# The speed of sound, cells a step: the lattice counts faster air as blown up, so that smoke moves no farther in a step.
+# The speed of sound in cells per step. The lattice treats faster air as an error, so that smoke moves at most this far.
 _SOUND = math.sqrt(1.0 / 3.0)
 
 
 @dataclass(frozen=True)
 class Source:
-    """A region that gives smoke, in cells and steps of the lattice.
+    """A region that emits smoke, in cells and steps of the lattice.
 
     Attributes:
         shape: "box" or "sphere".
-        centre: Cells.
-        size: Half edges, or radii, cells; above 0.
-        density: Added in a step of the lattice, or the value that is set.
-        temperature: Likewise.
-        fixed: Whether both are set instead of added.
+        centre: Centre in cells.
+        size: Half edges or radii in cells; above 0.
+        density: Density added per step of the lattice, or the density that is set.
+        temperature: Temperature, added or set like the density.
+        fixed: Whether the values are set instead of added.
     """
 
     shape: str
@@ -91,8 +91,8 @@ class Buoyancy:
     """The acceleration of the air by smoke, linear in density and temperature.
 
     Attributes:
-        lift: Upwards at temperature 1, cells of the lattice a step squared.
-        weight: Downwards at density 1, likewise.
+        lift: Upward acceleration at temperature 1, in cells of the lattice per step squared.
+        weight: Downward acceleration at density 1, in the same unit.
         up: Unit vector against gravity.
     """
 
@@ -108,7 +108,7 @@ class Buoyancy:
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """Memory of a cell of smoke, bytes; arguments as for `Solver`."""
+    """Returns the memory of a cell of smoke in bytes; arguments as for `Solver`."""
     fields = _buffers(scheme) * (2 if temperature else 1)
     return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
@@ -117,7 +117,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
     """Checks that a grid of smoke can be indexed and allocated.
 
     Raises:
-        WlmError: It can't.
+        WlmError: It cannot.
     """
     x, y, z = shape
     if x * y * z >= 2**31:
@@ -129,32 +129,30 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
 class Solver:
     """Smoke in the air of a lattice.
 
-    Set the lattice's faces beforehand; its solids and its force are set by the solver. A moving obstacle syncs with the
-    device at each step.
+    Set the lattice's faces beforehand; the solver sets its solids and its force. With a moving obstacle each step waits
+    for the device.
 
     Args:
         lattice: The air.
         refinement: Cells of smoke along an edge of a cell of the lattice.
-        scheme: Of advection, one of `SCHEMES`.
-        storage: "float32" or "float16": half the memory and as fast, but each step rounds to 11 bits.
-        temperature: Whether smoke has one.
-        sources: Where smoke comes from.
-        obstacles: At most 255.
-        dissipation: Decay rate of the density, per step of the lattice: exp(-dissipation t) remains.
-        cooling: Likewise of the temperature.
-        buoyancy: None for none.
-        substeps: Steps of the lattice in one of the solver. At a speed of 1 / substeps smoke can jump over walls.
-        bricks: Whether only bricks of 8^3 cells with smoke in them, and those beside them, are computed.
-        threshold: With bricks: the largest value of a brick that counts as empty.
-        checkpoint: The file of the last good state; None: no file.
-        checkpoint_every: Steps of the solver between two checkpoints.
+        scheme: Advection scheme, one of `SCHEMES`.
+        storage: "float32" or "float16", which halves the memory at the same speed but rounds to 11 bits at each step.
+        temperature: Whether the smoke has a temperature.
+        sources: Sources of smoke.
+        obstacles: At most 255 obstacles.
+        dissipation: Decay rate of the density per step of the lattice: exp(-dissipation t) remains.
+        cooling: Decay rate of the temperature.
+        buoyancy: Acceleration of the air by smoke; None: none.
+        substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
+        bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are computed.
+        threshold: With bricks, the largest value in a brick that counts as empty.
 
     Attributes:
-        period: Steps after which a CUDA graph of them can be replayed, see `step`.
+        period: A CUDA graph must contain a multiple of this number of steps, see `step`.
 
     Raises:
-        ValueError: A wrong argument.
-        WlmError: The memory isn't enough.
+        ValueError: An argument is wrong.
+        WlmError: There is not enough memory.
     """
 
     period = 2
@@ -175,13 +173,11 @@ class Solver:
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
-        checkpoint: str | os.PathLike[str] | None = None,
-        checkpoint_every: int = 50,
     ) -> None:
         for name, value, allowed in (("scheme", scheme, SCHEMES), ("storage", storage, tuple(advection.STORAGES))):
             if value not in allowed:
                 raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
-        for name, count in (("refinement", refinement), ("substeps", substeps), ("checkpoint_every", checkpoint_every)):
+        for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
         for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
@@ -200,7 +196,7 @@ class Solver:
         stored, cells = advection.STORAGES[storage], math.prod(self.shape)
         require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
-        self._checkpoint, self._checkpoint_every, self._kept = checkpoint, checkpoint_every, ""
+        self._kept = ""
         self._fields = [
             advection.Fields(self._zeros((cells,), stored), self._zeros((cells if temperature else 0,), stored))
             for _ in range(_buffers(scheme))
@@ -232,21 +228,21 @@ class Solver:
             "bricks": bricks,
             "threshold": threshold,
         }
-        # As JSON gives them back, which has no tuples.
+        # In JSON's types, which have no tuples, as they are read back.
         self._settings: dict[str, Any] = json.loads(json.dumps(self._settings))
         self._done = 0
 
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Runs some steps, and writes checkpoints.
+        """Runs steps.
 
-        Within the capture of a CUDA graph it neither checks nor writes: call `check` between replays. The number of
-        steps there, and of those done before, must be a multiple of `period`, `substeps` one of the lattice's
-        `period`, and obstacles must be at rest.
+        During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps, and the
+        number of earlier steps, must then be multiples of `period`, `substeps` a multiple of the lattice's `period`,
+        and obstacles must be at rest.
 
         Raises:
-            WlmError: The air blew up, an obstacle is too fast, or the checkpoint can't be written.
+            WlmError: The air blew up, or an obstacle is too fast.
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
@@ -262,49 +258,47 @@ class Solver:
                 self._place_obstacles()
             self._step()
             self._done += 1
-            if self._checkpoint is not None and not capturing and self._done % self._checkpoint_every == 0:
-                self.save(self._checkpoint)
 
     def check(self) -> None:
-        """Checks that the air hasn't blown up; syncs with the device.
+        """Checks that the air has not blown up; waits for the device.
 
         Raises:
-            WlmError: It has; the line names step, cell, cause and the checkpoint saved or loaded last.
+            WlmError: It has; the message names step, cell, cause and the state that was saved or loaded last.
         """
         with self._naming_checkpoint():
             self.lattice.check()
 
     @property
     def steps(self) -> int:
-        """Steps done, by replays of a graph too; syncs with the device."""
+        """Number of steps done, including replays of graphs; waits for the device."""
         return self.lattice.steps // self.substeps
 
     # Results.
 
     @property
     def density(self) -> wp.array:
-        """float or half [X, Y, Z] on the device; valid until the next step."""
+        """The density, float or half [X, Y, Z] on the device; valid until the next step."""
         return self._fields[0].density.reshape(self.shape)
 
     @property
     def temperature(self) -> wp.array | None:
-        """Likewise; None without one."""
+        """The temperature, as the density; None if the smoke has none."""
         values = self._fields[0].temperature
         return values.reshape(self.shape) if values.size else None
 
     @property
     def solid(self) -> wp.array:
-        """uint8 [cells of the lattice], the obstacles' numbers; [0] without any."""
+        """Numbers of the obstacles, uint8 [cells of the lattice]; [0] without obstacles."""
         return self._solid
 
     @property
     def velocity(self) -> wp.array:
-        """vec3 [cells of the lattice], cells a step: the velocity that carried the smoke in the last step."""
+        """Velocity that carried the smoke in the last step, vec3 [cells of the lattice], cells per step."""
         return self._velocity
 
     @property
     def active_cells(self) -> int:
-        """Cells of smoke computed in the last step, in whole bricks; all without bricks. Syncs with the device."""
+        """Number of cells of smoke computed in the last step, all cells without bricks; waits for the device."""
         if self._bricks is DENSE:
             return math.prod(self.shape)
         return int(self._bricks.count.numpy()[0]) * advection_places.BRICK**3
@@ -317,11 +311,11 @@ class Solver:
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> DensityVolume:
-        """The smoke as a volume to render; it shares the solver's memory and is valid until the next step.
+        """Returns the smoke as a volume, which shares the solver's memory and is valid until the next step.
 
         Args:
-            extinction: Per length of the world, of density 1.
-            emission: Light given off per length of the world at temperature 1.
+            extinction: Extinction per length of the world at density 1.
+            emission: Light emitted per length of the world at temperature 1.
             cell: Edge of a cell of the lattice in the world's unit.
             origin: Corner of the domain in the world.
         """
@@ -340,7 +334,7 @@ class Solver:
         """Writes the complete state, atomically.
 
         Raises:
-            WlmError: The air blew up, or the file can't be written; an earlier file stays.
+            WlmError: The air blew up, or the file cannot be written; an earlier file is kept.
         """
         self.check()
         air = self.lattice.state()
@@ -355,13 +349,13 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continues from a checkpoint of a solver and a lattice of the same settings.
+        """Continues from a checkpoint of a solver and a lattice with the same settings.
 
-        On a CPU the steps that follow are bit for bit the same; on a GPU but for the order of the outlets' atomic sums,
-        and with bricks to their threshold.
+        On a CPU the following steps are bit for bit the same; on a GPU up to the order of the outlets' atomic sums, and
+        with bricks up to their threshold.
 
         Raises:
-            WlmError: The file is damaged, or of another simulation; the line names what differs.
+            WlmError: The file is damaged or belongs to another simulation; the message names the difference.
         """
         artifact = read_artifact(path, _SYSTEM)
         for name, value in self._settings.items():
@@ -369,7 +363,7 @@ class Solver:
                 raise WlmError(f"{path}: {name}: expected {value}, found {stored}: a checkpoint of another simulation")
         state, now = artifact.tensors, self._fields[0]
         field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
-        # NaN before the first step: no obstacle is placed yet.
+        # NaN before the first step, when no obstacle has been placed.
         nowhere = np.isnan(state.get("placed", 0.0)).all()
         table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
         if self.temperature is not None:
@@ -392,7 +386,7 @@ class Solver:
         self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
-            # The lattice of a state before the first step has no solid yet.
+            # Before the first step the lattice has no solid.
             if air["solid"].size:
                 self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
             else:
@@ -403,12 +397,12 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
-        """Remembers for errors where a state is kept; its step is the lattice's, as in the lattice's errors."""
+        """Remembers the file of a state for error messages; steps are those of the lattice."""
         self._kept = f"; the state of step {int(steps)} is kept in {path}"
 
     @contextmanager
     def _naming_checkpoint(self) -> Iterator[None]:
-        """Adds to the line of an error where a state is kept."""
+        """Adds the file of the last state to error messages."""
         try:
             yield
         except WlmError as error:
@@ -417,7 +411,7 @@ class Solver:
     # Within a step.
 
     def _place_obstacles(self) -> None:
-        """Moves obstacles to where they will be in the middle of the step, unless they are there and at rest."""
+        """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
         begin = float(self._done * self.substeps)
         placed = np.empty_like(self._placed)
         for k, obstacle in enumerate(self.obstacles):

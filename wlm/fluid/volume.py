@@ -1,4 +1,32 @@
-"""Smoke without its empty parts: the cubes of 8^3 voxels in which there is any, for files that are soon written."""
+"""Density volumes of smoke: validated input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
+
+Special cases. Repairs are listed in `DensityVolume.warnings`, one line for each kind.
+
+====================================  ================================================================
+input                                 result
+====================================  ================================================================
+NaN or infinite voxels                0; warning with the count and the first voxel
+negative voxels                       0; warning likewise (solvers and filters produce small ones)
+all voxels zero, or a single voxel    valid
+no voxel                              error
+float16                               stays half; float32, float64 and integers become float32
+float64 beyond float32                treated as infinite: 0, warning
+other types, other than 3 dimensions  error
+more than 1024^3 voxels, or more than error, unless the file is trusted
+512^3 claimed by a much smaller file
+temperature of another shape          error
+temperature at which a voxel emits    lowered; warning with the count and the first voxel
+more than 65,504 (half's maximum)
+a length, extinction or emission      error
+beyond float32
+voxels of a `.nvdb` or `.vdb` that    resampled to cubic voxels (`wlm.fluid.grids`)
+are not cubes along the axes
+grids of points, vectors, integers    ignored in a `.vdb`; an error if chosen in a `.nvdb`
+a file missing or damaged             error that names the file and the field
+====================================  ================================================================
+
+A grid's density has no unit: the extinction per length is `extinction` times the density.
+"""
 
 import math
 import os
@@ -23,17 +51,18 @@ from wlm.formats.vdb import VdbFile
 from wlm.interop import check_device, device_name, to_warp
 
 EDGE = 8
-"""Voxels along a brick's edge."""
+"""Voxels along an edge of a brick."""
 
 
 def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Takes the bricks in which any of some fields isn't 0.
+    """Extracts the bricks in which any of several fields is not 0.
 
     Args:
         fields: [X, Y, Z] each, of one shape, on one device.
 
     Returns:
-        Their numbers int32 [N], rising, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0 beyond the box.
+        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0 outside
+        the box.
     """
     margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
     cut = []
@@ -46,7 +75,7 @@ def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Ten
 
 
 def scatter(numbers: torch.Tensor, bricks: torch.Tensor, shape: Sequence[int]) -> torch.Tensor:
-    """What `gather` took, in its place: [X, Y, Z] of a shape, 0 elsewhere; the numbers are within it."""
+    """Inverse of `gather`: returns [X, Y, Z] of a shape, 0 outside the bricks; the numbers must be valid."""
     counts = [-(-n // EDGE) for n in shape]
     whole = torch.zeros([n * EDGE for n in counts], dtype=bricks.dtype, device=bricks.device)
     x, y, z = torch.unravel_index(numbers.long(), counts)
@@ -55,27 +84,27 @@ def scatter(numbers: torch.Tensor, bricks: torch.Tensor, shape: Sequence[int]) -
 
 
 _DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
-_LARGEST = 2**31 - 1  # voxels that a kernel can index
+_LARGEST = 2**31 - 1  # largest number of voxels that a kernel can index
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 SUFFIXES = (".npz", ".nvdb", ".vdb")
-"""Of the files that `load_volume` reads."""
+"""Suffixes of the files that `load_volume` reads."""
 
 
 @dataclass(frozen=True, eq=False)
 class DensityVolume:
     """Smoke in a box of cubic voxels.
 
-    The constructor doesn't check: a solver's frames are used as they lie on the device. `from_array` does.
+    The constructor does not validate: frames of a solver are used without a copy. `from_array` validates.
 
     Attributes:
         density: float32 or float16 tensor [X, Y, Z], finite, not negative.
-        extinction: Per unit of length at density 1; above 0.
+        extinction: Extinction per unit of length at density 1; above 0.
         voxel: Edge of a voxel, in the world's unit.
-        origin: float64 [3], the corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
-        temperature: Like the density; None: no emission.
-        emission: Light given off per unit of length at temperature 1.
-        warnings: The repairs, one line each.
+        origin: float64 [3], corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
+        temperature: Tensor like the density; None: no emission.
+        emission: Light emitted per unit of length at temperature 1.
+        warnings: Repairs, one line each.
     """
 
     density: torch.Tensor
@@ -93,21 +122,21 @@ class DensityVolume:
 
     @property
     def device(self) -> torch.device:
-        """The device of the voxels."""
+        """Device of the voxels."""
         return self.density.device
 
     @property
     def size(self) -> np.ndarray:
-        """The box's edges in the world, float64 [3]."""
+        """Edges of the box in the world, float64 [3]."""
         return self.voxel * np.asarray(self.shape, np.float64)
 
     @property
     def centre(self) -> np.ndarray:
-        """The box's centre in the world, float64 [3]."""
+        """Centre of the box in the world, float64 [3]."""
         return np.asarray(self.origin) + 0.5 * self.size
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
-        """Density and temperature as Warp arrays that share the tensors' memory."""
+        """Returns density and temperature as Warp arrays that share the tensors' memory."""
         hot = None if self.temperature is None else to_warp(self.temperature)
         return to_warp(self.density), hot
 
@@ -123,23 +152,23 @@ def from_array(
     device: str = "cpu",
     name: str = "array",
 ) -> DensityVolume:
-    """Makes a checked volume from arrays.
+    """Makes a validated volume from arrays.
 
     Args:
-        density: Numbers [X, Y, Z]; copied where they have to be changed or moved.
-        extinction: Per unit of length at density 1.
+        density: Numbers [X, Y, Z]; copied only if they must be changed or moved.
+        extinction: Extinction per unit of length at density 1.
         voxel: Edge of a voxel, in the world's unit.
-        origin: The corner of voxel (0, 0, 0) in the world.
+        origin: Corner of voxel (0, 0, 0) in the world.
         temperature: [X, Y, Z], or None.
-        emission: Light given off per unit of length at temperature 1.
+        emission: Light emitted per unit of length at temperature 1.
         device: "cpu" or "cuda:N".
-        name: By which messages name it.
+        name: Name in messages.
 
     Returns:
         The volume, repaired as in the module's table.
 
     Raises:
-        WlmError: An error of the module's table, or a length or factor that isn't above 0.
+        WlmError: An error of the module's table.
     """
     device = check_device(device)
     # Kernels compute in float32.
@@ -181,25 +210,25 @@ def load_volume(
     - `.npz`: an array `density` [X, Y, Z], and optionally `temperature` of the same shape and the numbers
       `voxel` and `origin` [3]; or their bricks, as `save_volume` writes them.
     - `.nvdb` and `.vdb`: grids of floats, over the box of their active voxels. Their maps to the world give the size
-      and the position of the voxels; voxels that aren't cubes along the axes are resampled (`wlm.fluid.grids`).
+      and the position of the voxels; voxels that are not cubes along the axes are resampled (`wlm.fluid.grids`).
 
     Args:
-        path: The file; its suffix tells the format.
-        extinction: Per unit of length at density 1.
-        emission: Light given off per unit of length at temperature 1.
-        voxel: Edge of a voxel, in the world's unit; None: the file's, or 1.
+        path: The file; its suffix determines the format.
+        extinction: Extinction per unit of length at density 1.
+        emission: Light emitted per unit of length at temperature 1.
+        voxel: Edge of a voxel, in the world's unit; None: the size in the file, or 1.
         device: "cpu" or "cuda:N".
-        trust: Whether the file is believed to hold as many voxels as it says (`wlm.formats.limits`).
-        up: "x", "y" or "z", the axis of the file's world that becomes +y. None: y, and a warning where a `.nvdb` or
+        trust: Whether the file may have as many voxels as it claims (`wlm.formats.limits`).
+        up: "x", "y" or "z", the axis of the file's world that becomes +y. None: y, with a warning if a `.nvdb` or
             `.vdb` is longest along z, which is up in Blender and Unreal.
-        density: Name of the array or grid; None: `density`, else of a VDB file the first grid of floats.
-        temperature: The same of the temperature; None: `temperature`, if there is one.
+        density: Name of the array or grid; None: `density`, or else the first grid of floats of a VDB file.
+        temperature: Name of the temperature's array or grid; None: `temperature`, if it exists.
 
     Returns:
         The volume, repaired as in the module's table.
 
     Raises:
-        WlmError: One line that names the file and the field, for each error of the module's table.
+        WlmError: An error of the module's table; the message names the file and the field.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -213,7 +242,7 @@ def load_volume(
         volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
         volume = _turned(volume, up) if up != "y" else volume
     else:
-        # It becomes dense on the CPU: the file's tree is in host memory anyway.
+        # The grid becomes dense on the CPU, where the file's tree is.
         read = _read_nvdb if path.suffix.lower() == ".nvdb" else _read_vdb
         volume = _from_parts(read(path, names, trust), up, trust, **factors)
         heat = None if volume.temperature is None else volume.temperature.to(device)
@@ -229,13 +258,13 @@ def load_volume(
 
 
 def is_long_along_z(volume: DensityVolume) -> bool:
-    """Whether a volume has more voxels along z than along x and along y, as smoke has that rises along z."""
+    """Whether a volume is longest along z, which suggests that its smoke rises along z."""
     x, y, z = volume.shape
     return z > max(x, y)
 
 
 def _turned(volume: DensityVolume, up: str) -> DensityVolume:
-    """The same smoke in a world whose axis `up` has become +y."""
+    """Returns the smoke rotated so that the axis `up` becomes +y."""
     matrix = np.diag([volume.voxel] * 3 + [1.0])
     matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * volume.voxel
     parts = [Grid(_DENSITY, volume.density, matrix)]
@@ -247,16 +276,16 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
-    """Writes a volume as `.npz`, atomically, such that `load_volume` reads it back.
+    """Writes a volume as `.npz`, atomically; `load_volume` reads it back.
 
     Args:
         path: The file.
         volume: The smoke.
-        bricks: Whether to leave out what is empty instead of packing all by deflate: far quicker, for a larger file
-            that other programs don't know.
+        bricks: Whether to omit empty bricks instead of compressing everything by deflate: much faster, but the file is
+            larger and other programs cannot read it.
 
     Raises:
-        WlmError: Another suffix, or the file can't be written.
+        WlmError: The suffix is wrong, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise WlmError(f"{path}: expected a name that ends in .npz")
@@ -281,7 +310,7 @@ def _check(
     warnings: list[str],
     dtype: torch.dtype | None = None,
 ) -> torch.Tensor:
-    """The values in `dtype`, or half where they are half, else float32; repaired as the module's table says."""
+    """Returns the values in `dtype` (None: half if they are half, else float32), repaired as in the module's table."""
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
@@ -296,7 +325,7 @@ def _check(
     dtype = dtype or (torch.float16 if values.dtype == torch.float16 else torch.float32)
     values = values.detach().to(device, dtype).contiguous()
     low, high = torch.aminmax(values)
-    if low >= 0 and torch.isfinite(high):  # NaN would be both; most volumes need no masks as large as they are
+    if low >= 0 and torch.isfinite(high):  # NaN fails this test; most volumes then need no masks
         return values
     for bad, kind in ((~torch.isfinite(values), "NaN or infinite"), (values < 0, "negative")):
         if bad.any():
@@ -307,13 +336,13 @@ def _check(
 
 
 def _found(bad: torch.Tensor) -> tuple[int, tuple[int, ...]]:
-    """How many voxels are bad, and the first."""
+    """Returns the number of bad voxels, and the first one."""
     first = np.unravel_index(int(bad.flatten().to(torch.uint8).argmax()), bad.shape)
     return int(bad.sum()), tuple(int(i) for i in first)
 
 
 def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnings: list[str]) -> torch.Tensor:
-    """The temperatures, none so high that one voxel's light would be beyond what pictures hold."""
+    """Returns temperatures clamped so that the light of a voxel stays within the range of half floats."""
     most = HALF_MAX / max(emission * voxel, _TINY)
     bad = heat > most
     if bad.any():
@@ -367,17 +396,17 @@ def from_grid(
     trust: bool = True,
     up: str = "y",
 ) -> DensityVolume:
-    """Makes a checked volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
+    """Makes a validated volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
 
-    It becomes dense: a march reads eight voxels for each sample, each of which would be a walk down the tree.
+    The volume is dense: a march reads eight voxels per sample, each of which would be a traversal of the tree.
 
     Args:
         density: A grid of floats.
         temperature: Another grid, or None.
-        extinction: Per unit of length at density 1.
-        emission: Light given off per unit of length at temperature 1.
-        name: By which messages name it.
-        trust: Whether its box is believed, however few voxels the grid stores; false for a stranger's.
+        extinction: Extinction per unit of length at density 1.
+        emission: Light emitted per unit of length at temperature 1.
+        name: Name in messages.
+        trust: Whether the box may be large although the grid stores few voxels; false for files of unknown origin.
         up: "x", "y" or "z", the axis of the grid's world that becomes +y.
 
     Returns:
@@ -396,7 +425,7 @@ def from_grid(
 
 
 def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
-    """Arrays of bricks as what they are of, on a device, and the others as they are."""
+    """Returns the arrays with bricks expanded to whole fields on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
     if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (1 <= shape.min() and shape.max() <= most):
         raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
@@ -421,7 +450,7 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
 
 
 def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
-    """A volume of dense grids: of the density and, if there are two, of the temperature."""
+    """Makes a volume of dense grids: the density and, if there is a second grid, the temperature."""
     voxels = sum(part.values.numel() for part in parts)
     lattice, values = on_one_lattice(
         parts, _LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up
@@ -432,7 +461,7 @@ def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> 
 
 
 def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    """The dense grids of density and, if there is one, temperature."""
+    """Reads the dense grids of density and, if it exists, temperature from a NanoVDB file."""
     data = read_file(path, VOLUME_BYTES, "the NanoVDB file")
     try:
         found = {entry.name: entry for entry in reversed(list(entries(data)))}
@@ -448,7 +477,7 @@ def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) ->
 
 
 def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    """The same of OpenVDB's file."""
+    """Reads the grids of density and, if it exists, temperature from an OpenVDB file."""
     data = read_file(path, VOLUME_BYTES, "the OpenVDB file")
     file = VdbFile(data, str(path))
     if not file.names:
@@ -466,7 +495,7 @@ def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
 
 
 def _choose(path: Path, names: Sequence[str], wanted: tuple[str | None, str | None]) -> list[str]:
-    """The names of the density's grid and, if there is one, the temperature's."""
+    """Returns the names of the grids of density and, if it exists, temperature."""
     density, temperature = wanted
     for name in (density, temperature):
         if name is not None and name not in names:

@@ -1,4 +1,4 @@
-"""The triangles that light is drawn on."""
+"""Triangles that light is drawn on."""
 
 import os
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
-from wlm.formats.obj import read_obj
+from wlm.formats.meshes import SUFFIXES, read_mesh
 
-_ROOM = 0.25  # of the box's volume
+_ROOM = 0.25  # fraction of the bounding box that a room encloses at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +29,15 @@ class Geometry:
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lowest and the highest corner of what the triangles span, float32 [3] each."""
+        """The lowest and the highest corner of the triangles' bounding box, float32 [3] each."""
         used = self.position[self.triangle.reshape(-1)]
         return used.min(0), used.max(0)
 
     @property
     def is_room(self) -> bool:
-        """Whether most of the triangles face the middle, as the walls of a room do that is seen from inside.
+        """Whether most triangles face the middle, as the walls of a room do.
 
-        The volume that triangles enclose is positive where they face outwards, counter-clockwise as seen.
+        The enclosed volume (a sum of signed tetrahedra) is negative for triangles that face inwards.
         """
         if not len(self.triangle):
             return False
@@ -53,7 +53,7 @@ def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, wi
     """Reads a mesh.
 
     Args:
-        path: `.glb`, `.gltf` or `.obj`.
+        path: `.glb`, `.gltf`, `.obj`, `.ply`, `.stl` or `.off`.
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs; None takes 1 if any primitive has it, else 0.
         with_uv: Whether UVs are needed: primitives without them are then left out.
 
@@ -61,8 +61,8 @@ def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, wi
         WlmError: The file is missing or damaged, or has no triangles, or none with these UVs.
     """
     path = Path(path)
-    if path.suffix.lower() == ".obj":
-        mesh = read_obj(path)
+    if path.suffix.lower() in SUFFIXES:
+        mesh = read_mesh(path)
         parts = [(mesh.position, mesh.triangle, mesh.uv)] if mesh.uv is not None or not with_uv else []
     else:
         primitives = read_gltf(path)[1]

@@ -143,7 +143,13 @@ def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDo
     Raises:
         WlmError: An error in the table of this module; the line names the file and the field.
     """
-    data = read_file(path, MESH_BYTES, "the glTF file")
+    return parse_gltf(path, read_file(path, MESH_BYTES, "the glTF file"), trust)
+
+
+def parse_gltf(
+    path: str | os.PathLike[str], data: bytes, trust: bool = False
+) -> tuple[GltfDocument, list[GltfPrimitive]]:
+    """Reads the bytes of a `.glb` or `.gltf` file, as `read_gltf` does; `path` is its name in messages."""
     with reported(path):
         text, binary = _split_glb(path, data) if data[:4] == MAGIC else (data, None)
         if len(text) > JSON_BYTES:
@@ -166,6 +172,10 @@ def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDo
         return document, _read_primitives(document)
 
 
+Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
+"""A mesh that came from elsewhere: its name, positions [V, 3], triangles int [F, 3] and UVs [V, 2]."""
+
+
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
@@ -180,35 +190,55 @@ def document_from_arrays(
     Returns:
         The document and its one primitive.
     """
-    points, places = np.asarray(position, "<f4"), np.asarray(uv, "<f4")
-    corners = np.asarray(triangle, "<u4")
-    views, accessors, start = [], [], 0
-    for array, target, kind, component in (
-        (points, 34962, "VEC3", 5126),
-        (places, 34962, "VEC2", 5126),
-        (corners.reshape(-1), 34963, "SCALAR", 5125),
-    ):
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
-        accessors.append({"bufferView": len(accessors), "componentType": component, "count": len(array), "type": kind})
-        start += array.nbytes
-    accessors[0] |= {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
+    return document, primitive
+
+
+def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocument, list[GltfPrimitive]]:
+    """Makes a document of several meshes from arrays. Each mesh has its own node.
+
+    Args:
+        meshes: Name, positions, triangles and UVs of each mesh, as for `document_from_arrays`; at least one.
+        name: Name of the document.
+
+    Returns:
+        The document and its primitives, one for each mesh.
+    """
+    views, accessors, data, primitives = [], [], [], []
+    nodes, trees, start = [], [], 0
+    for number, (label, position, triangle, uv) in enumerate(meshes):
+        points, places = np.asarray(position, "<f4"), np.asarray(uv, "<f4")
+        corners = np.asarray(triangle, "<u4")
+        for array, target, kind, component in (
+            (points, 34962, "VEC3", 5126),
+            (places, 34962, "VEC2", 5126),
+            (corners.reshape(-1), 34963, "SCALAR", 5125),
+        ):
+            views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+            accessor = {"bufferView": len(accessors), "componentType": component, "count": len(array), "type": kind}
+            accessors.append(accessor)
+            start += array.nbytes
+            data.append(array.tobytes())
+        first = len(accessors) - 3
+        accessors[first] |= {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+        nodes.append({"mesh": number, "name": label})
+        trees.append(
+            {"primitives": [{"attributes": {"POSITION": first, "TEXCOORD_0": first + 1}, "indices": first + 2}]}
+        )
+        row, short = np.arange(len(points)), one_line(label, _LABEL)
+        arrays = points.astype(np.float64), corners.astype(np.int32), {0: places}
+        primitives.append(GltfPrimitive(number, number, 0, label, *arrays, row, short, short, None))
     content = {
         "asset": {"version": "2.0", "generator": "wlm"},
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2}]}],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": trees,
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
     }
-    document = GltfDocument(name, content, (points.tobytes() + places.tobytes() + corners.tobytes(),))
-    row = np.arange(len(points))
-    corners = corners.astype(np.int32)
-    label = one_line(name, _LABEL)
-    return document, GltfPrimitive(
-        0, 0, 0, name, points.astype(np.float64), corners, {0: places}, row, label, label, None
-    )
+    return GltfDocument(name, content, (b"".join(data),)), primitives
 
 
 def elements(document: GltfDocument, number: int) -> np.ndarray:

@@ -66,7 +66,29 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Writes a document as `.glb` with some primitives replaced and everything else unchanged, atomically.
+    """Writes the `.glb` file of `encode_glb`, atomically.
+
+    Args:
+        path: The file to write; its folder must exist.
+        document, replacements, uv_set: See `encode_glb`.
+
+    Returns:
+        The number of bytes written.
+
+    Raises:
+        ValueError: See `encode_glb`.
+        WlmError: See `encode_glb`; or the file cannot be written.
+    """
+    return atomic_write(path, encode_glb(document, replacements, uv_set, path))
+
+
+def encode_glb(
+    document: GltfDocument,
+    replacements: Sequence[Replacement] = (),
+    uv_set: int = 1,
+    path: str | os.PathLike[str] | None = None,
+) -> list[bytes]:
+    """Encodes a document as `.glb` with some primitives replaced and everything else unchanged.
 
     Attributes and morph targets keep their encoding. glTF requires consecutive UV sets, so missing sets below `uv_set`
     get the new UVs too. Unused data is dropped, unless the file has an extension that may refer to it in an unknown
@@ -74,18 +96,18 @@ def write_glb(
     EXT_mesh_primitive_edge_visibility) are dropped.
 
     Args:
-        path: The file to write; its folder must exist.
         document: The document.
         replacements: At most one for each primitive.
         uv_set: n of the new `TEXCOORD_n`, the same for all replacements.
+        path: Name of the file in messages; None: that of the document.
 
     Returns:
-        The number of bytes written.
+        The bytes of the file, in pieces.
 
     Raises:
         ValueError: A primitive is replaced twice or already has the UV set, a shape is wrong or an index out of range.
         WlmError: A part of the document that reading did not check, since the scene does not draw it, is malformed;
-            the file cannot be written, or would exceed the 4 GiB of the format.
+            or the file would exceed the 4 GiB of the format.
     """
     for each in replacements:
         _check(each, uv_set)
@@ -101,7 +123,7 @@ def write_glb(
                     tree.replace(primitives[each.primitive.primitive], each, uv_set)
         tree.embed_images()
         tree.drop_unused()
-    return atomic_write(path, _pack(path, tree.content, tree.payloads))
+    return _pack(document.path if path is None else path, tree.content, tree.payloads)
 
 
 class _Tree:

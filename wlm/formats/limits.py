@@ -23,8 +23,8 @@ JSON_BYTES = 512 << 20
 BAKE_BYTES = 1 << 30
 """Largest Godot bake. A probe has 156 bytes, and its tetrahedra and BSP tree some hundred."""
 
-OBJ_BYTES = 2 << 30
-"""Largest OBJ file. Ten million vertices take about 1.5 GB."""
+MODEL_BYTES = 2 << 30
+"""Largest OBJ, PLY, STL or OFF file. Ten million vertices of an OBJ take about 1.5 GB."""
 
 MESH_BYTES = (4 << 30) - 1
 """Largest `.glb`, by its format, and largest buffer or image beside a glTF file."""

@@ -1,8 +1,21 @@
-"""Zstandard frames of a known size."""
+"""Zstandard frames of a known size, and parts of an artifact that are stored as such frames."""
 
+import math
+from collections.abc import Mapping
+
+import numpy as np
 import zstandard
 
-_LEVEL = 19
+from wlm.errors import one_line
+from wlm.formats.parts import Part, check_part
+
+_LEVEL, _FAST_LEVEL = 19, 9
+_FAST_BYTES = 4 << 20  # data above this size is packed at the faster level, in a tenth of the time
+_FREE, _MOST = 1 << 26, 64
+_MOST_AXES = 4
+
+Shapes = dict[str, list[int]]
+"""The shapes of the parts that are stored as frames, by name: a setting of the artifact."""
 
 
 def compress(*pieces: bytes) -> bytes:
@@ -10,7 +23,8 @@ def compress(*pieces: bytes) -> bytes:
 
     Each piece has blocks of its own, so that zstd models pieces with different statistics separately.
     """
-    packer = zstandard.ZstdCompressor(level=_LEVEL).compressobj(size=sum(map(len, pieces)))
+    size = sum(map(len, pieces))
+    packer = zstandard.ZstdCompressor(level=_LEVEL if size <= _FAST_BYTES else _FAST_LEVEL).compressobj(size=size)
     frame = b""
     for piece in pieces:
         frame += packer.compress(piece) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
@@ -39,3 +53,51 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
     if len(unpacked) != size or not reader.eof or reader.unused_data:
         raise ValueError(f"{name}: expected one whole frame of {size} bytes")
     return unpacked
+
+
+def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Shapes]:
+    """Packs the parts of an artifact.
+
+    Args:
+        parts: Arrays by name.
+
+    Returns:
+        Each part as a frame, uint8 [bytes]; a part stays as it is if its frame would be larger, or so much smaller
+        that `unpack_parts` would refuse it. And the shapes of the parts that became frames.
+    """
+    result, shapes = dict(parts), {}
+    for name, part in parts.items():
+        frame = compress(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).tobytes())
+        if len(frame) < part.nbytes <= _limit(len(frame)):
+            result[name], shapes[name] = np.frombuffer(frame, np.uint8), list(part.shape)
+    return result, shapes
+
+
+def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mapping[str, Part]) -> dict[str, np.ndarray]:
+    """Unpacks parts that `pack_parts` packed. Their values still have to be checked by `check_parts`.
+
+    Args:
+        tensors: The parts as read.
+        shapes: The shapes of those that are frames.
+        table: The types of all parts.
+
+    Raises:
+        ValueError: A frame is damaged, is none of the table's, or claims far more bytes than it can hold.
+    """
+    result = dict(tensors)
+    for name, shape in shapes.items():
+        if name not in table or name not in tensors:
+            raise ValueError(f"setting parts: {one_line(name, 60)} is none of the file's")
+        frame = check_part(tensors, name, Part(np.uint8, (None,)))
+        dtype = np.dtype(table[name].dtype).newbyteorder("<")
+        size = math.prod(shape) * dtype.itemsize
+        if len(shape) > _MOST_AXES or size > _limit(len(frame)):
+            raise ValueError(f"part {name}: {shape}: expected what {len(frame)} bytes can hold")
+        data = decompress(frame.tobytes(), size, f"part {name}")
+        result[name] = np.frombuffer(data, dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
+    return result
+
+
+def _limit(size: int) -> int:
+    """The most bytes that a frame of some bytes may unpack to."""
+    return _FREE + _MOST * size

@@ -42,8 +42,6 @@ _PROBE_EXPORTS = {
 _EXPORTS = _PROBE_EXPORTS | {
     "wlm-bake": BAKED,
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
-    "wlm-atlas": "a compressed lightmap of a mesh",
-    "wlm-atlas-scene": "the compressed lightmaps of a scene",
     "wlm-probe-export": "light probes: buffers and a shader",
     "wlm-probe-volume": "a cascaded volume of probes: buffers and shaders",
     "wlm-godot-light": "light probes for Godot",

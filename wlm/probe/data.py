@@ -132,8 +132,8 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
-    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.probe.export_grid`).
-    - `light.json` with its textures, `probes.json`: exports of `wlm.probe.export_unreal` and `export_unity`.
+    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.export.export(..., "three")`).
+    - `light.json` with its textures, `probes.json`: exports for Unreal and for Unity.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
     - `.lmbake`: a lightmap bake of Godot 4.

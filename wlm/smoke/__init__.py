@@ -1,4 +1,4 @@
-"""Smoke as six-way lightmaps, predicted from a guiding map (neural-six-way-lightmaps), marched, or baked."""
+"""Smoke as six-way lightmaps: baked by ray marches or predicted by a network (neural-six-way-lightmaps)."""
 
 from wlm._facade import facade
 

@@ -1,10 +1,11 @@
-"""Conventions of directions: the six lightmaps, the camera, the weights of a light, the channels of engines.
+"""Cameras, and conventions of directions: the six lightmaps, the weights of a light, the channels of engines.
 
-Directions are the camera's: x to the right, y up, z from the smoke towards the camera. A lightmap is named for where
-its light comes from, so that "right" is brighter on the image's right side, "front" is lit from the camera's side and
-"back" from behind the smoke. A light's direction points from the smoke to the light. Images have row 0 at the top.
+Directions are in the camera's axes: x to the right, y up, z from the smoke towards the camera. A lightmap is named
+after the direction from which its light comes: "right" is brighter on the image's right side, "front" is lit from the
+camera's side and "back" from behind the smoke. A light's direction points from the smoke to the light. Images have row
+0 at the top.
 
-Unity's local z is minus the billboard's normal: a light behind is +z there, and -z here.
+Unity's local z is minus the billboard's normal: a light behind the smoke is at +z there, and at -z here.
 """
 
 from collections.abc import Sequence
@@ -20,10 +21,10 @@ DIRECTIONS = ("right", "left", "top", "bottom", "front", "back")
 """The order of the lightmaps in all arrays."""
 
 VECTORS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
-"""Towards the light of each lightmap, in the camera's axes."""
+"""Direction to the light of each lightmap, in the camera's axes."""
 
 ALPHA, EMISSION = "alpha", "emission"
-"""Channels of a file besides the lightmaps; alpha is opacity, 1 - transparency."""
+"""Channels of a file other than the lightmaps; alpha is opacity, 1 - transparency."""
 
 LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "unity": (("right", "top", "back", ALPHA), ("left", "bottom", "front", EMISSION)),
@@ -31,22 +32,23 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "o3de-tlrb": (("top", "left", "right", "bottom"), ("front", "back", EMISSION, ALPHA)),
     "embergen": (("top", "left", "right", ALPHA), ("bottom", "back", "front", EMISSION)),
 }
-"""Channels R, G, B, A of an engine's two textures. O3DE takes opacity from a third, which this alpha may be."""
+"""Channels R, G, B, A of an engine's two textures. O3DE reads opacity from a third texture, which may be this alpha."""
 
 RULES = ("squared", "absolute", "normalised")
-"""The weight of lightmap p under a light from w: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| + |w_z|)."""
+"""Rules for the weight of lightmap p under a light from w: w_p^2; |w_p|, the paper's eq. 5; |w_p| / (|w_x| + |w_y| +
+|w_z|)."""
 
 _SHORTEST = 1e-12
-# A map's centre of brightness must lie this share of the image farther out than its opposite's.
+# Share of the image by which a map's centre of brightness must be farther out than its opposite's.
 _LEAST_SHIFT = 1e-3
-_MARGIN = 1.05  # of an image's height over the box's, so that no smoke touches the edge
+_MARGIN = 1.05  # image height over box height, so that no smoke touches the edge
 
 
 def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarray:
-    """A direction, float64 [3], of length 1.
+    """Returns a direction scaled to length 1, float64 [3].
 
     Raises:
-        ValueError: It has no length, or isn't three finite numbers.
+        ValueError: It has no length, or is not three finite numbers.
     """
     vector = np.asarray(vector, np.float64)
     length = np.linalg.norm(vector)
@@ -56,20 +58,20 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 
 
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
-    """Weights of the lightmaps under a light, in the order of `DIRECTIONS`.
+    """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
-    The weights |w| of the paper's eq. 5 add up to as much as 1.73 for oblique lights: too bright by half on average, as
-    path tracing shows. The squares add up to 1, and engines use them.
+    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights: 1.5 times too bright on average, as path
+    tracing shows. The squares sum to 1, and engines use them.
 
     Args:
-        toward: [..., 3], the directions to the lights in the camera's axes, of any length but 0.
+        toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.
         rule: One of `RULES`.
 
     Returns:
         float64 [..., 6], not negative.
 
     Raises:
-        ValueError: No such rule, or a direction without length or that isn't finite.
+        ValueError: The rule is unknown, or a direction has no length or is not finite.
     """
     if rule not in RULES:
         raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")
@@ -84,19 +86,19 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
 
 
 def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
-    """Checks that each lightmap is bright where its name says.
+    """Checks that each lightmap is bright on the side of its name.
 
-    Only smoke that stops some light can tell: in thin smoke the maps are alike, and that counts as a fault.
+    This requires smoke that absorbs some light: in thin smoke the maps are equal, which counts as a fault.
 
     Args:
         lightmaps: [..., 6, H, W], one frame or many, in the order of `DIRECTIONS`.
 
     Returns:
-        One line per fault: "right" must be brighter on the right than "left", "top" above "bottom", "front" brighter
-        than "back". Two exchanged opposites are always found; "right" in the place of "top" need not be.
+        One line per fault: the centre of "right" must be to the right of that of "left", "top" above "bottom", and
+        "front" brighter than "back". Exchanged opposites are always found; "right" exchanged with "top" may not be.
 
     Raises:
-        ValueError: The shape isn't that of lightmaps.
+        ValueError: The shape is wrong.
     """
     lightmaps = np.asarray(lightmaps, np.float64)
     if lightmaps.ndim < 3 or lightmaps.shape[-3] != 6:
@@ -124,12 +126,13 @@ class Camera:
     """An orthographic or perspective camera.
 
     Attributes:
-        position: The image's centre in the camera's plane, or the eye, in the world's unit. Nothing behind it is seen.
+        position: Centre of the image in the camera's plane, or the eye, in the world's unit; smoke behind it is not
+            visible.
         right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
             points from the smoke to the camera.
-        extent: The image's height in the world's unit; in perspective that at distance 1.
+        extent: Height of the image in the world's unit; in perspective at distance 1.
         height, width: H and W in pixels, which are square.
-        perspective: Whether rays meet in the eye; the six-way lightmaps themselves are orthographic.
+        perspective: Whether rays meet in the eye; six-way lightmaps are always orthographic.
     """
 
     position: tuple[float, float, float]
@@ -167,10 +170,10 @@ class Camera:
     ) -> "Camera":
         """Makes a camera that looks from a position to a target.
 
-        Where it looks along `world_up`, "up" is chosen among the axes of the world, the same at every call.
+        If it looks along `world_up`, "up" is chosen among the axes of the world, always in the same way.
 
         Raises:
-            ValueError: The position is the target, or a size is wrong.
+            ValueError: The position equals the target, or a size is wrong.
         """
         toward = np.asarray(position, np.float64) - np.asarray(target, np.float64)
         length = np.linalg.norm(toward)
@@ -202,17 +205,17 @@ class Camera:
 
         Args:
             smoke: A volume, or a box in the world: its corner [3] and its edges [3].
-            toward: The direction from the smoke to the camera, of any length but 0.
+            toward: Direction from the smoke to the camera, of any length except 0.
             pixels: H.
             aspect: W over H.
-            target: The point in the image's middle; None: the box's centre.
-            extent: The image's height in the world's unit, in perspective at distance 1; None: such that the box fits.
-            distance: Of the camera from its target; None: outside the box. What is behind the camera isn't seen.
-            up: Upwards in the image, as far as it can be.
-            perspective: Whether rays meet in the eye; the six-way lightmaps are orthographic.
+            target: Point in the middle of the image; None: the box's centre.
+            extent: Height of the image in the world's unit, in perspective at distance 1; None: the box fits.
+            distance: Distance of the camera from its target; None: outside the box.
+            up: Direction that is upwards in the image.
+            perspective: Whether rays meet in the eye; six-way lightmaps are always orthographic.
 
         Raises:
-            ValueError: A direction without length, or a size is wrong.
+            ValueError: A direction has no length, or a size is wrong.
         """
         if isinstance(smoke, DensityVolume):
             smoke = (smoke.origin, smoke.voxel * np.asarray(smoke.shape))
@@ -222,7 +225,7 @@ class Camera:
         corners = origin + size * np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) - target
         nearest = float((corners @ toward).max())
         if distance is None:
-            # In perspective as far off as the box is large, so that it isn't seen through a keyhole.
+            # At least as far away as the box is large, which avoids an extreme perspective.
             distance = nearest + float(np.linalg.norm(size))
         width = max(round(pixels * aspect), 1)
         shape = {"height": pixels, "width": width, "world_up": up, "perspective": perspective}
@@ -232,26 +235,26 @@ class Camera:
         across, rise, _ = np.abs(corners @ camera.axes.T).max(axis=0)
         extent = 2.0 * _MARGIN * max(float(rise), float(across) * pixels / width)
         if perspective:
-            # Of the box's nearest side, or of the sphere round it where the camera is inside.
+            # At the distance of the box's nearest side, or of its centre if the camera is inside.
             extent /= distance - nearest if distance > nearest else distance
         return replace(camera, extent=extent)
 
     @property
     def axes(self) -> np.ndarray:
-        """Right, up, toward: float64 [3, 3], which takes a direction in the world to one in the camera's axes."""
+        """Rows right, up, toward, float64 [3, 3]: the rotation from the world to the camera's axes."""
         return np.array([self.right, self.up, self.toward], np.float64)
 
     @property
     def pitch(self) -> float:
-        """A pixel's edge in the world's unit, in perspective at distance 1."""
+        """Edge of a pixel in the world's unit, in perspective at distance 1."""
         return self.extent / self.height
 
     def finer(self, factor: int) -> "Camera":
-        """The same view with each pixel cut in factor x factor."""
+        """Returns the same view with each pixel divided into factor x factor pixels."""
         return replace(self, height=self.height * factor, width=self.width * factor)
 
     def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
-        """Origins and directions of length 1 of the pixels' rays in the world, both float64 [H, W, 3]."""
+        """Returns origins and unit directions of the pixels' rays in the world, both float64 [H, W, 3]."""
         right, up, toward, position = (
             torch.tensor(np.asarray(vector, np.float64), device=device) for vector in (*self.axes, self.position)
         )
@@ -264,15 +267,15 @@ class Camera:
         return across + position, (-toward).expand_as(across)
 
     def in_world(self) -> View:
-        """The camera in the world, as kernels take it."""
+        """Returns the camera in the world, as kernels take it."""
         right, up, toward = self.axes
         return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
 
     def view(self, volume: DensityVolume) -> View:
-        """The camera in a volume's voxels, as kernels take it.
+        """Returns the camera in a volume's voxels, as kernels take it.
 
-        An orthographic camera far from the grid is moved along its axis to just before it, which changes nothing but
-        the rounding.
+        An orthographic camera far from the grid is moved along its axis to just in front of it, which changes only
+        rounding.
         """
         position = (np.asarray(self.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel
         right, up, toward = self.axes

@@ -1,4 +1,4 @@
-"""A trained network's file: its settings, its weights as half floats, and a summary of the training."""
+"""File of a trained network: settings, weights as half floats, and a summary of the training."""
 
 import hashlib
 import os
@@ -22,7 +22,7 @@ _SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safete
 
 
 class _Header(Header):
-    """The settings of a file."""
+    """Settings in the header of a file."""
 
     network: NetworkSettings
     summary: dict[str, JsonValue]
@@ -32,10 +32,10 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     """Rounds the weights to half floats.
 
     Returns:
-        The file's settings, its parts, and a hash of these as its source.
+        Settings and parts of the file, and a hash of the parts as its source.
 
     Raises:
-        WlmError: A weight isn't a finite half float.
+        WlmError: A weight is not a finite half float.
     """
     parts = {}
     digest = hashlib.blake2b(digest_size=16)
@@ -50,14 +50,14 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> SmokeModel:
-    """Makes a network of a file's parts, in float32 on the CPU.
+    """Makes a network from the parts of a file, in float32 on the CPU.
 
     Raises:
         WlmError: A setting is wrong.
-        ValueError: The weights aren't those of the settings.
+        ValueError: The weights do not match the settings.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
-    # The largest part first: without it no memory is taken for the network.
+    # The largest part is checked first, before memory for the network is allocated.
     lowest, channels = header.network.levels - 1, header.network.width * 2 ** (header.network.levels - 1)
     check_part(artifact.tensors, f"encoder.{lowest}.2.weight", Part(np.float16, (channels, channels, 3, 3)))
     network = SixWayNetwork(header.network)
@@ -69,7 +69,7 @@ def decode(artifact: Artifact) -> SmokeModel:
 
 
 def shipped() -> Path:
-    """The file of the trained network that comes with wlm.
+    """Returns the file of the trained network that ships with wlm.
 
     Raises:
         WlmError: It is missing.
@@ -80,13 +80,13 @@ def shipped() -> Path:
 
 
 def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
-    """Loads a network for use on smoke, which takes the settings of its guiding maps.
+    """Loads a network for use on smoke, which requires the settings of its guiding maps.
 
     Args:
-        path: The file; None: the network that comes with wlm.
+        path: The file; None: the network that ships with wlm.
 
     Raises:
-        WlmError: As `wlm.load`; or the file lacks the settings of the network's samples.
+        WlmError: The file is missing or damaged, or lacks the settings of the network's samples.
     """
     path = shipped() if path is None else path
     model = load(path, SmokeModel.SYSTEM)

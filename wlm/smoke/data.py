@@ -1,8 +1,8 @@
-"""Smoke in files: one volume or a folder of a scene's frames, guiding maps and lightmaps as EXR, numbered results.
+"""Smoke in files: volumes and folders of frames, guiding maps and lightmaps as EXR, numbered results.
 
-A folder of a scene's frames holds `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume as
-`wlm.smoke.load` reads it. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
-holds volumes whose names are alike but for a number before their suffix.
+The folder of a simulated scene contains `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume
+that `wlm.smoke.load` reads. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
+contains volumes whose names differ only in a number before the suffix.
 """
 
 import functools
@@ -34,13 +34,13 @@ from wlm.system import Meter, OnProgress
 
 SCENE_FILE = "scene.json"
 CHECKPOINT = "simulation.partial"
-"""In the folder of frames, as long as the simulation isn't done."""
+"""File in the folder of frames while the simulation is not finished."""
 
-# The name of every system's reader.
+# Every system's reader has this name.
 load = load_volume
 
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
-_NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # what is before the last number, it, and the suffix
+_NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # text before the last number, the number, the suffix
 _TRANSPARENCY = "transparency"
 _DEPTH = "depth"
 _GUIDE = ("light", _TRANSPARENCY, _DEPTH)
@@ -48,15 +48,15 @@ _GUIDE = ("light", _TRANSPARENCY, _DEPTH)
 
 @dataclass(frozen=True)
 class Frames:
-    """Smoke over time, one volume in memory at a time: the file of a single volume, or a folder of frames.
+    """Smoke over time, with one volume in memory at a time: a single file, or a folder of frames.
 
     Attributes:
         path: The file or the folder.
-        scene: Of a folder that `simulate` wrote; None: a single volume, or another program's frames.
-        files: Those that are there, by their rising number; that of a single volume is 1.
-        device: Where volumes go.
-        extinction, emission: In place of the scene's, or of 1; None: those.
-        options: Of `load` for files of other programs: trust, up, density, temperature.
+        scene: Scene of a folder that `simulate` wrote; None: a single volume, or another program's frames.
+        files: Existing files by number, in rising order; a single volume has number 1.
+        device: Device of the volumes.
+        extinction, emission: Replace the scene's values, or 1; None: not replaced.
+        options: Options of `load` for files of other programs: trust, up, density, temperature.
     """
 
     path: Path
@@ -69,21 +69,21 @@ class Frames:
 
     @property
     def single(self) -> bool:
-        """Whether it is one file and not a folder."""
+        """Whether this is a single file instead of a folder."""
         return self.files.get(1) == self.path
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of the frames that are there, rising."""
+        """Numbers of the existing frames, in rising order."""
         return tuple(self.files)
 
     @property
     def camera(self) -> CameraSettings:
-        """The scene's camera, or the default one."""
+        """The scene's camera, or the default camera."""
         return CameraSettings() if self.scene is None else self.scene.camera
 
     def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
-        """Places a camera before a frame: that of a sequence stays where it is, before the boxes of all frames.
+        """Places a camera in front of a frame; for a sequence in front of the boxes of all frames, where it stays.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -93,27 +93,27 @@ class Frames:
 
     @functools.cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """The corner and the edges of the boxes of all frames together, which are read for it."""
+        """Corner and edges of the bounding box of all frames, which are read for it."""
         boxes = []
         for number in self.files:
             volume = replace(self, device="cpu").load(number)
             begin = np.asarray(volume.origin)
             boxes.append((bool(volume.density.any()), begin, begin + volume.size))
-        # A frame without smoke may have its box anywhere.
+        # The box of a frame without smoke may be anywhere.
         smoky = [box for box in boxes if box[0]] or boxes
         low = np.min([box[1] for box in smoky], axis=0)
         return low, np.max([box[2] for box in smoky], axis=0) - low
 
     def file(self, number: int) -> Path:
-        """The file of a frame, which `simulate` may yet have to write."""
+        """Returns the file of a frame, which may not exist yet."""
         return self.files.get(number, self.path / f"frame_{number:04d}.npz")
 
     def time(self, number: int) -> float:
-        """The time of a frame in seconds; 0 without a scene."""
+        """Returns the time of a frame in seconds; 0 without a scene."""
         return 0.0 if self.scene is None else self.scene.time(number)
 
     def looks(self, number: int) -> Looks | None:
-        """What a picture of a frame shows; None without a scene."""
+        """Returns lights, colours and obstacles of a frame's picture; None without a scene."""
         return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
@@ -132,7 +132,7 @@ class Frames:
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
     ) -> Iterator[tuple[int, DensityVolume]]:
-        """Yields frames with their numbers; `progress` is called after each has been dealt with.
+        """Yields frames with their numbers; `progress` is called after each has been processed.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -152,16 +152,16 @@ def load_frames(
     device: str = "cpu",
     **options: Any,
 ) -> Frames:
-    """Opens a volume, or a folder of frames: of `simulate`, or of volumes that another program numbered.
+    """Opens a volume, a folder of frames of `simulate`, or a folder of numbered volumes of another program.
 
     Args:
         path: The file or the folder.
         extinction, emission, device: As in `Frames`.
-        options: As in `Frames`; those that are None aren't given.
+        options: As in `Frames`; None values are ignored.
 
     Raises:
-        WlmError: A folder without frames, of several sequences, or with a damaged `scene.json`; frames of `simulate`
-            need no option but trust.
+        WlmError: The folder has no frames, frames of several sequences, or a damaged `scene.json`; or an option other
+            than trust is given for frames of `simulate`.
     """
     path = Path(path)
     options = {name: value for name, value in options.items() if value is not None}
@@ -179,10 +179,10 @@ def load_frames(
 
 
 def _sequence(folder: Path) -> dict[int, Path]:
-    """The volumes of a folder by the last number in their names, which are alike but for it.
+    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal.
 
     Raises:
-        WlmError: It has none, those of several sequences, or two of one number.
+        WlmError: There are no volumes, several sequences, or two volumes of one number.
     """
     found: dict[tuple[str, str], dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
@@ -204,18 +204,18 @@ def _sequence(folder: Path) -> dict[int, Path]:
 
 
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
-    """Prepares a folder for a simulation's frames.
+    """Prepares a folder for the frames of a simulation.
 
-    Frames appear one by one beside the checkpoint, so they aren't staged as `wlm.formats.folder` does for files that
-    are only of use together.
+    Frames are useful separately and appear one after the other beside the checkpoint, so they are not staged by
+    `wlm.formats.folder`.
 
     Args:
-        folder: Made if its parent is there.
+        folder: The folder; created if its parent exists.
         scene: The scene to simulate.
-        resume: Whether to go on with a simulation of the same scene. Otherwise an earlier one's frames are removed.
+        resume: Whether to continue a simulation of the same scene; otherwise frames of an earlier one are removed.
 
     Raises:
-        WlmError: It holds other files, is of another scene and is to be resumed, or can't be written.
+        WlmError: The folder contains other files, belongs to another scene that is to be resumed, or cannot be written.
     """
     folder = Path(folder)
     claim(folder, SCENE_FILE, _FORMAT)
@@ -235,14 +235,14 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
 
 def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
-    """Files such as `six_0001.exr`, by their rising number."""
+    """Returns files such as `six_0001.exr` by number, in rising order."""
     pattern = re.compile(rf"{re.escape(stem)}_(\d+){re.escape(suffix)}")
     files = {int(match[1]): path for path in folder.iterdir() if (match := pattern.fullmatch(path.name))}
     return dict(sorted(files.items()))
 
 
 def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
-    """At most `count` of some frames, evenly spread, the first and the last among them; None: all."""
+    """Returns at most `count` frames, evenly spread and including the first and the last; None: all."""
     if count is None or count >= len(numbers):
         return tuple(numbers)
     last = len(numbers) - 1
@@ -250,16 +250,16 @@ def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
 
 
 class NumberedFiles:
-    """A run's results in a folder, one file per frame, in place of those of an earlier run.
+    """Results of a run in a folder, one file per frame, which replace those of an earlier run.
 
-    The earlier files are removed when the first new one is about to be written: a run that fails before loses none.
-    Each file is of use by itself, so there is no index, and nothing is staged. As long as it isn't done, a run that can
-    be resumed says in `STEM.partial` what it is.
+    The earlier files are removed when the first new file is about to be written, so that a run that fails before keeps
+    them. Each file is useful separately, so there is no index and no staging. While a resumable run is not finished,
+    `STEM.partial` describes it.
 
     Attributes:
         folder: The folder.
-        partial: The file that says what an unfinished run is.
-        done: Numbers of the results that the run which is resumed has already.
+        partial: File that describes an unfinished run.
+        done: Numbers of the results that exist already if a run is resumed.
     """
 
     def __init__(
@@ -271,23 +271,23 @@ class NumberedFiles:
         run: Mapping[str, Any] | None = None,
         resume: bool = False,
     ) -> None:
-        """Makes the folder, or checks that it holds nothing but files of an earlier run.
+        """Creates the folder, or checks that it contains only files of an earlier run.
 
         Args:
-            folder: Made if its parent is there.
-            stem, suffix: Of the files, as for `numbered`.
-            others: Names of files that such a run writes beside them.
-            run: What the results depend on, as JSON values; None: such a run isn't resumed.
-            resume: Whether to keep the files of an interrupted run, if there was one.
+            folder: The folder; created if its parent exists.
+            stem, suffix: Stem and suffix of the files, as for `numbered`.
+            others: Names of further files of such a run.
+            run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
+            resume: Whether to keep the files of an interrupted run.
 
         Raises:
-            WlmError: It holds other files, can't be written, or is of a run that depends on something else.
+            WlmError: The folder contains other files, cannot be written, or belongs to a run with other settings.
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False
         self.done: frozenset[int] = frozenset()
         self.partial = self.folder / f"{stem}.partial"
-        # Compared with what JSON gives back, which has no tuples.
+        # In JSON's types, which have no tuples, as they are read back.
         self._run = None if run is None else json.loads(json.dumps({**run, "wlm": __version__}))
         with _writing(self.folder):
             self.folder.mkdir(exist_ok=True)
@@ -304,15 +304,15 @@ class NumberedFiles:
             self.done = frozenset(numbered(self.folder, stem, suffix))
 
     def finish(self) -> None:
-        """Ends the run: there is nothing to resume."""
+        """Ends the run, which can then no longer be resumed."""
         with _writing(self.folder):
             self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
-        """The file for a frame's result, which is ready to be written.
+        """Returns the file for a frame's result and removes earlier files before the first one.
 
         Raises:
-            WlmError: The earlier files can't be removed.
+            WlmError: The earlier files cannot be removed.
         """
         if not self._cleared:
             with _writing(self.folder):
@@ -329,22 +329,22 @@ class NumberedFiles:
 
 
 def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:
-    """Writes a guiding map as an EXR of the channels light, transparency and depth, all float32.
+    """Writes a guiding map as an EXR with the channels light, transparency and depth, all float32.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     planes = dict(zip(_GUIDE, guide.maps.cpu().numpy(), strict=True))
     write_planes(path, planes, {"camera": asdict(guide.camera)}, whole=_GUIDE)
 
 
 def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
-    """Writes lightmaps as an EXR of half floats: a channel for each direction, `transparency`, of hot smoke `emission`,
-    and where it is known the surface's `depth`, a float; the camera and the looks are in its header.
+    """Writes lightmaps as an EXR of half floats: a channel per direction, `transparency`, `emission` of hot smoke, and
+    `depth` as float32 if it is known; the camera and the looks are in the header.
 
     Raises:
-        ValueError: The camera isn't known.
-        WlmError: The file can't be written.
+        ValueError: The camera is unknown.
+        WlmError: The file cannot be written.
     """
     if six.camera is None:
         raise ValueError("camera: expected that of the lightmaps, found none")
@@ -360,7 +360,7 @@ def is_six_way(path: Path) -> bool:
     """Whether a file is an EXR with a channel for each direction.
 
     Raises:
-        WlmError: It is called an EXR and can't be read.
+        WlmError: The file is named .exr and cannot be read.
     """
     if path.suffix.lower() != ".exr" or not path.is_file():
         return False
@@ -368,10 +368,10 @@ def is_six_way(path: Path) -> bool:
 
 
 def six_way_files(folder: Path) -> list[Path]:
-    """The six-way lightmaps in a folder, one a frame, by name; empty where its EXR files are something else.
+    """Returns the six-way lightmaps in a folder, one file per frame, by name; none if its EXR files are something else.
 
     Raises:
-        WlmError: The first EXR file can't be read.
+        WlmError: The first EXR file cannot be read.
     """
     files = sorted(path for path in folder.glob("*.exr") if path.name[0] != ".")
     return files if files and is_six_way(files[0]) else []
@@ -381,13 +381,13 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
     """Reads the lightmaps of a file of `write_six_way`.
 
     Raises:
-        WlmError: The file is missing or damaged, lacks a channel or its camera, or holds a number that isn't finite.
+        WlmError: The file is missing or damaged, lacks a channel or its camera, or has a number that is not finite.
     """
     return read_shaded(path, device)[0]
 
 
 def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
-    """Reads what `write_six_way` wrote: the lightmaps, and the looks that were given with them.
+    """Reads the lightmaps and, if present, the looks of a file of `write_six_way`.
 
     Raises:
         WlmError: As `read_six_way`, or the looks are wrong.
@@ -400,7 +400,7 @@ def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixW
         if not np.isfinite(plane).all():
             raise WlmError(f"{path}: channel {name}: expected finite numbers, found NaN or infinity")
     try:
-        # JSON has lists for tuples.
+        # JSON has lists instead of tuples.
         fields = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
         camera = Camera(**fields)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
@@ -418,7 +418,7 @@ def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixW
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Turns errors of the file system into one line that names the folder."""
+    """Converts errors of the file system to a WlmError that names the folder."""
     try:
         yield
     except OSError as error:
@@ -436,7 +436,7 @@ def _read_scene(folder: Path) -> Scene:
 
 
 def _simulated(scene: Scene) -> dict[str, Any]:
-    """The settings that a simulation's frames depend on: neither their number nor those of pictures."""
+    """Returns the settings on which the frames of a simulation depend."""
     appearance = {"smoke": {"extinction", "glow"}, "obstacles": {"__all__": {"colour"}}}
     others = dict.fromkeys(("name", "frames", "camera", "lights", "background"), True)
     return json.loads(scene.model_dump_json(exclude=others | appearance))

@@ -1,10 +1,10 @@
 """A trained network at run time: one image at a time, on a GPU in half floats and as a CUDA graph, on a CPU in float32.
 
-The adapters' weights are folded, which changes rounding alone: a norm's scale and shift go into the 1 x 1 convolution
-after it, beta and gamma into the one before; the channel attention multiplies the weights of the convolution after it,
-which are fewer than the pixels. The adapters run side by side, and their heads as one convolution. Pixels are rows of
-channels, so that 1 x 1 convolutions are plain matrix products. Between these run the kernels of
-`wlm_kernels.smoke.naf_block`, and after the heads those of `wlm_kernels.smoke.planes`.
+The adapters' weights are folded, which changes only rounding: a norm's scale and shift are merged into the following
+1 x 1 convolution, beta and gamma into the preceding one; the channel attention multiplies the weights of the following
+convolution, which are fewer than the pixels. The adapters run in one batch, and their heads as one convolution. Pixels
+are rows of channels, so that 1 x 1 convolutions are matrix products. The kernels of `wlm_kernels.smoke.naf_block` run
+between these, and those of `wlm_kernels.smoke.planes` after the heads.
 """
 
 from collections.abc import Sequence
@@ -25,27 +25,27 @@ _WARMUP = 2
 
 
 class Decoder:
-    """Turns encoded guiding maps of one size into planes.
+    """Predicts planes from encoded guiding maps of one size.
 
     Attributes:
         height, width: H and W of the images.
-        device: Where it runs.
+        device: Device on which it runs.
         guide: Kind of guiding map, a key of `planes.GUIDES`.
         half: Whether it computes in half floats.
     """
 
     def __init__(self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True) -> None:
-        """Folds the weights, as they are now, and allocates buffers.
+        """Folds the current weights and allocates buffers.
 
         Args:
-            model: The network; it isn't changed.
+            model: The network; it is not changed.
             device: "cpu", "cuda" or "cuda:N".
             height, width: H and W, at least 1.
             half: Whether a GPU computes in half floats; a CPU always computes in float32.
 
         Raises:
-            ValueError: A size below 1.
-            WlmError: No such device.
+            ValueError: A size is below 1.
+            WlmError: The device does not exist.
         """
         if height < 1 or width < 1:
             raise ValueError(f"expected at least one pixel, got {height} x {width}")
@@ -64,16 +64,16 @@ class Decoder:
         self._run = StepGraph(self._work, self.device, warmup=_WARMUP)
 
     def __call__(self, encoded: torch.Tensor) -> torch.Tensor:
-        """Predicts the planes of one image; on CUDA the work is queued, not awaited.
+        """Predicts the planes of one image; on CUDA the call returns before the work is done.
 
         Args:
-            encoded: [C, H, W], a guiding map of `planes.render_guide` of the kind `guide`, on the device.
+            encoded: [C, H, W], a guiding map from `planes.render_guide` of the kind `guide`, on the device.
 
         Returns:
             float32 [8, H, W] in the order of `PLANES`, clamped to their ranges. The next call overwrites it.
 
         Raises:
-            ValueError: Another size, or another device.
+            ValueError: The size or the device is wrong.
         """
         if encoded.shape != self._guide.shape[1:] or encoded.device != self._guide.device:
             expected = f"{list(self._guide.shape[1:])} on {self.device}"
@@ -84,20 +84,20 @@ class Decoder:
 
     @torch.no_grad()
     def _work(self) -> None:
-        # cuDNN tries out its algorithms before the graph is captured; without half floats, TF32 stays off.
+        # cuDNN benchmarks its algorithms before the graph is captured; TF32 is used only with half floats.
         with torch.backends.cudnn.flags(enabled=True, benchmark=True, deterministic=False, allow_tf32=self.half):
             heads = self._body(self._guide)
         self._tail(heads, self._guide[0], self._planes)
 
 
 class _Adapters:
-    """G NAFBlocks side by side on one image of H x W pixels and c channels.
+    """G NAFBlocks in one batch on an image of H x W pixels and c channels.
 
-    Constants that a block adds to all pixels are kept apart: the norm's kernel adds those of the first correction, and
-    the caller adds `shift`.
+    Constants that a block adds to all pixels are separate: the norm's kernel adds those of the first correction, the
+    caller adds `shift`.
 
     Attributes:
-        shift: [G, c], to be added to the outputs.
+        shift: [G, c], must be added to the outputs.
     """
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
@@ -106,7 +106,7 @@ class _Adapters:
         Args:
             blocks: The G blocks.
             height, width: H and W.
-            device, dtype: Where, and in which type, they run.
+            device, dtype: Device and type of the computation.
         """
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
@@ -189,7 +189,7 @@ class _Body:
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """All heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W] that is padded."""
+        """Returns all heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W]."""
         settings, stem = self.settings, self.settings.stem
         padded = F.pad(guide, self.padding)
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
@@ -201,7 +201,7 @@ class _Body:
         for level in reversed(range(len(self.up))):
             above = F.interpolate(F.conv2d(x, *self.up[level]), scale_factor=2.0, mode="nearest")
             x = self._twice(torch.cat([above, skips[level]], 1), self.decoder[level])
-        # Each adapter through all heads, of which only its own count: one convolution is quicker than four.
+        # Each adapter runs through all heads and only its own head is used: one convolution is faster than four.
         y = self.adapters(x) + self.shift
         y = y.view(-1, *self.size, settings.width).permute(0, 3, 1, 2)
         return F.conv2d(y, *self.heads, padding=1)
@@ -216,10 +216,7 @@ class _Body:
 
 
 class _Tail:
-    """Turns the heads' outputs into planes: pixels in place, the guide's filter added, 0 far from smoke.
-
-    The filter runs in float32.
-    """
+    """Combines the heads' outputs with the filter of the guide, which runs in float32; planes are 0 far from smoke."""
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
@@ -231,7 +228,7 @@ class _Tail:
         places[order] = torch.tensor([[adapter, n * area] for n, adapter in enumerate(adapters)], dtype=torch.int32)
         filters = network.filter.weight
         edge = filters.shape[-1]
-        # Columns first, in the order in which a thread reads them.
+        # Columns first, the order in which a thread reads them.
         taps = torch.zeros(filters.shape[1], edge, edge, len(PLANES))
         taps[..., order] = filters.permute(1, 3, 2, 0)
         self._places = to_warp(places.to(device))
@@ -254,16 +251,16 @@ class _Tail:
 
 
 def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """A convolution's weights, in the images' memory layout, and biases."""
+    """Returns a convolution's weights, in the images' memory layout, and biases."""
     return layer.weight.to(device, dtype, memory_format=torch.channels_last), layer.bias.to(device, dtype)
 
 
 def _halves(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Joins G expanded groups so that all first halves come before all second halves."""
+    """Concatenates G groups so that all first halves come before all second halves."""
     return torch.cat([half for side in (0, 1) for half in (part.chunk(2)[side] for part in parts)])
 
 
 def _after_norm(norm: nn.Module, conv: nn.Conv2d) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights and biases of a 1 x 1 convolution with the norm before it folded in."""
+    """Returns weights and biases of a 1 x 1 convolution into which the preceding norm is folded."""
     weight = conv.weight[:, :, 0, 0]
     return weight * norm.weight[:, 0, 0], conv.bias + weight @ norm.bias[:, 0, 0]

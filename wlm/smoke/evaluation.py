@@ -1,11 +1,11 @@
-"""Scores of lightmaps: a network's, and those of any other method on the same samples.
+"""Scores of lightmaps of a network, and of other methods on the same samples.
 
-All scores are of encoded planes, that is in sRGB, as the paper's PSNR is (section 5).
+All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5). Special cases:
 
 =====================================  =====================================================
 an exact prediction                    120 dB, as everywhere (`wlm.metrics`)
 no visible smoke                       the flicker is NaN
-a target that doesn't change           the ratio of flickers is NaN
+a target that does not change          the ratio of flickers is NaN
 no samples, or planes of another size  error
 =====================================  =====================================================
 """
@@ -36,34 +36,34 @@ from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import Meter, OnProgress
 
 Method = Callable[[Pool, slice], torch.Tensor]
-"""Predicts planes [n, 2, 8, H, W] of both frames of the samples that a slice takes from a pool; `score` clamps."""
+"""Function that predicts planes [n, 2, 8, H, W] of both frames of a slice of a pool; `score` clamps them."""
 
 NETWORK, HALF = "network", "network, half floats"
-"""Names of a network's own methods in a `Comparison`."""
+"""Names of a network's methods in a `Comparison`."""
 
 REFERENCE = "reference"
-"""The fine march's name in an `Example`."""
+"""Name of the fine march in an `Example`."""
 
 DENSITIES = (0.5, 1.0, 2.0)
-"""Factors on the density, those of the paper's ablation (figure 5)."""
+"""Factors of the density, those of the paper's ablation (figure 5)."""
 
 _BATCH = 8  # samples
-_EXAMPLES = 2  # of a comparison
-_STILL = 1e-4  # a flicker of no more than this, a fortieth of a byte's step, counts as none
+_EXAMPLES = 2  # images shown in a comparison
+_STILL = 1e-4  # a flicker up to this, a fortieth of a level of 8 bits, counts as none
 
 
 @dataclass(frozen=True)
 class Score(system.Report):
-    """How well predicted planes fit a pool; decibels in sRGB with a peak of 1, over whole images.
+    """Scores of predicted planes on a pool; decibels in sRGB with a peak of 1, over whole images.
 
     Attributes:
-        psnr: Mean over the images, each over its six lightmaps, as in the paper.
-        lowest, highest: Over the images.
-        planes: For each of `PLANES`, of the mean square error over all images.
+        psnr: Mean over the images of the PSNR of their six lightmaps, as in the paper.
+        lowest, highest: Range over the images.
+        planes: PSNR of each of `PLANES`, from the mean square error over all images.
         flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
-            earlier frame by the smoke's motion. Shadows that move otherwise and new smoke count too.
-        reference_flicker: The same of the targets, in which nothing flickers.
-        images: PSNR of each image: of both frames of the first sample, then of the second.
+            earlier frame by the smoke's motion. It includes shadows that move differently, and new smoke.
+        reference_flicker: Flicker of the targets.
+        images: PSNR of each image: both frames of the first sample, then of the second.
     """
 
     psnr: float
@@ -76,11 +76,11 @@ class Score(system.Report):
 
     @property
     def flicker_ratio(self) -> float:
-        """Flicker over the targets': 1 is as steady as these; NaN where the targets don't change."""
+        """Flicker relative to that of the targets; NaN if the targets do not change."""
         return self.flicker / self.reference_flicker if self.reference_flicker > _STILL else math.nan
 
     def to_json(self) -> dict[str, Any]:
-        """As `wlm.system.Report.to_json`, with the ratio of flickers, and planes by name."""
+        """Returns the scores as JSON values, with the ratio of flickers, and planes by name."""
         names = ("psnr", "lowest", "highest", "flicker", "reference_flicker", "flicker_ratio")
         planes = dict(zip(PLANES, self.planes, strict=True))
         return system.plain({name: getattr(self, name) for name in names} | {"planes": planes})
@@ -111,20 +111,21 @@ def evaluate(
     file_bytes: int | None = None,
     half: bool = True,
 ) -> Report:
-    """Scores a network as it runs: one image at a time through its `Decoder`.
+    """Scores a network at run time: one image at a time through its `Decoder`.
 
     Args:
         model: The network.
-        data: Samples with guiding maps of its kind; or settings, of which the test set is simulated, which no network
-            was trained on or selected by; None: the settings that it was trained with.
+        data: Samples with guiding maps of the network's kind; or settings of a test set, which is simulated and took no
+            part in training or selection; None: the settings of the network's training.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called about twice a second.
         file_bytes: Size of the network's file; None: `model.file_bytes()`.
         half: Whether a GPU computes in half floats.
 
     Raises:
-        WlmError: No such device, the file lacks its settings, the memory isn't enough, or no frame has smoke.
-        ValueError: The samples don't fit the network.
+        WlmError: The device does not exist, the model lacks its settings, there is not enough memory, or no frame has
+            smoke.
+        ValueError: The samples do not fit the network.
     """
     device = check_device(device)
     if not isinstance(data, Pool):
@@ -138,7 +139,7 @@ def evaluate(
 
 
 def of_network(network: torch.nn.Module) -> Method:
-    """A network in float32, several images at once, as training validates it."""
+    """Returns the method of a network in float32 on several images at once, as in validation."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -148,11 +149,11 @@ def of_network(network: torch.nn.Module) -> Method:
 
 
 def of_decoder(decoder: Decoder) -> Method:
-    """A network at run time."""
+    """Returns the method of a network at run time."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
-        # Copied, since the next call overwrites them.
+        # Copied: the next call overwrites the result.
         planes = [decoder(guide).clone() for guide in guides.flatten(0, 1).float()]
         return torch.stack(planes).unflatten(0, guides.shape[:2])
 
@@ -161,16 +162,16 @@ def of_decoder(decoder: Decoder) -> Method:
 
 @torch.no_grad()
 def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgress | None = None) -> Score:
-    """Scores a method on both frames of all samples; its planes are clamped as `decode_lightmaps` does.
+    """Scores a method on both frames of all samples; planes are clamped as by `decode_lightmaps`.
 
     Args:
         method: The method.
-        pool: The samples, with what the method reads.
-        batch: Samples at once.
+        pool: The samples, with the guiding maps that the method reads.
+        batch: Samples per call of the method.
         progress: Called about twice a second.
 
     Raises:
-        ValueError: The pool is empty, or the method's planes have another shape.
+        ValueError: The pool is empty, or the planes have a wrong shape.
     """
     if len(pool) == 0:
         raise ValueError("pool: expected samples, got none")
@@ -201,13 +202,13 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Held-out samples of one smoke: all frame pairs, each from all views.
+    """Test samples of one smoke: all frame pairs, each from all views.
 
     Attributes:
         whole: All samples, ordered by frame pair and then by view; the views turn about the box's centre.
-        keep: bool [N], the samples that count: those that aren't almost empty.
-        settings: How they were made.
-        make: Makes them anew with other settings.
+        keep: bool [N], samples that are scored: those that are not almost empty.
+        settings: Settings of the samples.
+        make: Makes the samples with other settings.
     """
 
     whole: Pool
@@ -216,22 +217,22 @@ class HeldOut:
     make: Callable[[DatasetSettings], Pool]
 
     def pool(self, guide: str) -> Pool:
-        """The samples that count, with guiding maps of a kind; nothing else depends on that."""
+        """Returns the scored samples, with guiding maps of a kind."""
         same = guide == self.settings.guide
         return (self.whole if same else self.make(_with_guide(self.settings, guide))).take(self.keep)
 
     @property
     def kept(self) -> torch.Tensor:
-        """int [n], the numbers of the samples that count."""
+        """Numbers of the scored samples, int [n]."""
         return self.keep.nonzero().flatten()
 
 
 class Entry(NamedTuple):
-    """A method, with what it is scored on.
+    """A method, with the samples on which it is scored.
 
     Attributes:
-        numbers: int [n], which of all held-out samples; maybe none.
-        pool: These samples, with what the method reads.
+        numbers: int [n], numbers of the samples; may be empty.
+        pool: These samples, with the guiding maps that the method reads.
         method: The method.
     """
 
@@ -241,15 +242,15 @@ class Entry(NamedTuple):
 
 
 Contender = Callable[[HeldOut], Entry]
-"""Enters a method for held-out samples."""
+"""Function that returns the entry of a method for test samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """An image on which the network does badly.
+    """An image on which the network has a low score.
 
     Attributes:
-        frame, view: Its place in `Comparison.images`.
+        frame, view: Index in `Comparison.images`.
         planes: float16 [8, H, W] on the CPU, encoded lightmaps of `REFERENCE` and of each method that has this image.
     """
 
@@ -260,16 +261,16 @@ class Example:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Methods on one held-out set.
+    """Scores of several methods on one test set.
 
     Attributes:
-        name: What the samples show.
+        name: Name of the test set.
         samples: Number of frame pairs and views.
         methods: Scores by name.
-        turns: float [views], degrees by which each view is turned about the smoke.
-        images: PSNR of each image by the method's name, [frames, views]; NaN where the method has no such image. Both
-            frames of a pair follow each other; those of a volume are alike.
-        worst: The samples on which the network does worst, each by its worse frame, the worst first.
+        turns: float [views], angle of each view about the smoke in degrees.
+        images: PSNR of each image by the method's name, [frames, views]; NaN where the method has no such image. The
+            two frames of a pair are adjacent; those of a volume are equal.
+        worst: Samples with the lowest scores of the network, lowest first, each with its worse frame.
     """
 
     name: str
@@ -281,12 +282,12 @@ class Comparison:
 
     @property
     def half_loss(self) -> float | None:
-        """Decibels lost by half floats; None where they weren't tried."""
+        """Decibels lost by half floats; None if they were not scored."""
         half = self.methods.get(HALF)
         return None if half is None else self.methods[NETWORK].psnr - half.psnr
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON's own types."""
+        """Returns the scores as JSON values."""
         methods = {name: scores.to_json() for name, scores in self.methods.items()}
         return {"name": self.name, "samples": self.samples, "half_loss": self.half_loss, "methods": methods}
 
@@ -301,14 +302,14 @@ def compare(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> list[Comparison]:
-    """Scores a network and its rivals on the test set at several densities, and on volumes.
+    """Scores a network and other methods on the test set at several densities, and on volumes.
 
     Args:
         model: The network.
-        settings: Of the test set; None: those that it was trained with.
+        settings: Settings of the test set; None: those of the network's training.
         volumes: Files for `pool_of_volume`.
         rivals: Other methods, by name.
-        densities: Factors on the test set's extinction.
+        densities: Factors of the test set's extinction.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called after each set, with the network's "PSNR dB".
 
@@ -316,8 +317,8 @@ def compare(
         A comparison for each density, then for each volume.
 
     Raises:
-        WlmError: No such device, the file lacks its settings, the memory isn't enough, a volume can't be read, or no
-            frame has smoke.
+        WlmError: The device does not exist, the model lacks its settings, there is not enough memory, a volume cannot
+            be read, or no frame has smoke.
     """
     device, guide = check_device(device), model.settings.guide
     settings = _with_guide(settings or model.dataset, guide)
@@ -333,7 +334,7 @@ def compare(
     if device != "cpu":
         contenders[HALF] = at_run_time
     contenders |= rivals or {}
-    # All frames are made, so that each has its first view; almost empty ones don't count, but in volumes all do.
+    # All frames are made, so that each has its first view; almost empty frames are not scored, except in volumes.
     complete = settings.model_copy(update={"kept_empty": 1.0})
     sets = {
         f"density x {scale:g}": (
@@ -357,14 +358,14 @@ def compare(
 
 @torch.no_grad()
 def _compare(name: str, held_out: HeldOut, contenders: Mapping[str, Contender]) -> Comparison:
-    """Scores methods on one smoke; the first is the network, whose worst images all show."""
+    """Scores methods on one smoke; the first is the network, which selects the images to show."""
     views = held_out.settings.views
     scores: dict[str, Score] = {}
     images: dict[str, np.ndarray] = {}
-    worst: list[tuple[int, int]] = []  # a sample and its worse frame
+    worst: list[tuple[int, int]] = []  # samples, each with its worse frame
     planes: list[dict[str, torch.Tensor]] = []
     for method_name, contender in contenders.items():
-        # One after the other: each pool is a copy.
+        # One method at a time: each pool is a copy.
         numbers, pool, method = contender(held_out)
         if not len(pool):
             continue
@@ -388,7 +389,7 @@ def _compare(name: str, held_out: HeldOut, contenders: Mapping[str, Contender]) 
 
 
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:
-    """The network's decoder, for images of the pool's size."""
+    """Returns the method of the network's decoder for images of the pool's size."""
     height, width = pool.guides.shape[-2:]
     return of_decoder(Decoder(model, device, height=height, width=width, half=half))
 

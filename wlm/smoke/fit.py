@@ -1,17 +1,17 @@
-"""Training a network on samples that are simulated as they are needed (neural-six-way-lightmaps, section 4.4).
+"""Training of a network on samples that are simulated during the training (neural-six-way-lightmaps, section 4.4).
 
-A training has rounds; each simulates a pool of samples from sequences that no other round has, and takes its steps from
-these. A step depends on the seed, the round and the step's number alone. So a training that was stopped and resumed
-gives the same weights and curves, to the bit on one device, as one that wasn't; only the seconds differ.
+A training has rounds. Each round simulates a pool of samples, from sequences that no other round uses, and trains on
+it. A step depends only on the seed, the round and the number of the step. A training that was stopped and resumed
+therefore gives the same weights and curves, to the bit on one device, as one that was not. Special cases:
 
 ===============================================  ========================================================
 NaN or infinity in a pool                        error that names the round, the tensor and the first sample
-a step whose gradient isn't finite               skipped and counted; error when a tenth of a round's are
+a step whose gradient is not finite              skipped and counted; error if a tenth of a round's steps are
 3 dB below the untrained network                 error at the end of the round; the best network so far is kept
 an empty pool, or one of another size            error
 out of time, or stopped                          a checkpoint is written first
-stopped before the first step                    a checkpoint of step 0 replaces any older one
-resumed beside another network than the          the next validation's network is kept
+stopped before the first step                    a checkpoint of step 0 replaces any older checkpoint
+resumed beside a network that is not the         the network of the next validation is saved
 checkpoint's best
 resumed after the end                            error
 ===============================================  ========================================================
@@ -48,22 +48,22 @@ from wlm.system import Meter, OnProgress, Progress, load
 
 _CHUNK = 50  # steps between two reports
 _LEAST_SKIPPED = 10
-_MOST_SKIPPED = 0.1  # of a round's steps
-_WORSE = 3.0  # decibels below the untrained network from which a training counts as diverged
+_MOST_SKIPPED = 0.1  # largest share of skipped steps in a round
+_WORSE = 3.0  # decibels below the untrained network at which a training has diverged
 _SCORES = ("psnr", "lowest", "highest", "flicker", "reference_flicker")  # columns of the curves
 
 
 @dataclass(frozen=True)
 class Training:
-    """The result of a training.
+    """Result of a training.
 
     Attributes:
-        finished: False: it ran out of time and can be resumed.
+        finished: Whether it is finished; otherwise it ran out of time and can be resumed.
         best: Validation PSNR of the saved network; NaN if none has been validated.
         score: The last validation, or None.
-        steps, skipped: Steps done, and those of them without an update.
-        seconds: In all, earlier runs included.
-        model: The saved network, as its file holds it; None if there is none yet.
+        steps, skipped: Numbers of steps, and of steps without an update.
+        seconds: Total time, earlier runs included.
+        model: The saved network, read from its file; None if there is none yet.
     """
 
     finished: bool
@@ -89,28 +89,28 @@ def train(
     make_validation: Callable[..., Pool] | None = None,
     **overrides: Mapping[str, Any],
 ) -> Training:
-    """Trains a network and saves the one with the best validation.
+    """Trains a network and saves the version with the best validation.
 
-    Beside `output` it writes `OUTPUT.csv`, the curves, and until it is finished `OUTPUT.partial`, the checkpoint.
+    It also writes `OUTPUT.csv`, the curves, and until it is finished `OUTPUT.partial`, the checkpoint.
 
     Args:
         profile: A profile's name, the path of a YAML file, or the profile itself.
         output: The network's file.
-        seed: Determines the initial weights, the pools and the order of samples.
+        seed: Seed of the initial weights, the pools and the order of samples.
         device: "cpu", "cuda" or "cuda:N".
-        minutes: Time limit, at which it stops with a checkpoint, after at least `_CHUNK` steps; None: no limit.
-        resume: Whether to continue from the checkpoint, if there is one.
-        checkpoint_every: Seconds between two checkpoints while steps are taken; 0: after every `_CHUNK` of them. There
-            is one at the end of each round too.
-        progress: Called after each sequence simulated and about every 50 steps, with "PSNR dB" at the last validation
+        minutes: Time limit at which the training stops with a checkpoint, after at least `_CHUNK` steps; None: none.
+        resume: Whether to continue from the checkpoint, if it exists.
+        checkpoint_every: Seconds between checkpoints during the steps; 0: after every `_CHUNK` steps. There is also one
+            at the end of each round.
+        progress: Called after each simulated sequence and about every 50 steps, with "PSNR dB" of the last validation
             and the mean "loss" since then.
-        make_pool, make_validation: Replace those of `learn.dataset`.
-        **overrides: Settings of the profile's parts that differ: `training={"rounds": 2}`.
+        make_pool, make_validation: Replace the functions of `network.dataset`.
+        **overrides: Settings that replace those of the profile's parts: `training={"rounds": 2}`.
 
     Raises:
-        WlmError: A wrong setting, no such device, a checkpoint that is damaged or of another training, a finished
-            training to resume, unusable samples, a training that diverged, or a file that can't be written or that
-            another process is writing.
+        WlmError: A setting is wrong, the device does not exist, the checkpoint is damaged or of another training, the
+            training to resume is finished, samples are unusable, the training diverged, or a file cannot be
+            written or is being written by another process.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     profile, device = Profile.load(profile).override(overrides), check_device(device)
@@ -127,7 +127,7 @@ def train(
         meter = Meter(progress, "train", profile.training.total)
         run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
         make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
-        # Between two sequences of a pool nothing is lost: earlier steps are in the checkpoint.
+        # Stopping between two sequences of a pool loses nothing: earlier steps are in the checkpoint.
         validation = make_validation(profile.dataset, device, progress=run.report)
         _check_pool("validation", validation)
         run.begin(validation)
@@ -144,7 +144,7 @@ def train(
 
 
 class _Run:
-    """A training's state: the trainer, the best network so far and the curves; restored from a checkpoint."""
+    """State of a training: the trainer, the best network so far and the curves; restored from a checkpoint."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class _Run:
         self.limit = math.inf if minutes is None else 60.0 * minutes
         # Seconds of earlier runs; validation PSNR of the best and of the untrained network.
         self.before, self.best, self.untrained = 0.0, math.nan, math.nan
-        self.best_step = self.first_skipped = 0  # step of the best; steps skipped before this round
+        self.best_step = self.first_skipped = 0  # step of the best network; steps skipped before this round
         self.score: Score | None = None
         self.loss = math.nan
         self.columns = ["step", "seconds", "rate", "loss", *self.settings.losses, "skipped"]
@@ -201,16 +201,16 @@ class _Run:
         return self.before + self.meter.seconds
 
     def begin(self, validation: Pool) -> None:
-        """Validates and saves the untrained network, which every later one has to beat."""
+        """Validates and saves the untrained network, the baseline of all later networks."""
         if self.trainer.step == 0:
             self.score = score(of_network(self.trainer.average), validation)
             self.untrained = self.best = self.score.psnr
-            # The checkpoint first: beside no network, or an older one, its best counts for nothing.
+            # The checkpoint is written first: without a matching network its best score is ignored.
             self.save()
             self._save_network()
 
     def do_round(self, pool: Pool) -> bool:
-        """Runs the remaining steps of a round; False: out of time."""
+        """Runs the remaining steps of a round; returns False if it runs out of time."""
         number, begin = self.round, self.round * self.settings.steps
         plan = plan_round(self.settings, pool, seed=self.seed, round=number)
         if self.trainer.step == begin:
@@ -226,7 +226,7 @@ class _Run:
                 )
             self.loss = self._losses()[0]
             if self.round > number:
-                return True  # validated before anything can stop it
+                return True  # the round is validated before the training can stop
             try:
                 self.report()
             except KeyboardInterrupt:
@@ -239,7 +239,7 @@ class _Run:
                 self.save()
 
     def end_round(self, validation: Pool) -> None:
-        """Validates, saves the network if it is the best, and writes curves and checkpoint."""
+        """Validates, saves the network if it is the best so far, and writes curves and checkpoint."""
         validated = self.round % self.settings.validate_every == 0 or self.round == self.settings.rounds
         if validated:
             self.score = score(of_network(self.trainer.average), validation)
@@ -248,7 +248,7 @@ class _Run:
                     f"{self.output}: the training diverged: {self.score.psnr:.1f} dB after {self.trainer.step} steps,"
                     f" {self.untrained:.1f} before the first; expected a smaller rate than {self.settings.rate:g}"
                 )
-            # True where the best is NaN too.
+            # Also true if the best is NaN.
             if not self.score.psnr <= self.best:
                 self.best, self.best_step = self.score.psnr, self.trainer.step
                 self._save_network()
@@ -274,7 +274,7 @@ class _Run:
         return Training(finished, self.best, self.score, step, skipped, self.seconds, self._saved())
 
     def _saved(self) -> SmokeModel | None:
-        """The output as it is; None where it is missing or damaged, which the next best network replaces."""
+        """Loads the output; None if it is missing or damaged: the next best network replaces it."""
         try:
             return load(self.output, SmokeModel.SYSTEM)
         except WlmError:
@@ -294,14 +294,14 @@ class _Run:
         SmokeModel(self.trainer.average, summary).save(self.output)
 
     def _losses(self) -> list[float]:
-        """Means of the loss and its parts since the last row of the curves."""
+        """Returns means of the loss and its parts since the last row of the curves."""
         last = self.curve[-1] if len(self.curve) else np.zeros(len(self.columns))
         steps, skipped = (self.columns.index(name) for name in ("step", "skipped"))
         count = self.trainer.step - last[steps] - (self.trainer.skipped - last[skipped])
         return [float(value / count) if count else math.nan for value in self.trainer.take_losses()]
 
     def _add_to_curve(self, validated: bool) -> None:
-        """Adds the round's row, with NaN for what it hasn't validated, and writes the curves."""
+        """Adds the row of a round, with NaN for missing scores, and writes the curves."""
         scores = [math.nan] * (len(_SCORES) + len(PLANES))
         if validated:
             scores = [*(getattr(self.score, name) for name in _SCORES), *self.score.planes]
@@ -320,7 +320,7 @@ def _check_pool(where: str, pool: Pool) -> None:
     if len(pool) == 0:
         raise WlmError(f"{where}: expected samples, found none")
     for tensor in fields(pool):
-        # Sample by sample: a mask of the whole would take half as much memory again.
+        # Sample by sample: a mask of the whole pool would take half as much memory again.
         finite = torch.stack([torch.isfinite(sample).all() for sample in getattr(pool, tensor.name)])
         if not finite.all():
             first = int((~finite).nonzero()[0])

@@ -1,8 +1,8 @@
 """Six-way lightmaps of one frame, the result of each march and of the network, and their shading.
 
-A lightmap holds the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from its
-direction: with g = 0 at most 1/2 from the front and 1 from a side. All is linear. The lightmaps are orthographic, as a
-flat billboard has no other view.
+A lightmap stores the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from the map's
+direction: with g = 0 at most 1/2 from the front and 1 from a side. All values are linear. Lightmaps are orthographic,
+the only view of a flat billboard.
 """
 
 import math
@@ -19,15 +19,15 @@ from wlm.smoke.transport.lights import checked_albedo
 
 @dataclass(frozen=True)
 class StepError:
-    """The change by halving the step.
+    """Change of a result when the step is halved.
 
-    It bounds the error of the finer result where the error falls at least in proportion to the step, as it does down to
-    rounding: by experience with its square, so that a third of this remains.
+    It bounds the error of the finer result if the error falls at least in proportion to the step. In practice the error
+    falls with the square of the step, so that a third of this change remains.
 
     Attributes:
-        largest: Greatest difference of a pixel in any lightmap.
-        rms: Root of the mean square of the differences, over that of the lightmaps; 0 where these are black.
-        transparency: Greatest difference of a pixel's transparency.
+        largest: Largest difference of a pixel in any lightmap.
+        rms: Root mean square of the differences over that of the lightmaps; 0 if these are black.
+        transparency: Largest difference of a pixel's transparency.
     """
 
     largest: float
@@ -41,12 +41,12 @@ class SixWay:
 
     Attributes:
         lightmaps: float32 tensor [6, H, W], in the order of `wlm.smoke.camera.DIRECTIONS`.
-        transparency: float32 tensor [H, W], or None: not known, as in files without it.
-        emission: float32 tensor [H, W], the light that the smoke gives off itself, or None: it is cold.
-        camera: The view, or None: not known, as in an engine's textures.
+        transparency: float32 tensor [H, W]; None: unknown, as in files without it.
+        emission: float32 tensor [H, W], light that the smoke emits; None: the smoke is cold.
+        camera: The view; None: unknown, as for an engine's textures.
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0 where there
-            is none; or None: not known.
-        error: Of the march, or None: not estimated.
+            is none; None: unknown.
+        error: Error of the march; None: not estimated.
     """
 
     lightmaps: torch.Tensor
@@ -68,7 +68,7 @@ class SixWay:
             raise ValueError(f"camera: expected {size} pixels, got {(self.camera.height, self.camera.width)}")
 
     def __getitem__(self, direction: str) -> torch.Tensor:
-        """The lightmap of a direction by its name, [H, W]."""
+        """Returns the lightmap of a direction by its name, [H, W]."""
         return self.lightmaps[DIRECTIONS.index(direction)]
 
     def shade(
@@ -80,22 +80,22 @@ class SixWay:
         ramp: Ramp | None = None,
         albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
-        """Lights the smoke: a light of irradiance E counts for E / (4 pi) of each lightmap's weight (eq. 4 and 5).
+        """Lights the smoke; a light of irradiance E adds E / (4 pi) times its weight of each lightmap (eq. 4 and 5).
 
         Args:
             lights: Any number.
-            background: Linear light behind the smoke, [H, W, 3] or one colour; None: the smoke's light alone, to be
-                added to what is behind times the transparency.
-            rule: How a light's direction weighs the lightmaps, one of `wlm.smoke.camera.RULES`.
-            ramp: Colour of the emission; None: grey, as it is.
-            albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
+            background: Linear light behind the smoke, [H, W, 3] or one colour; None: only the smoke's light, to which
+                the background times the transparency must be added.
+            rule: Rule for the weights of the lightmaps, one of `wlm.smoke.camera.RULES`.
+            ramp: Colour of the emission; None: grey.
+            albedo: R, G, B, share of light that survives a scattering, 0 to 1.
 
         Returns:
             float32 [H, W, 3], linear.
 
         Raises:
-            ValueError: The camera is needed and not known, or the transparency for a background; a light has no
-                direction, a negative irradiance or a visibility of another shape; not an albedo.
+            ValueError: The camera, or the transparency for a background, is needed and unknown; a light has no
+                direction, a negative irradiance or a visibility of another shape; or the albedo is invalid.
         """
         if self.camera is None and lights:
             raise ValueError("camera: expected that of the lightmaps, found none; give it by dataclasses.replace")

@@ -1,22 +1,21 @@
-"""The settings of a scene to simulate and render, a YAML file: the box, air, smoke, inlets, obstacles, camera, lights.
+"""Settings of a scene to simulate and render, a YAML file: box, air, smoke, inlets, obstacles, camera, lights.
 
-Lengths are in metres, times in seconds, directions the world's, +y up unless the scene says otherwise. A class is named
-`...Settings` where the object that is made of it has the plain name. The stated behaviours:
+Lengths are in metres, times in seconds, directions in the world, with +y up by default. A class is named `...Settings`
+if the object that is made from it has the plain name. Special cases:
 
 =======================================  =============================================================
 a number NaN, infinite or beyond 1e18    error that names the field
 a cell not of 1e-9 to 1e9 metres         error
 more than 1,000,000 steps a frame        error that says what asks for them
 an unknown or a repeated key             error
-a path whose times don't rise            error
-an inlet's or a source's end before      error
-its start
-no inlet, no source                      fine: the box stays empty
-an obstacle over an inlet                fine: nothing comes in where it lies
-a camera or a light along an axis        fine, along the vertical too
-a light of no direction                  error
-a box of one cell                        fine
-an obstacle or an inlet too fast for     error when it is simulated: it names the obstacle or the inlet
+a path whose times do not increase       error
+a source that ends before its start      error
+no inlet, no source                      valid: the box stays empty
+an obstacle over an inlet                valid: no inflow through the covered part
+a camera or a light along an axis        valid, also along the vertical
+a light without a direction              error
+a box of one cell                        valid
+an obstacle or an inlet too fast for     error in the simulation, which names the obstacle or the inlet
 the time step
 =======================================  =============================================================
 """
@@ -39,7 +38,7 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
 _SHORTEST = 1e-12
-_MOST_STEPS = 1_000_000  # a frame; real scenes have some hundred
+_MOST_STEPS = 1_000_000  # largest number of steps per frame; typical scenes have hundreds
 
 
 def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -54,7 +53,7 @@ def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[
     return path
 
 
-_LARGEST = 1e18  # float32 holds its square
+_LARGEST = 1e18  # its square is within float32
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
 _Vector = tuple[_Number, _Number, _Number]
 _Direction = Annotated[_Vector, AfterValidator(_directed)]
@@ -88,13 +87,13 @@ class Grid(_Settings):
     """The box and its faces.
 
     Attributes:
-        cells: X, Y, Z of the velocity's grid.
-        cell: Metres along a cell's edge.
-        refine: Voxels of density along a cell's edge; in the paper 400 over 100.
-        origin: The box's corner.
-        faces: The boundary condition of each face: "wall", "slip" (a wall without friction), "open", or "periodic", as
-            the opposite one must then be too. Around an inlet its face is a wall to the air, and open to smoke as a
-            whole. The default is open.
+        cells: X, Y, Z, cells of the velocity grid.
+        cell: Edge of a cell in metres.
+        refine: Voxels of density along the edge of a cell; 4 in the paper.
+        origin: Corner of the box.
+        faces: Boundary condition of each face: "wall", "slip" (a wall without friction), "open" (the default), or
+            "periodic", which the opposite face must then be too. Around an inlet its face is a wall for the air, and
+            entirely open for the smoke.
     """
 
     cells: tuple[_Count, _Count, _Count]
@@ -112,7 +111,7 @@ class Grid(_Settings):
         return self
 
     def face(self, name: str) -> str:
-        """The boundary condition of a face."""
+        """Returns the boundary condition of a face."""
         return self.faces.get(name, "open")
 
     @property
@@ -122,12 +121,12 @@ class Grid(_Settings):
 
     @property
     def voxel(self) -> float:
-        """Metres along an edge of a voxel of density."""
+        """Edge of a voxel of density in metres."""
         return self.cell / self.refine
 
     @property
     def size(self) -> np.ndarray:
-        """The box's edges in metres, float64 [3]."""
+        """Edges of the box in metres, float64 [3]."""
         return self.cell * np.asarray(self.cells, np.float64)
 
 
@@ -135,8 +134,8 @@ class Air(_Settings):
     """The air's flow.
 
     Attributes:
-        viscosity: Kinematic, square metres per second; air's is 1.5e-5.
-        speed: Metres per second that are `lattice_speed` cells per step; null: the fastest inlet or obstacle.
+        viscosity: Kinematic viscosity in square metres per second; 1.5e-5 for air.
+        speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Cells per step. Errors grow with its square, the number of steps with its inverse.
         operator, smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
     """
@@ -144,24 +143,24 @@ class Air(_Settings):
     viscosity: _Positive = 1.5e-5
     speed: _Positive | None = None
     lattice_speed: float = Field(0.1, gt=0.0, le=0.3)
-    operator: Literal["bgk", "regularised", "recursive"] = "regularised"
+    operator: Literal["bgk", "regularised"] = "regularised"
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
 
 
 class Smoke(_Settings):
-    """The smoke's motion and appearance.
+    """Motion and appearance of the smoke.
 
     Attributes:
-        extinction: Per metre, of density 1.
-        albedo: R, G, B, the share of light that a scattering leaves.
-        emission: Light given off per metre at temperature 1.
-        dissipation, cooling: Rates of decay of density and temperature, per second: exp(-rate t) is left.
-        buoyancy: Metres per second squared, upwards, at temperature 1.
-        weight: Metres per second squared, downwards, at density 1.
-        up: The direction opposite to gravity.
-        scheme, storage, bricks, substeps: The advection, as for `wlm.fluid.solver.Solver`.
-        glow: Colours of the emission: stops of emission, R, G, B; none: grey, as it is.
+        extinction: Extinction per metre at density 1.
+        albedo: R, G, B, share of light that survives a scattering.
+        emission: Light emitted per metre at temperature 1.
+        dissipation, cooling: Rates of decay of density and temperature per second: exp(-rate t) remains.
+        buoyancy: Upward acceleration at temperature 1, metres per second squared.
+        weight: Downward acceleration at density 1, metres per second squared.
+        up: Direction opposite to gravity.
+        scheme, storage, bricks, substeps: Advection, as for `wlm.fluid.solver.Solver`.
+        glow: Colours of the emission, as stops of emission, R, G, B; empty: grey.
     """
 
     extinction: _Positive = 10.0
@@ -180,7 +179,7 @@ class Smoke(_Settings):
 
     @property
     def hot(self) -> bool:
-        """Whether temperature has any effect."""
+        """Whether the temperature has any effect."""
         return self.emission > 0.0 or self.buoyancy > 0.0
 
 
@@ -195,7 +194,7 @@ class _Timed(_Settings):
         return self
 
     def active(self, time: float) -> bool:
-        """Whether it is on at a time, in seconds."""
+        """Whether the source is active at a time in seconds."""
         return self.start <= time and (self.stop is None or time < self.stop)
 
 
@@ -203,10 +202,10 @@ class Inlet(_Settings):
     """A steady inflow of air and smoke through a face.
 
     Attributes:
-        face: Of the box.
-        centre, radius: The round opening in the face; radius null: the whole face.
-        velocity: Metres per second, into the box.
-        density, temperature: Of the smoke that comes in.
+        face: Face of the box.
+        centre, radius: Circular opening in the face; radius null: the whole face.
+        velocity: Velocity in metres per second, into the box.
+        density, temperature: Values of the incoming smoke.
     """
 
     face: _Face
@@ -225,12 +224,12 @@ class Inlet(_Settings):
 
 
 class SourceSettings(_Timed):
-    """A ball within the box in which smoke arises.
+    """A ball within the box that emits smoke.
 
     Attributes:
-        centre, radius: Of the ball.
-        density, temperature: The values that the ball is held at while the source is on.
-        start, stop: Seconds; stop null: to the end.
+        centre, radius: Centre and radius of the ball.
+        density, temperature: Values that are set in the ball while the source is active.
+        start, stop: Times in seconds; stop null: until the end.
     """
 
     centre: _Vector
@@ -244,9 +243,9 @@ class ObstacleSettings(_Settings):
 
     Attributes:
         shape: "sphere", "box" or "cylinder", whose axis is y.
-        radius: Of a sphere; of the others half their extents along x, y and z.
-        path: Positions of its centre: time, x, y, z. It moves evenly between them, and rests before and after.
-        colour: Its albedo in pictures.
+        radius: Radius of a sphere; for the other shapes half the extents along x, y and z.
+        path: Keys of the centre: time, x, y, z. It moves linearly between them, and rests before and after.
+        colour: Albedo in pictures.
     """
 
     shape: Literal["sphere", "box", "cylinder"] = "sphere"
@@ -261,29 +260,29 @@ class ObstacleSettings(_Settings):
         return self
 
     def centre(self, time: float) -> np.ndarray:
-        """Its position at a time, float64 [3]."""
+        """Returns the position at a time, float64 [3]."""
         keys = np.array(self.path)
         return np.array([np.interp(time, keys[:, 0], keys[:, axis]) for axis in (1, 2, 3)])
 
     @property
     def fastest(self) -> float:
-        """Its greatest speed, metres per second."""
+        """Greatest speed in metres per second."""
         keys = np.array(self.path)
         distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
         return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its surface about its centre: corners float64 [V, 3], triangles int64 [F, 3], anticlockwise from outside."""
+        """Returns the surface relative to the centre: corners float64 [V, 3], triangles int64 [F, 3]."""
         points, triangles = {"sphere": sphere, "box": box, "cylinder": cylinder}[self.shape]()
         return points * np.asarray(self.radius), triangles
 
 
 class CameraSettings(_Settings):
-    """The camera, as `Camera.around` takes it; null is its None.
+    """Settings of a camera.
 
     Attributes:
-        toward, target, extent, distance, up, aspect, perspective: As there; lengths in metres.
-        resolution: Pixels along the height.
+        toward, target, extent, distance, up, aspect, perspective: As for `Camera.around`; lengths in metres.
+        resolution: Height of the image in pixels.
     """
 
     toward: _Direction = (0.0, 0.0, 1.0)
@@ -296,7 +295,7 @@ class CameraSettings(_Settings):
     perspective: bool = False
 
     def turned(self, degrees: float) -> CameraSettings:
-        """The same camera, turned about `up`: the paper's references are seen from 9 sides, 10 degrees apart."""
+        """Returns the camera turned about `up`: the paper's references have 9 views, 10 degrees apart."""
         axis = np.array(self.up) / np.linalg.norm(self.up)
         toward, angle = np.array(self.toward), math.radians(degrees)
         along = axis * (axis @ toward)
@@ -309,26 +308,25 @@ class LightSettings(_Settings):
     """A directional light.
 
     Attributes:
-        toward: From the smoke to the light.
-        irradiance: R, G, B on a surface that faces it; 4 pi (12.57) shows a lightmap as it is.
+        toward: Direction from the smoke to the light.
+        irradiance: R, G, B on a surface that faces the light; at 4 pi (12.57) lightmaps have their stored values.
     """
 
     toward: _Direction
     irradiance: _Colour = (4 * math.pi,) * 3
 
     def light(self) -> Light:
-        """The light."""
+        """Returns the light."""
         return Light(self.toward, self.irradiance)
 
 
 class Looks(_Settings):
-    """What a picture of a frame shows beside its smoke, and by which light.
+    """Settings of a frame's picture other than the smoke itself.
 
     Attributes:
-        lights, background: As of a scene.
-        albedo, glow: As of a scene's smoke; lightmaps that have light of all orders have their albedo already.
-        obstacles: As of a scene.
-        time: Of the obstacles, seconds.
+        lights, background, obstacles: As in a scene.
+        albedo, glow: As for a scene's smoke; lightmaps with light of all orders already include their albedo.
+        time: Time of the obstacles in seconds.
     """
 
     lights: tuple[LightSettings, ...]
@@ -340,7 +338,7 @@ class Looks(_Settings):
 
     @property
     def ramp(self) -> Ramp | None:
-        """The glow's colours; None: grey."""
+        """Colours of the emission; None: grey."""
         return _ramp(self.glow)
 
 
@@ -350,8 +348,8 @@ class Scene(_Settings):
     Attributes:
         name: Shown in reports.
         grid, air, smoke: The box and its contents.
-        inlets, sources, obstacles: In the box.
-        camera, lights, background: Of its pictures; the background is a linear colour.
+        inlets, sources, obstacles: Objects in the box.
+        camera, lights, background: Settings of pictures; the background is a linear colour.
         frames: Number of frames.
         rate: Frames per second; the first is one interval after the start.
     """
@@ -385,22 +383,22 @@ class Scene(_Settings):
         return self
 
     def time(self, frame: int) -> float:
-        """The time of a frame in seconds; frames count from 1."""
+        """Returns the time of a frame in seconds; frames count from 1."""
         return frame / self.rate
 
     def looks(self, frame: int) -> Looks:
-        """What a picture of a frame shows."""
+        """Returns the settings of a frame's picture."""
         parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
         return Looks(**parts, albedo=self.smoke.albedo, glow=self.smoke.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:
-        """The same scene on a grid of a multiple of its cells along each axis, rounded; no axis gets fewer than one.
+        """Returns the scene with its number of cells multiplied by a factor along each axis, rounded, at least one.
 
         The longest axis keeps its length, the others keep theirs to half a cell.
 
         Raises:
-            ValueError: The factor isn't above 0.
-            WlmError: More cells than a grid may have.
+            ValueError: The factor is not above 0.
+            WlmError: There are too many cells.
         """
         if not 0 < factor < math.inf:
             raise ValueError(f"factor: expected a number above 0, got {factor}")
@@ -412,7 +410,7 @@ class Scene(_Settings):
 
     @property
     def fastest(self) -> float:
-        """Metres per second that are `air.lattice_speed`; 1 where nothing moves."""
+        """Speed in metres per second that equals `air.lattice_speed`; 1 if nothing moves."""
         if self.air.speed is not None:
             return self.air.speed
         speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
@@ -420,18 +418,18 @@ class Scene(_Settings):
 
     @property
     def _speed_of_one_step(self) -> float:
-        """Metres per second that one step a frame allows."""
+        """Greatest speed in metres per second with one step per frame."""
         return self.rate * self.air.lattice_speed * self.grid.cell
 
     @property
     def steps(self) -> int:
-        """Steps of the air per frame: as few as keep `fastest` within `air.lattice_speed`, in whole substeps."""
+        """Steps of the air per frame: the fewest for `fastest`, in multiples of the substeps."""
         least = self.fastest / self._speed_of_one_step
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
     @property
     def step(self) -> float:
-        """Seconds of a step."""
+        """Duration of a step in seconds."""
         return 1.0 / (self.rate * self.steps)
 
 
@@ -439,7 +437,7 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
     """Loads `configs/smoke-NAME.yaml`, or any YAML file.
 
     Raises:
-        WlmError: Unknown scene, unreadable file, or a wrong setting.
+        WlmError: The scene is unknown, the file cannot be read, or a setting is wrong.
     """
     name = os.fspath(name)
     return load_settings(Scene, name if name.endswith((".yaml", ".yml")) else profile_path("smoke", name))
@@ -448,21 +446,21 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
 def make_camera(
     settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
 ) -> Camera:
-    """Places a camera before a box.
+    """Places a camera in front of a box.
 
     Args:
         settings: The camera.
-        origin, size: The box's corner and edges in the world, [3].
+        origin, size: Corner and edges of the box in the world, [3].
     """
     values = settings.model_dump()
     return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 
 
 def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surfaces of obstacles as triangles, for their pictures and shadows.
+    """Returns the surfaces of obstacles as triangles, for their pictures and shadows.
 
     Returns:
-        Corners float32 [V, 3] in the world, triangles int32 [F, 3], and each one's obstacle by its number, int32 [F].
+        Corners float32 [V, 3] in the world, triangles int32 [F, 3], index of each triangle's obstacle int32 [F].
     """
     corners, triangles, owner = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     first = 0

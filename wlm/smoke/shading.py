@@ -1,7 +1,4 @@
-"""A scene's light on smoke: directional lights, the colour of a glow, and the shadows of obstacles.
-
-All in linear light. `SixWay.shade` puts them together.
-"""
+"""Lights, colours of emission, and shadows of obstacles on smoke, all in linear light; `SixWay.shade` uses them."""
 
 import math
 from collections.abc import Sequence
@@ -27,9 +24,9 @@ class Light:
     """A directional light.
 
     Attributes:
-        toward: The direction to the light in the world, of any length but 0.
-        irradiance: R, G, B on a surface that faces it; not negative.
-        visibility: float tensor [H, W], the share of the light that reaches the smoke at a pixel, or None: all of it.
+        toward: Direction to the light in the world, of any length except 0.
+        irradiance: R, G, B on a surface that faces the light; not negative.
+        visibility: float tensor [H, W], share of the light that reaches the smoke at a pixel; None: all of it.
     """
 
     toward: tuple[float, float, float]
@@ -39,10 +36,10 @@ class Light:
 
 @dataclass(frozen=True)
 class Ramp:
-    """The colour of a glow: linear between its stops, the end stops' colour beyond them.
+    """Colour of emission, linear between stops and constant beyond them.
 
     Attributes:
-        stops: Emission, rising.
+        stops: Values of emission, increasing.
         colours: R, G, B of each stop, not negative.
     """
 
@@ -56,7 +53,7 @@ class Ramp:
             raise ValueError(f"ramp: expected finite colours and rising stops, got {self.stops}")
 
     def __call__(self, emission: torch.Tensor) -> torch.Tensor:
-        """Colours [..., 3] of emissions of any shape."""
+        """Returns colours [..., 3] of emissions of any shape."""
         stops = torch.tensor(self.stops, dtype=emission.dtype, device=emission.device)
         colours = torch.tensor(self.colours, dtype=emission.dtype, device=emission.device)
         after = torch.searchsorted(stops, emission.contiguous()).clamp(1, len(self.stops) - 1)
@@ -74,26 +71,25 @@ def obstacle_visibility(
     resolution: int = SHADOW_MAP,
     bias: float | None = None,
 ) -> torch.Tensor:
-    """The share of a light that obstacles leave to the smoke's surface, by a shadow map (section 4.5).
+    """Computes the share of a light that reaches the smoke's surface past obstacles, by a shadow map (section 4.5).
 
-    The map is drawn from the light over the obstacles. Each pixel is looked up at the depth of its smoke's surface
-    alone, so that a shadow through the depth of the smoke falls on its surface whole or not at all.
+    The map is rendered from the light. Each pixel is looked up only at the depth of its smoke's surface.
 
     Args:
-        depth: float32 [H, W], distance along the ray to the smoke's surface, as a guiding map has it; 0: none.
-        camera: That of the depths.
-        toward: [3], the direction to the light in the world, of any length but 0.
-        vertices: float32 [V, 3], the obstacles' corners in the world.
+        depth: float32 [H, W], distance along the ray to the smoke's surface; 0: none.
+        camera: Camera of the depths.
+        toward: [3], direction to the light in the world, of any length except 0.
+        vertices: float32 [V, 3], corners of the obstacles in the world.
         triangles: int32 or int64 [F, 3], rows of the vertices.
         resolution: Texels along an edge of the shadow map, at least 8.
-        bias: How much nearer to the light, in the world's unit, an obstacle must be to keep it off, at least 0; None:
-            1.5 texels.
+        bias: Distance in the world's unit by which an obstacle must be nearer to the light to shadow it, at least 0;
+            None: 1.5 texels.
 
     Returns:
-        float32 [H, W] in [0, 1], mixed between the four texels around a point; 1 where there is no smoke.
+        float32 [H, W] in [0, 1], bilinear between four texels; 1 where there is no smoke.
 
     Raises:
-        ValueError: A shape doesn't fit, the direction has no length, or the map is too small.
+        ValueError: A shape is wrong, the direction has no length, or the map is too small.
     """
     size = (camera.height, camera.width)
     if depth.shape != size:
@@ -114,7 +110,7 @@ def obstacle_visibility(
 
 
 def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
-    """Rows of axes of which the third points to a light, 9 numbers: any turn about its direction will do."""
+    """Returns the rows of three axes, 9 numbers, of which the third points to a light."""
     return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
 
 
@@ -128,12 +124,12 @@ def cast_shadow(
     resolution: int = SHADOW_MAP,
     bias: float | None = None,
 ) -> None:
-    """`obstacle_visibility` of arrays that stay in place, unchecked; a graph may capture it.
+    """Runs `obstacle_visibility` on arrays that stay in place, without checks; a CUDA graph can capture it.
 
     Args:
         points, triangles: vec3 [V] and int32 [F, 3], at least one.
-        axes: From `light_axes`.
-        view: From `Camera.in_world`.
+        axes: Result of `light_axes`.
+        view: Result of `Camera.in_world`.
         depth, out: float [H, W].
         resolution, bias: As for `obstacle_visibility`.
     """

@@ -1,4 +1,4 @@
-"""The simulation of a scene: its solver, and a folder with a volume for each of its frames."""
+"""Simulation of a scene: its solver, and a folder with a volume per frame."""
 
 import math
 import time
@@ -22,22 +22,22 @@ from wlm.smoke.scene import Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
-# Cells by which smoke at an inlet reaches into the box, so that the air carries on smoke of full density.
+# Depth in cells of the smoke at an inlet, so that the air carries smoke of full density into the box.
 _INLET_DEPTH = 1.0
-# Steps in which inlets open, per cell of the longest axis: a sudden start is a sound wave.
+# Steps in which inlets open, per cell of the longest axis: a sudden start causes a sound wave.
 _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds a scene's solver.
+    """Builds the solver of a scene.
 
     Args:
         scene: The scene.
-        device: As `wlm.interop.check_device` returns it.
+        device: Result of `wlm.interop.check_device`.
 
     Raises:
-        WlmError: The memory isn't enough for air and smoke, before any is allocated, or an inlet is too fast for the
-            time step.
+        WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
+            too fast for the time step.
     """
     smoke = scene.smoke
     _require_memory(scene, device)
@@ -58,12 +58,12 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             bricks=smoke.bricks,
         )
     except ValueError as error:
-        # Settings each within its range, and too small or too large together.
+        # Each setting is within its range, but together they are too small or too large.
         raise WlmError(f"{scene.name}: {error}") from error
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
-    """The solver's smoke, in the solver's memory: valid until the next step."""
+    """Returns the solver's smoke, in the solver's memory: valid until the next step."""
     smoke, grid = scene.smoke, scene.grid
     return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
 
@@ -78,30 +78,29 @@ def simulate(
     velocity: bool = False,
     progress: OnProgress | None = None,
 ) -> int:
-    """Runs a scene and writes its frames.
+    """Simulates a scene and writes its frames.
 
-    The state is saved in the folder every `checkpoint_every` seconds, within a frame too, and when `progress` raises
-    KeyboardInterrupt. Going on from it gives the same frames: on the CPU to the last bit, on a GPU as far as its
-    atomic sums come out alike, and with smoke in bricks to their threshold.
+    The state is saved in the folder every `checkpoint_every` seconds, also within a frame, and when `progress` raises
+    KeyboardInterrupt. A resumed simulation gives the same frames: on the CPU to the bit, on a GPU up to the order of
+    atomic sums, and with smoke in bricks up to their threshold.
 
     Args:
-        frames: The folder, as `wlm.smoke.data.open_frames` prepares it.
-        solver: From `make_solver`, not yet stepped; None: it is made here, on `device`. Whoever makes it before the
-            folder is opened loses no earlier frames if it can't be made.
-        device: As `wlm.interop.check_device` returns it.
-        resume: Whether to go on from a state that was saved there, if there is one. A state past the last frame asked
-            for stays there.
+        frames: The folder, prepared by `wlm.smoke.data.open_frames`.
+        solver: Solver from `make_solver`, before its first step; None: it is made here, on `device`. Making it before
+            the folder is opened keeps earlier frames if it fails.
+        device: Result of `wlm.interop.check_device`.
+        resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
         checkpoint_every: Seconds between two saves; 0: after every step.
-        velocity: Whether to keep the air's velocity beside each frame, as motion vectors need it.
-        progress: Called after each frame, with the figures `smoke`, the density's integral over the box, and
-            `frame s`, the seconds that the frame took; and about twice a second within a frame, without figures.
+        velocity: Whether to write the air's velocity beside each frame, as motion vectors need it.
+        progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
+            `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
     Returns:
-        The number of the first frame that was simulated; one more than there are if all were there.
+        Number of the first frame that was simulated; one more than the last frame if all existed.
 
     Raises:
-        WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or can't be written; a
-            frame before the saved state is missing; another process is writing the folder.
+        WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or cannot be written; a
+            frame before the saved state is missing; or another process is writing the folder.
     """
     with locked(frames.path):
         return _simulate(frames, solver, device, resume, checkpoint_every, velocity, progress)
@@ -116,7 +115,7 @@ def _simulate(
     velocity: bool,
     progress: OnProgress | None,
 ) -> int:
-    """`simulate`, once the folder is locked."""
+    """Runs `simulate` in the locked folder."""
     scene, checkpoint = frames.scene, frames.path / CHECKPOINT
     missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
     saved = resume and checkpoint.exists()
@@ -145,7 +144,7 @@ def _simulate(
             if last:
                 solver.check()
                 volume = volume_of(scene, solver)
-                # Before the state: one whose frame is missing would be resumed past it.
+                # Written before the state: a state without its frame could not be resumed.
                 if velocity:
                     write_velocity(velocity_file(frames.path, frame), solver.velocity, scene.grid.cell * scene.steps)
                 save_volume(frames.file(frame), volume, bricks=True)
@@ -167,7 +166,7 @@ def _simulate(
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
-    """Takes a solver from the end of the frame before to that of a frame; frames count from 1.
+    """Advances a solver from the end of the frame before to the end of a frame; frames count from 1.
 
     Raises:
         WlmError: An obstacle is too fast.
@@ -178,13 +177,13 @@ def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
 
 
 def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
-    """One step of the smoke, which begins after some frames, with the sources that are on then."""
+    """Does one step of the smoke, which begins at a time in frames, with the sources that are active then."""
     solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
     solver.step()
 
 
 def _require_memory(scene: Scene, device: str) -> None:
-    """Checks, before either is allocated, that air and smoke fit into the memory together."""
+    """Checks, before the allocation, that air and smoke fit into the memory together."""
     grid, smoke = scene.grid, scene.smoke
     voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
@@ -196,7 +195,7 @@ def _require_memory(scene: Scene, device: str) -> None:
             f"{scene.name}: {air} cells of air and {dense} of smoke need {needed / 2**30:.1f} GiB on {device}: expected"
             f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
         )
-    # A grid may also have more voxels than can be numbered.
+    # A grid may also have more voxels than can be indexed.
     fluid.require_memory(grid.shape, voxel, warp_device)
 
 
@@ -235,12 +234,12 @@ def _set_faces(lattice: Lattice, scene: Scene, domain: Domain) -> None:
         elif kind in ("wall", "slip"):
             lattice.set_wall(name, slip=kind == "slip")
         elif kind == "open":
-            # With inlets, as much leaves as comes in; without, the outside is at rest.
+            # With inlets, the outflow equals the inflow; without, the outside is at rest.
             lattice.set_outlet(name, density=None if scene.inlets else 1.0)
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
-    """Opens a face's inlets; where two overlap the later one counts."""
+    """Sets the inlets of a face; where two overlap the later one applies."""
     grid = scene.grid
     across = [axis for axis in range(3) if axis != FACES.index(name) // 2]
     places = [grid.origin[axis] + grid.cell * (np.arange(grid.cells[axis]) + 0.5) for axis in across]
@@ -258,7 +257,8 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
 
 
 def _sources(scene: Scene) -> list[_Timed]:
-    """The solver's sources, in cells, at inlets and within the box; and whether each is on at a time."""
+    """Returns the solver's sources at inlets and within the box, in cells, each with a function of time: whether it is
+    active."""
     sources: list[_Timed] = []
 
     def add(

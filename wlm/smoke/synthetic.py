@@ -1,4 +1,4 @@
-"""Smoke made of noise, where none from a simulation or a file is at hand: for demos and measurements."""
+"""Procedural smoke for demos, benchmarks and the training of `transport.orders`."""
 
 import numpy as np
 import torch
@@ -8,8 +8,8 @@ from wlm.fluid.volume import DensityVolume, from_array
 
 _BILLOWS = 160
 _MOST = 1.5  # density
-_REACH = 1.5  # of a billow over its radius
-_HOT = 0.3  # height up to which it is
+_REACH = 1.5  # extent of a billow relative to its radius
+_HOT = 0.3  # height up to which a plume is hot
 _OCTAVES = range(1, 6)
 _SHAPES = ("ball", "column", "shell", "fog")
 
@@ -17,17 +17,17 @@ _SHAPES = ("ball", "column", "shell", "fog")
 def make_plume(
     n: int = 48, *, seed: int = 1, hot: bool = True, extinction: float = 1.0, device: str = "cpu"
 ) -> DensityVolume:
-    """A leaning column of billows that widens as it rises, in a box of edge 1.
+    """Makes a leaning column of billows that widens with height, in a box of edge 1.
 
     Args:
         n: Voxels along an edge of the box, at least 1.
-        seed: Of the billows.
-        hot: Whether it has a temperature, which is highest at its foot.
-        extinction: Over the box's edge, of density 1.
+        seed: Seed of the billows.
+        hot: Whether the smoke has a temperature, which is highest at the bottom.
+        extinction: Optical depth of density 1 across the box.
         device: "cpu" or "cuda:N".
 
     Raises:
-        WlmError: No such device.
+        WlmError: The device does not exist.
     """
     random = np.random.default_rng(seed)
     axis = (np.arange(n) + 0.5) / n
@@ -37,7 +37,7 @@ def make_plume(
         wide = 0.04 + 0.16 * height
         at = np.array([0.44 + 0.14 * height, height, 0.5]) + wide * random.normal(0, 0.6, 3) * [1, 0.3, 1]
         radius = wide * random.uniform(0.25, 0.6)
-        # The voxels that it reaches.
+        # The voxels within its reach.
         near = [np.flatnonzero(np.abs(axis - centre) <= _REACH * radius) for centre in at]
         x, y, z = ((axis[voxels] - centre) ** 2 for voxels, centre in zip(near, at, strict=True))
         distance = np.sqrt(x[:, None, None] + y[:, None] + z)
@@ -48,14 +48,14 @@ def make_plume(
 
 
 def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device: str = "cpu") -> DensityVolume:
-    """A ball, a column, a shell or fog that fills the box, turned and stretched, whose edge octaves of noise ravel.
+    """Makes a ball, a column, a shell or fog, rotated and stretched, with edges perturbed by octaves of noise.
 
     Args:
         n, extinction, device: As for `make_plume`.
-        seed: Of the shape, its softness, and the noise.
+        seed: Seed of the shape, its softness, and the noise.
 
     Raises:
-        WlmError: No such device.
+        WlmError: The device does not exist.
     """
     random = np.random.default_rng(seed)
     shape = _SHAPES[int(random.integers(len(_SHAPES)))]

@@ -1,4 +1,4 @@
-"""Pictures of a mesh under its lightmap: the original, decoded ones, and their errors."""
+"""Pictures of a scene under its lightmaps: the original, the decoded ones, and their errors."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import Sampler
-from wlm.atlas.views import corner_weights, visible_uv
+from wlm.atlas.views import Points, points_at, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.ops import raster
@@ -17,46 +17,55 @@ from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
 
 
-def original(mesh: LightmappedMesh, device: str = "cpu") -> Sampler:
-    """The input lightmap as a decoder: it is read bilinearly, with the gaps between charts filled."""
-    image = torch.from_numpy(mesh.filled).to(check_device(device))
+def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
+    """The lightmaps themselves as a decoder: read bilinearly, their gaps filled."""
+    device = check_device(device)
 
-    def sample(uv: torch.Tensor, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-        return raster.texture(image, uv)
+    def sample(points: Points, state: int = 0) -> torch.Tensor:
+        light = torch.empty((len(points), 3), dtype=torch.float32, device=points.uv.device)
+        for number in torch.unique(points.sheet).tolist():
+            at = points.sheet == number
+            image = torch.from_numpy(scene.sheets[number].lightmaps[state]).to(device)
+            light[at] = raster.texture(image, points.uv[at].contiguous())
+        return light
 
     return sample
 
 
 def draw(
-    mesh: LightmappedMesh, samplers: Mapping[str, Sampler], view: View, resolution: int = 512, device: str = "cpu"
+    scene: LightmappedScene,
+    samplers: Mapping[str, Sampler],
+    view: View,
+    resolution: int = 512,
+    device: str = "cpu",
+    state: int = 0,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draws a mesh from one camera, as `wlm.atlas.evaluation` does.
+    """Draws a scene from one camera, as `wlm.atlas.evaluation` does.
 
     Args:
-        mesh: The mesh.
+        scene: The scene.
         samplers: Decoders by name.
         view: The camera.
         resolution: Pixels along a side.
-        device: "cpu" or "cuda:N", the decoders' device.
+        device: "cpu" or "cuda:N", the decoders'.
+        state: The number of the state.
 
     Returns:
-        For each decoder float32 [resolution, resolution, 3], linear light, 0 outside the mesh; and bool [resolution,
-        resolution], true where the mesh is visible.
+        For each decoder float32 [resolution, resolution, 3], linear light, 0 where no sheet is visible; and bool
+        [resolution, resolution], true where one is.
     """
-    visible, barycentric, uv = next(iter(visible_uv(mesh, [view], resolution, device)))
-    hit = visible >= 0
-    weight = corner_weights(barycentric[hit])
+    hit, points = points_at(scene, *next(iter(visible_uv(scene, [view], resolution, device))))
     pictures = {}
     for name, sampler in samplers.items():
-        picture = torch.zeros((*visible.shape, 3), dtype=torch.float32, device=visible.device)
-        picture[hit] = sampler(uv[hit], visible[hit], weight).float()
+        picture = torch.zeros((*hit.shape, 3), dtype=torch.float32, device=hit.device)
+        picture[hit] = sampler(points, state).float()
         pictures[name] = picture.cpu().numpy()
     return pictures, hit.cpu().numpy()
 
 
 def comparison(
     path: str | os.PathLike[str],
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     samplers: Mapping[str, Sampler],
     views: Sequence[View],
     *,
@@ -71,7 +80,7 @@ def comparison(
 
     Args:
         path: The PNG to write; its folder must exist.
-        mesh: The mesh with its original lightmap.
+        scene: The scene with its original lightmaps.
         samplers: Decoders by name, at least one; none is called "original".
         views: The cameras, at least one.
         resolution: Pixels along a side of a view before it is cropped.
@@ -86,13 +95,13 @@ def comparison(
         raise ValueError("expected at least one decoder and one view")
     drawn = {}
     for number, view in enumerate(views, 1):
-        pictures, hit = draw(mesh, {"original": original(mesh, device), **samplers}, view, resolution, device)
+        pictures, hit = draw(scene, {"original": original(scene, device), **samplers}, view, resolution, device)
         if hit.any():
             lines = hit.any(axis=1), hit.any(axis=0)
             window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
             drawn[f"view {number}"] = {name: picture[window] for name, picture in pictures.items()}, hit[window]
     if not drawn:
-        raise WlmError(f"{mesh.name}: cannot draw it: it is visible in no view")
+        raise WlmError(f"{scene.name}: cannot draw it: no view shows it")
     white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn.values()]))
     rows = {}
     for label, (pictures, hit) in drawn.items():

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.atlas.data import LightmappedMesh
-from wlm.atlas.exporter import Output
-from wlm.atlas.exporter import geometry as mesh_of
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import AtlasModel, unpack_entries
 from wlm.formats.geometry import Geometry
 from wlm.texels import exposure, fill_gaps
@@ -16,12 +14,12 @@ from wlm.view.surface import SurfaceScene, compared, flat_geometry
 
 
 def atlas_scene(
-    output: Output, original: np.ndarray | None, *, title: str, flat: bool = False, up: int = 1
+    model: AtlasModel, original: np.ndarray | None, *, title: str, flat: bool = False, up: int = 1
 ) -> SurfaceScene:
     """Makes the scene of a compression, with the lightmap that was compressed beside it.
 
     Args:
-        output: The folder's content.
+        model: The model; its first sheet is shown in the first state.
         original: [H, W, 3], the lightmap, of the model's size; None: not shown.
         title: Of the window.
         flat: Whether the lightmap is shown unwrapped, not on its mesh.
@@ -30,23 +28,23 @@ def atlas_scene(
     Raises:
         WlmError: The folder's mesh is damaged.
     """
-    model, mesh = output.model, mesh_of(output)
-    lights = {"decoded": fill_gaps(model.decoder().lightmap(mesh), mesh.mask)}
+    mask = model.scene.sheets[0].mask
+    lights = {"decoded": fill_gaps(model.decoder().lightmap(), mask)}
     if original is not None:
-        lights["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), mesh.mask)
+        lights["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), mask)
     views = ("light", "tiles") if model.method == "tiles" else ("light",)
     size = f"textures {100 * (1.0 - model.compression_ratio):.1f}% of half floats"
-    return _scene(title, mesh, lights, flat, up, views, model, size)
+    return _scene(title, model.scene, lights, flat, up, views, model, size)
 
 
-def input_scene(mesh: LightmappedMesh, *, title: str, flat: bool = False, up: int = 1) -> SurfaceScene:
+def input_scene(scene: LightmappedScene, *, title: str, flat: bool = False, up: int = 1) -> SurfaceScene:
     """Makes the scene of a mesh under its lightmap; arguments as for `atlas_scene`."""
-    return _scene(title, mesh, {"original": mesh.filled}, flat, up, ("light",), None, "input")
+    return _scene(title, scene, {"original": scene.sheets[0].lightmap}, flat, up, ("light",), None, "input")
 
 
 def _scene(
     title: str,
-    mesh: LightmappedMesh,
+    scene: LightmappedScene,
     lights: dict[str, np.ndarray],
     flat: bool,
     up: int,
@@ -54,6 +52,7 @@ def _scene(
     model: AtlasModel | None,
     note: str,
 ) -> SurfaceScene:
+    mesh = scene.sheets[0]
     height, width = mesh.mask.shape
     shape = Geometry(mesh.position.astype(np.float32), mesh.triangle[mesh.active].astype(np.uint32), mesh.uv)
     return _AtlasScene(

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from wlm import atlas, lightmap, probe
-from wlm.atlas.exporter import MODEL_FILE, geometry, read_folder, read_inputs
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact
+from wlm.formats.light import read_light
 from wlm.metrics import PSNR_CAP_DB, psnr
 from wlm.system import Meter, Model, OnProgress, load
+from wlm.texels import fill_gaps
 from wlm.view.display import Display, white_of
 from wlm.view.document import Document
 
@@ -23,7 +24,6 @@ _Path = str | os.PathLike[str]
 
 _GAIN = 8.0  # of differences in pictures
 _SIDE = 300  # of a picture, in the page's pixels
-_VIEWS, _RESOLUTION = 50, 512  # of an atlas' score
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +98,8 @@ def compare(
     """Compares two models of one input.
 
     Args:
-        first, second: Two `.wlm` of lightmaps or of probes, or two folders of `wlm atlas compress`.
-        original: What was compressed: a lightmap set, a probe file, or of folders the lightmap; None: no scores.
+        first, second: Two `.wlm` of lightmaps, probes or atlases.
+        original: What was compressed: a lightmap set, a probe file, or the lightmap of an atlas; None: no scores.
         key: Of a probe file with several arrays, the one that was compressed.
         device: Where both are decoded.
         progress: Called about twice a second.
@@ -108,8 +108,6 @@ def compare(
         WlmError: A file can't be read, they are of different systems or sizes, or nothing of theirs can be compared.
     """
     paths = Path(first), Path(second)
-    if all(path.is_dir() for path in paths):
-        return _atlases(paths, original, device, progress)
     models = load(paths[0]), load(paths[1])
     systems = [model.SYSTEM for model in models]
     if systems[0] != systems[1]:
@@ -119,7 +117,7 @@ def compare(
     if systems[0] == "probe":
         return _probes(paths, models, original, key, device, progress)
     if systems[0] == "atlas":
-        raise WlmError(f"{paths[0]}: expected the folder that wlm atlas compress wrote, which has the mesh")
+        return _atlases(paths, models, original, device, progress)
     raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")
 
 
@@ -130,11 +128,9 @@ def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
     names = list(dict.fromkeys([*profiles[0], *profiles[1]]))
     settings = {name: tuple(profile.get(name) for profile in profiles) for name in names}
     sizes = {name: tuple(each.get(name, 0) for each in parts) for name in dict.fromkeys([*parts[0], *parts[1]])}
-    # Of an atlas the folder has the name.
-    shown = [path.parent if path.name == MODEL_FILE else path for path in paths]
-    alike = shown[0].resolve().name == shown[1].resolve().name
+    alike = paths[0].resolve().name == paths[1].resolve().name
     return {
-        "names": tuple(str(path) if alike else path.resolve().name for path in shown),
+        "names": tuple(str(path) if alike else path.resolve().name for path in paths),
         "system": models[0].SYSTEM,
         "bytes": tuple(path.stat().st_size for path in paths),
         "parts": dict(sorted(sizes.items(), key=lambda part: -max(part[1]))),
@@ -208,24 +204,27 @@ def _probes(
     return Comparison(**_facts(paths, models), apart=psnr(*(each[:, None] for each in values)), scores=scores)
 
 
-def _atlases(paths: Sequence[Path], original: _Path | None, device: str, progress: OnProgress | None) -> Comparison:
-    outputs = [read_folder(path) for path in paths]
-    sizes = [(output.model.width, output.model.height) for output in outputs]
+def _atlases(
+    paths: Sequence[Path], models: Sequence[Any], original: _Path | None, device: str, progress: OnProgress | None
+) -> Comparison:
+    sizes = [tuple(sheet.size for sheet in model.sheets) for model in models]
     if sizes[0] != sizes[1]:
-        raise WlmError(f"{paths[1]}: expected a lightmap of {_size(sizes[0])}, found {_size(sizes[1])}")
-    meshes = [geometry(output) for output in outputs]
-    light = [
-        output.model.decoder(device).lightmap(mesh) * meshes[0].mask[..., None]
-        for output, mesh in zip(outputs, meshes, strict=True)
-    ]
+        raise WlmError(f"{paths[1]}: expected lightmaps of the same sizes as {paths[0]}")
+    scene, decoders = models[0].scene, [model.decoder(device) for model in models]
+    mask = scene.sheets[0].mask[..., None]
+    light = [decoder.lightmap() * mask for decoder in decoders]
     pictures, scores = {"A": light[0], "B": light[1]}, {}
     if original is not None:
-        inputs = [read_inputs(output, lightmap_path=original) for output in outputs]
-        options = {"views": _VIEWS, "resolution": _RESOLUTION, "device": device}
-        reports = [
-            atlas.evaluate(each.model, mesh, **options, progress=_stage(progress, name))
-            for each, mesh, name in zip(outputs, inputs, "AB", strict=True)
-        ]
+        if len(scene.sheets) * len(scene.states) > 1:
+            raise WlmError(f"{original}: expected models of one lightmap; wlm atlas evaluate scores scenes")
+        picture = np.nan_to_num(read_light(original)[0][..., :3].astype(np.float32), posinf=65504.0)
+        if picture.shape[:2] != sizes[0][0]:
+            raise WlmError(
+                f"{original}: expected {_size(sizes[0][0][::-1])} texels, found {_size(picture.shape[1::-1])}"
+            )
+        sheet = replace(scene.sheets[0], lightmaps=fill_gaps(picture, mask[..., 0])[None])
+        samplers = dict(zip("AB", decoders, strict=True))
+        found = atlas.compare(replace(scene, sheets=(sheet,)), samplers, device=device, progress=progress)
         names = {
             "PSNR of views, dB": "psnr",
             "PSNR of texels, dB": "texel_psnr",
@@ -233,11 +232,12 @@ def _atlases(paths: Sequence[Path], original: _Path | None, device: str, progres
             "1 - SSIM": "one_minus_ssim",
             "FLIP": "flip",
         }
-        scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
-        pictures["original"] = inputs[0].lightmap * meshes[0].mask[..., None]
-    facts = _facts([output.folder / MODEL_FILE for output in outputs], [output.model for output in outputs])
-    apart = psnr(*light, meshes[0].mask)
-    return Comparison(**facts, apart=apart, scores=scores, pictures=pictures, where="The lightmap")
+        scores = {title: tuple(getattr(found[each], name) for each in "AB") for title, name in names.items()}
+        pictures["original"] = sheet.lightmap * mask
+    apart = psnr(*light, mask[..., 0])
+    return Comparison(
+        **_facts(paths, models), apart=apart, scores=scores, pictures=pictures, where="The first lightmap"
+    )
 
 
 def _stage(progress: OnProgress | None, name: str) -> OnProgress | None:

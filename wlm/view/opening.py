@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.light import SUFFIXES, read_light
@@ -19,6 +18,7 @@ from wlm.system import OnProgress, load
 from wlm.view.scene import Scene
 
 if TYPE_CHECKING:
+    from wlm.atlas.model import AtlasModel
     from wlm.lightmap.data import SheetFrames
     from wlm.lightmap.model import SheetModel
     from wlm.view.probe_scene import Probes
@@ -101,8 +101,6 @@ class _Request:
     progress: OnProgress | None
 
     def folder(self) -> Scene:
-        if (self.path / REPORT_FILE).is_file():
-            return self.atlas()
         if (self.path / SCENE_FILE).is_file():
             return self.volume(self.path)
         if frames := six_way_files(self.path):
@@ -130,7 +128,7 @@ class _Request:
             position, values, live, _ = probes_of(model, self.original, self.key)
             return self._probes(Probes.of_model(model, position, values, live, self.path.name))
         if model.SYSTEM == "atlas":
-            raise WlmError(f"{self.path}: expected the folder that wlm atlas compress wrote, which has the mesh")
+            return self.atlas(model)
         raise WlmError(f"{self.path}: a network has no picture of its own; expected the lightmaps that it predicts")
 
     def lightmap_set(self) -> Scene:
@@ -152,16 +150,15 @@ class _Request:
 
         return input_scene(load_mesh(self.mesh, self.path), title=self.path.name, flat=self.flat, up=self._up)
 
-    def atlas(self) -> Scene:
-        from wlm.atlas.exporter import read_folder
+    def atlas(self, model: AtlasModel) -> Scene:
         from wlm.view.atlas_scene import atlas_scene
 
         self._refuse("mesh", "key", "walk", "block", "extinction")
-        output, light = read_folder(self.path), None
+        light = None
         if self.original is not None:
             light = read_light(self.original)[0]
-            self._check_size(light.shape[:2], (output.model.height, output.model.width))
-        return atlas_scene(output, light, title=self.path.name, flat=self.flat, up=self._up)
+            self._check_size(light.shape[:2], model.sheets[0].size)
+        return atlas_scene(model, light, title=self.path.name, flat=self.flat, up=self._up)
 
     def probes(self) -> Scene:
         from wlm.probe.data import load as load_probes

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from wlm.atlas.data import LightmappedMesh
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import Report as AtlasReport
 from wlm.atlas.model import AtlasModel
-from wlm.atlas.views import mesh_views
+from wlm.atlas.views import scene_views
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import Report as LightmapReport
@@ -119,13 +119,13 @@ def _worst_tiles(page: Document, model: SheetModel, lightmaps: SheetFrames, repo
 
 
 def atlas_report(
-    path: str | os.PathLike[str], model: AtlasModel, mesh: LightmappedMesh, report: AtlasReport, views: int
+    path: str | os.PathLike[str], model: AtlasModel, scene: LightmappedScene, report: AtlasReport, views: int
 ) -> int:
     """Writes an atlas report: the summary, the worst view, and the lightmap's errors.
 
     Args:
         path: The page, `.html`; its folder must exist.
-        model, mesh, report: As they were given to `wlm.atlas.evaluate` and came from it.
+        model, scene, report: As they were given to `wlm.atlas.evaluate` and came from it.
         views: The cameras that were asked for.
 
     Returns:
@@ -150,15 +150,16 @@ def atlas_report(
         ("saved on disk", _number(100 * report.cr_disk, ".2f", "%")),
         ("views that see the mesh", f"{report.views}"),
     ]
-    warnings = [*mesh.warnings, *([] if report.views else [unseen])]
+    warnings = [*scene.warnings, *([] if report.views else [unseen])]
     page = _begin(model.name, model.profile.name, warnings, rows)
     decoder = model.decoder()
     if report.worst_view >= 0:
-        view = mesh_views(mesh, views)[report.worst_view]
-        drawn, hit = draw(mesh, {"original": original(mesh), "decoded": decoder}, view)
+        view = scene_views(scene, views)[report.worst_view]
+        drawn, hit = draw(scene, {"original": original(scene), "decoded": decoder}, view)
         then = drawn.pop("original")
         _beside(page, f"The worst view, camera {report.worst_view}", "original", then, drawn, hit)
-    _beside(page, "The lightmap", "original", mesh.lightmap, {"decoded": decoder.lightmap(mesh)}, mesh.mask)
+    sheet = scene.sheets[0]
+    _beside(page, "The lightmap", "original", sheet.lightmap, {"decoded": decoder.lightmap()}, sheet.mask)
     return page.write(path)
 
 

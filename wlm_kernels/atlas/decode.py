@@ -1,17 +1,25 @@
-"""Reads a lightmap from tiles: one entry of a table, then one bilinear read of a small texture.
+"""Reads lightmaps from tiles: one entry of a lookup texture, then bilinear reads of a small texture.
 
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
 entry names the rectangle of the texture that holds it, or of a second texture, made of blocks. The rectangle's
-outermost samples lie on the tile's borders.
+outermost samples lie on the tile's borders. `decode` reads the tiles of one lightmap; `decode_shared` reads tiles that
+many sheets and states share, where light is a sum of components, rectangles beside each other, times the state's
+factors.
 
 Read `wlm/atlas/exact.py` first: the same in float64 NumPy.
 """
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 SIDE_BITS = wp.constant(4)
 _SIDE_MASK = wp.constant(15)
 _BLOCK = wp.constant(4)
+_COUNT_BITS = wp.constant(8)
+_COUNT_MASK = wp.constant(255)
+_COARSE_BITS = wp.constant(4)
+_COARSE_MASK = wp.constant(15)
 
 
 @wp.struct
@@ -25,7 +33,7 @@ class Axis:
 
 @wp.func
 def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """Number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN tile 0 and NaN."""
+    """The number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN, tile 0 and NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
@@ -35,7 +43,7 @@ def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 @wp.func
 def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """The two texels that a place in a tile lies between."""
+    """The two texels between which a place in a tile lies."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
     if last >= first_block_code:
@@ -57,7 +65,7 @@ def _bilinear(texels: wp.array2d[wp.vec3h], x: Axis, y: Axis) -> wp.vec3:
     return wp.lerp(top, bottom, y.share)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _decode(
     # in:
     uv: wp.array1d[wp.vec2],
@@ -97,8 +105,113 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
         texels: vec3h [Hp, Wp].
         out: vec3 [N], written.
         blocks: vec3h [Hb, Wb], multiples of 4: the second texture; None: there is none.
-        first_block_code: The least number in the low bits of an entry that means the second texture, in blocks: the
+        first_block_code: The least number in the low bits of an entry that names the second texture, in blocks: the
             first block << 4 | `first_block_code` + number of blocks - 1.
     """
     inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
     wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
+
+
+@wp.func
+def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
+    """Bilinear read of the rectangle that begins some columns to the right."""
+    left = right + x.low
+    next = right + x.high
+    top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
+    bottom = wp.lerp(wp.vec3(pages[page, y.high, left]), wp.vec3(pages[page, y.high, next]), x.share)
+    return wp.lerp(top, bottom, y.share)
+
+
+@wp.func
+def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
+    """`axis_at` for a component of one block."""
+    return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
+
+
+@wp.kernel
+def _decode_shared(
+    # in:
+    uv: wp.array1d[wp.vec2],
+    sheet: wp.array1d[int],
+    sheets: wp.array2d[int],  # [S, 7]
+    size: int,
+    factor: wp.array1d[wp.vec3],  # [C]
+    lut: wp.array3d[wp.uint16],
+    texels: wp.array3d[wp.vec3h],
+    blocks: wp.array3d[wp.vec3h],
+    first_block_code: int,
+    # out:
+    out: wp.array1d[wp.vec3],
+):
+    """One point per thread."""
+    i = wp.tid()
+    u = uv[i]
+    s = sheet[i]
+    down = tile_place(u[1], sheets[s, 0], size, sheets[s, 4])
+    across = tile_place(u[0], sheets[s, 1], size, sheets[s, 5])
+    row = sheets[s, 2] + int(down[0])
+    column = sheets[s, 3] + int(across[0])
+    x = axis_at(lut[row, column, 0], across[1], first_block_code)
+    y = axis_at(lut[row, column, 1], down[1], first_block_code)
+    step = (int(lut[row, column, 0]) & _SIDE_MASK) + 1
+    of_blocks = step > first_block_code
+    rows = int(1)  # rows of blocks
+    if of_blocks:
+        step = _BLOCK * (step - first_block_code)
+        rows = wp.max((int(lut[row, column, 1]) & _SIDE_MASK) + 1 - first_block_code, 1)
+    first = int(0)
+    last = int(1)
+    if lut.shape[2] == 4:
+        first = int(lut[row, column, 2])
+        last = int(lut[row, column, 3])
+    page = last >> (_COUNT_BITS + _COARSE_BITS)
+    coarse = (last >> _COUNT_BITS) & _COARSE_MASK
+    # NaN where there is no place.
+    total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
+    count = last & _COUNT_MASK
+    if count > 0:
+        total += factor[first]
+    whole = count - coarse
+    for k in range(count):
+        right = k * step
+        if k >= whole:
+            # Coarse components are stacked in columns beside the others.
+            right = whole * step + _BLOCK * ((k - whole) / rows)
+            below = _BLOCK * ((k - whole) % rows)
+            x = _in_block(lut[row, column, 0], across[1], first_block_code)
+            y = _in_block(lut[row, column, 1], down[1], first_block_code)
+            y.low += below
+            y.high += below
+        light = wp.vec3(0.0, 0.0, 0.0)
+        if of_blocks:
+            light = _bilinear_at(blocks, page, right, x, y)
+        else:
+            light = _bilinear_at(texels, page, right, x, y)
+        total += wp.cw_mul(factor[first + 1 + k], light)
+    # Factors have any sign.
+    for c in range(3):
+        if total[c] < 0.0:
+            total[c] = 0.0
+    out[i] = total
+
+
+def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
+    """Reads light at points of shared tiles.
+
+    Args:
+        uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
+        sheet: int [N], the row of each point's sheet or level in `sheets`.
+        sheets: int [S, 7]: rows and columns of texels; first row and column in the lookup texture; rows and columns of
+            tiles; one number that isn't read.
+        size: B, texels along a tile.
+        factor: vec3 [C], a constant of each mixture and then one factor of each component.
+        lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
+            - 1; number of its mixture's constant; page << 12 | number of coarse components << 8 | number of components.
+            Or the first two numbers alone, [ty, tx, 2]: one component and one page.
+        texels: vec3h [pages, Hp, Wp]; the components of a tile follow each other along a row.
+        blocks: vec3h [pages, Hb, Wb], the second texture, in blocks of 4 x 4 texels.
+        first_block_code: As for `decode`; 16: no entry names the second texture.
+        out: vec3 [N], written.
+    """
+    inputs = [uv, sheet, sheets, size, factor, lut, texels, blocks, first_block_code]
+    wp.launch(_decode_shared, uv.shape, inputs=inputs, outputs=[out], device=uv.device)

@@ -5,27 +5,28 @@ Read `tests/reference/advection.py` first: the same step in float64 NumPy, cell 
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
   rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. A midpoint within `REACH` of
-  the eight velocities around x is extrapolated from these.
+  the eight velocities around x is extrapolated from them.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
-  rho) / 2, clamped to the eight values that A interpolates. Second order where smooth.
+  rho) / 2, clamped to the eight values that A interpolates. Second order where the field is smooth.
 
-Neither conserves mass.
+Neither scheme conserves mass.
 
-Positions are in fine cells, centres at half integers; fields are flat, [X, Y, Z] with z fastest. Velocities are coarse
-cells a step at the centres of coarse cells, trilinear between them and constant beyond the outermost. Stated behaviour:
+Positions are in fine cells, centres at half integers; fields are flat, [X, Y, Z] with z fastest. Velocities are in
+coarse cells per step at the centres of coarse cells, trilinear between them and constant beyond the outermost centres.
+Special cases:
 
 ===============================  =====================================================================
-a trace that leaves the domain   at an open face: clean air comes in, 0; at a closed one: held at it
-a trace that ends in a solid     cut where it first meets it, by bisection: to within 1/64 of its length
-a read beside a solid            solid cells don't count, the other weights are scaled up
+a trace that leaves the domain   through an open face: 0, clean air; at a closed face: clamped to it
+a trace that ends in a solid     cut where it enters the solid, by bisection to 1/64 of its length
+a read beside a solid            solid cells are excluded, the other weights are scaled up
 a cell in a solid                0
 MacCormack with an end beside a  semi-Lagrangian there
 solid or beyond an open face
-a velocity that isn't a number   reads some cell of the grid, never beyond it
-more than half floats hold       65504
+a velocity that is not a number  reads some cell of the grid, never outside it
+more than half floats can hold   65504
 ===============================  =====================================================================
 
-A trace shorter than a coarse cell can't jump a wall. None of it has a gradient.
+A trace shorter than a coarse cell cannot jump over a wall. There are no gradients.
 """
 
 import functools
@@ -62,11 +63,11 @@ from wlm_kernels.fluid.advection_places import (
 )
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
-# Loops over eight cells are for places beside solids: unrolled they would take the registers of all others.
+# Loops over eight cells run only beside solids; unrolled they would use registers in all other cells too.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 
-# Threads of a block, and blocks that share a multiprocessor: a kernel that takes 110 registers otherwise makes room for
-# more threads, and spills where it rarely goes; fewer blocks are slower.
+# Threads per block, and blocks per multiprocessor: a kernel that would use 110 registers then allows more threads, and
+# spills registers in rare branches; fewer blocks are slower.
 _BOUNDS = (256, 4)
 
 STORAGES = {"float32": wp.float32, "float16": wp.float16}
@@ -77,7 +78,7 @@ _BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // BRICK_RUN)
 
 @functools.cache
 def fields_struct(stored: type) -> Any:
-    """Builds (once) the struct by which kernels take fields of `wp.float32` or `wp.float16`."""
+    """Builds (once) the struct in which kernels take fields of `wp.float32` or `wp.float16`."""
 
     @wp.struct
     class FieldArrays:
@@ -89,14 +90,14 @@ def fields_struct(stored: type) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """What is carried: flat arrays [cells], both float or both half; the temperature is [0] where there is none."""
+    """Advected fields: flat arrays [cells], both float or both half; the temperature may be empty, [0]."""
 
     density: wp.array
     temperature: wp.array
 
     @functools.cached_property
     def arrays(self) -> Any:
-        """The same as kernels take it."""
+        """The fields as kernels take them."""
         struct = fields_struct(self.density.dtype)()
         struct.density, struct.temperature = self.density, self.temperature
         return struct
@@ -104,16 +105,16 @@ class Fields:
 
 @functools.cache
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
-    """Builds (once) a kernel over runs of `RUN` cells along x, with bricks over workers times a brick's runs.
+    """Builds (once) a kernel over runs of `RUN` cells along x; with bricks, over the workers times the runs of a brick.
 
-    Without solids it is half the code, and without temperatures it uses fewer registers.
+    Without solids the code is half as long, and without temperatures it uses fewer registers.
 
     Args:
         correcting: Whether it is the second half of a MacCormack step; else it is a semi-Lagrangian step.
         stored: `wp.float32` or `wp.float16`.
         in_bricks: Whether only listed bricks are computed.
         solids: Whether there are solid cells.
-        hot: Whether there are temperatures.
+        hot: Whether there is a temperature.
     """
     run = BRICK_RUN if in_bricks else RUN
     fields_type = fields_struct(stored)
@@ -124,7 +125,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             return stored(wp.min(value, _LARGEST_HALF))
         return stored(value)
 
-    # By Warp's strides, 64 bits wide each, the addresses would be a third of the work.
+    # Addresses from Warp's 64-bit strides would take a third of the time.
     @wp.func_native("return field.data[i];")
     def peek(field: wp.array1d[stored], i: int) -> stored: ...
 
@@ -150,7 +151,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        """The same at a point beside a solid: of the cells that aren't solid, their weights scaled up."""
+        """`interpolate` beside a solid: solid cells are excluded, the other weights are scaled up."""
         at = stencil(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
@@ -160,12 +161,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 w = stencil_weight(at, k)
                 total += w * value_at(field, index_of(box.n, cell))
                 weight += w
-        # Where all eight cells are solid it is 0.
+        # 0 if all eight cells are solid.
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
     def limited(field: wp.array1d[stored], at: FlatStencil, value: float) -> float:
-        """A value clamped to those that `interpolate` reads."""
+        """A value clamped to the range of the values that `interpolate` reads."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -190,8 +191,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         dt: float,
         wall: wp.uint8,
     ):
-        """Where a trace from x ends in the domain, whether it left through an open face, and whether the end is beside
-        a solid; `wall` is the mark of the cell that it starts in."""
+        """Returns the end of a trace from x within the domain, whether it left through an open face, and whether the
+        end is beside a solid; `wall` is the mark of the cell in which it starts."""
         end = trace_back(box, u, around, f, x, v, dt)
         p = wp.vec3(end)
         left = bool(False)
@@ -200,7 +201,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             p = into_domain(box, end)
             left = beyond_open_face(box, end)
         if wp.static(solids):
-            # Within half a coarse cell of a start with no solid beside it, a read meets none either.
+            # Within half a coarse cell of a start without a solid beside it, a read meets no solid either.
             reach = 0.5 * float(box.refinement)
             away = end - x
             short = wp.abs(away[0]) <= reach and wp.abs(away[1]) <= reach and wp.abs(away[2]) <= reach
@@ -215,7 +216,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
-        """The first cell of a run: of the whole domain, or of the k-th listed brick."""
+        """The first cell of run i of the whole domain, or of the k-th listed brick."""
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
@@ -340,7 +341,7 @@ def _launch(
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
     threads = bricks.workers * int(_BRICK_RUNS) or -(-box.n[0] // RUN) * box.n[1] * box.n[2]
-    # A semi-Lagrangian step takes the prediction and doesn't read it.
+    # A semi-Lagrangian step does not read the prediction.
     inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
     wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)
 
@@ -355,17 +356,17 @@ def advect(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
 ) -> None:
-    """A semi-Lagrangian step, or the first half of a MacCormack step.
+    """Does a semi-Lagrangian step, or the first half of a MacCormack step.
 
     Args:
         box: The domain, see `advection_places.make_box`.
-        velocity: vec3 [coarse cells], cells a step.
-        walls: uint8 [coarse cells] as `advection_places.mark_walls` makes it, or [0] without solids.
-        fields: What is carried.
-        out: Other arrays of the same shapes and types, set.
-        dt: Steps.
+        velocity: vec3 [coarse cells], cells per step.
+        walls: uint8 [coarse cells] from `advection_places.mark_walls`, or [0] without solids.
+        fields: The fields.
+        out: Other arrays of the same shapes and types, written.
+        dt: Number of steps.
         decay: Factors of density and temperature, at most 1; (1, 1) in the first half of a MacCormack step.
-        bricks: The bricks to compute, listed already.
+        bricks: The bricks to compute, listed by `relist`.
     """
     _launch(box, velocity, walls, fields, None, out, dt, decay, bricks)
 
@@ -381,5 +382,5 @@ def correct(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
 ) -> None:
-    """The second half of a MacCormack step; `predicted` is the `out` of `advect`, and this `out` is a third."""
+    """Does the second half of a MacCormack step; `predicted` is the result of `advect`, `out` a third set of arrays."""
     _launch(box, velocity, walls, fields, predicted, out, dt, decay, bricks)

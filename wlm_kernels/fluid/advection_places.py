@@ -1,14 +1,13 @@
-"""The geometry of advection: the grids, solids and faces that `advection` traces through, and the bricks of 8^3 cells
-in which there is smoke.
+"""Geometry of advection: the grids, solids and faces through which `advection` traces, and bricks of 8^3 cells.
 
 Read `tests/reference/advection.py` first: `Domain` there has the same grids, faces and solids in NumPy.
 
 The fine grid (smoke) has `refinement` cells along each edge of a cell of the coarse grid (air). Solids are whole
 coarse cells. Each axis is periodic, or each of its two ends is open (clean air comes in) or closed.
 
-Bricks: a brick is busy if a value in it exceeds the threshold, and is listed if a brick within `rings` of it is busy.
-Bricks that aren't listed are 0 in every buffer. The error against the dense step is what lies below the threshold in
-bricks without a busy brick around them: at most the threshold for each cell and step, and none with a threshold of 0.
+A brick is busy if a value in it exceeds the threshold, and is listed if a brick within `rings` of it is busy. Bricks
+that are not listed are 0 in every buffer. The error relative to a dense step is at most the threshold per cell and
+step, in bricks without a busy brick around them; with a threshold of 0 there is no error.
 """
 
 from collections.abc import Sequence
@@ -20,24 +19,24 @@ from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 wp.set_module_options({"enable_backward": False})
 
 PERIODIC, OPEN, CLOSED = 0, 1, 2
-"""Kinds of an axis' ends; either both ends are periodic or neither."""
+"""Kinds of the ends of an axis; either both ends are periodic or neither."""
 
 BRICK = 8
 """Cells along an edge of a brick."""
 
 RUN, BRICK_RUN = 16, BRICK
 """Cells along x that one thread computes, so that cells between the same eight velocities read them once; fewer in
-bricks, which end sooner."""
+bricks, which are shorter."""
 
 REACH = 0.25
-"""Coarse cells by which a trace's midpoint may lie outside the eight velocities around its start and still be
-extrapolated from them: to read the next eight, which are mostly the same, would double the time."""
+"""Distance in coarse cells by which the midpoint of a trace may be outside the eight velocities around its start and
+still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
 
 FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
 _OPEN = wp.constant(OPEN)
 _HALVINGS = wp.constant(6)
 _REACH = wp.constant(REACH)
-# Groups of threads that share the list of bricks: enough to fill any GPU.
+# Groups of threads that share the list of bricks; enough to fill any GPU.
 _WORKERS = 8192
 
 
@@ -70,13 +69,13 @@ class Bricks:
     """The bricks of a domain, on a device.
 
     Attributes:
-        rings: Bricks by which smoke may move beyond a busy one in a step.
+        rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
         workers: Groups of threads that share the list; 0 without bricks.
-        threshold: The largest value of a brick that counts as empty.
+        threshold: Largest value in a brick that counts as empty.
         busy: int [B], 1 where a value above the threshold was written since the last list.
         active: int [B], 1 where listed.
-        listed: int [B], the numbers of the active bricks in any order; `count` int [1] of them.
-        retired: int [B], the bricks that were active in the list before; `retired_count` int [1] of them.
+        listed: int [B], numbers of the active bricks in any order; their count is `count` int [1].
+        retired: int [B], bricks that were active in the previous list; their count is `retired_count` int [1].
     """
 
     rings: int
@@ -105,8 +104,8 @@ class Stencil:
 
 @wp.struct
 class FlatStencil:
-    """The eight cells around a point in memory: the index of the lowest, the distance to the next along each axis, and
-    the fraction between the two."""
+    """Memory offsets of the eight cells around a point: index of the lowest cell, step to the next cell along each
+    axis, and the fractions between them."""
 
     base: int
     step: wp.vec3i
@@ -115,7 +114,7 @@ class FlatStencil:
 
 @wp.struct
 class TrilinearVelocity:
-    """The trilinear polynomial through the velocities of a stencil's cells, in the stencil's fractions."""
+    """Coefficients of the trilinear polynomial through the velocities of a stencil, in the stencil's fractions."""
 
     c: wp.vec3
     x: wp.vec3
@@ -129,7 +128,7 @@ class TrilinearVelocity:
 
 @wp.func
 def _neighbour(i: int, n: int, periodic: int) -> int:
-    """A cell within the grid, whatever i is: no float that was turned into it may make a kernel read beyond."""
+    """A cell within the grid for any i, even one that was converted from NaN."""
     if periodic != 0:
         if i < 0:
             i = i + n
@@ -180,7 +179,7 @@ def _pair(i: int, n: int, periodic: int):
     """The lower of the cells i and i + 1 along an axis, and the step from it to the upper."""
     low = i
     step = int(1)
-    # Only at the ends of the axis does anything change.
+    # Cells away from the ends of the axis need no wrapping.
     if i < 0 or i >= n - 1:
         low = _neighbour(i, n, periodic)
         step = _neighbour(i + 1, n, periodic) - low
@@ -259,7 +258,7 @@ def into_domain(box: Box, x: wp.vec3) -> wp.vec3:
 
 @wp.func
 def in_domain(box: Box, x: wp.vec3) -> bool:
-    """Whether a point lies in the domain; false where a coordinate isn't a number."""
+    """Whether a point is in the domain; false for NaN."""
     low = x[0] >= 0.0 and x[1] >= 0.0 and x[2] >= 0.0
     return low and x[0] <= float(box.n[0]) and x[1] <= float(box.n[1]) and x[2] <= float(box.n[2])
 
@@ -314,7 +313,7 @@ def trace_back(
 
 @wp.func
 def clip_at_solid(box: Box, walls: wp.array1d[wp.uint8], x: wp.vec3, end: wp.vec3) -> wp.vec3:
-    """The last point in the fluid, to 1/64, of a trace from x in the fluid to an end in a solid, by bisection."""
+    """Last point in the fluid, to 1/64 of the length, of a trace from x in the fluid to an end in a solid."""
     free = wp.vec3(x)
     solid = wp.vec3(end)
     for _k in range(_HALVINGS):
@@ -335,7 +334,7 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
         ends: For each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`.
 
     Raises:
-        ValueError: The refinement is below 1, one end alone of an axis is periodic, or there are 2^31 fine cells.
+        ValueError: The refinement is below 1, only one end of an axis is periodic, or there are 2^31 fine cells.
     """
     if refinement < 1:
         raise ValueError(f"refinement: expected at least 1, got {refinement}")
@@ -381,21 +380,22 @@ def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
     Args:
         box: The domain.
         solid: uint8 [coarse cells], above 0 where a cell is solid.
-        walls: uint8 [coarse cells], set.
+        walls: uint8 [coarse cells], written.
     """
     wp.launch(_mark, solid.shape[0], inputs=[box, solid], outputs=[walls], device=solid.device)
 
 
 def rings_for(cells: float) -> int:
-    """Rings of bricks that smoke may enter when a trace goes some fine cells far: a read needs one cell more."""
+    """Number of rings of bricks that smoke may enter if a trace has a given length in fine cells; a read needs one more
+    cell."""
     return -(-(int(cells) + 2) // BRICK)
 
 
 def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
-    """Makes the bricks of a domain, all of them busy, none of them listed yet; arguments as for `Bricks`."""
+    """Makes the bricks of a domain, all busy and none listed; the arguments are attributes of `Bricks`."""
     total = box.bricks[0] * box.bricks[1] * box.bricks[2]
     bricks = Bricks()
-    # Across a periodic face lies perhaps a brick that is cut short, and behind it the next.
+    # The brick across a periodic face may be cut short, so that smoke reaches the one behind it.
     bricks.rings = rings + int(any(box.periodic[a] and box.n[a] % BRICK for a in range(3)))
     # A CPU runs one worker after the other.
     bricks.workers = min(total, _WORKERS) if wp.get_device(device).is_cuda else 1
@@ -438,7 +438,7 @@ def _list(
 
 
 def relist(box: Box, bricks: Bricks) -> None:
-    """Lists the bricks to compute in the next step, and those that no longer are; afterwards none is busy."""
+    """Lists the bricks to compute in the next step and the bricks that are no longer computed; then none is busy."""
     bricks.count.zero_()
     bricks.retired_count.zero_()
     wp.launch(_list, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)

@@ -1,16 +1,16 @@
-"""Smoke apart from its transport: sources, solids that come and go, and buoyancy, by which smoke moves the air.
+"""Sources of smoke, solids that appear and disappear, and buoyancy, by which smoke moves the air.
 
 Read `test_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first: the same in NumPy.
 
-Fields and domains are those of `advection` and `advection_places`. Stated behaviour:
+Fields and domains are those of `advection` and `advection_places`. Special cases:
 
 ==============================  ======================================================================
-a source in a solid             gives nothing there
-a source outside the domain     gives nothing
-a source that adds less than    nothing is added: half floats have 11 bits
-half floats can tell
+a source in a solid             adds no smoke there
+a source outside the domain     adds no smoke
+a source that adds less than    adds no smoke: half floats have 11 bits
+half floats resolve
 cells that a solid covers       their smoke is lost
-cells that a solid frees        the mean of the nearest cells in the fluid coarse cells around; 0 if none
+cells that a solid frees        mean of the nearest cells in the fluid coarse cells around; 0 if none
 ==============================  ======================================================================
 """
 
@@ -41,8 +41,8 @@ class SourceKernels:
 
     Attributes:
         source: Over the cells of a box around a source.
-        cover: Empties cells that become solid and fills those that cease to be, over coarse cells.
-        lift: Over coarse cells.
+        cover: Empties cells that become solid and fills cells that become fluid, over coarse cells.
+        lift: Acceleration of the air, over coarse cells.
         empty: Empties retired bricks, over workers times a brick's cells.
     """
 
@@ -130,7 +130,7 @@ def source_kernels(stored: type) -> SourceKernels:
                 for j in range(27):
                     step = wp.vec3i(j // 9 - 1, j // 3 % 3 - 1, j % 3 - 1)
                     beside = coarse + step
-                    # The fine cell of this neighbour that lies nearest.
+                    # The nearest fine cell of this neighbour.
                     q = wp.vec3i()
                     valid = bool(True)
                     for a in range(3):
@@ -231,18 +231,18 @@ def add_source(
     fixed: bool,
     bricks: Bricks = DENSE,
 ) -> None:
-    """Adds smoke to the cells whose centres lie in a box or an ellipsoid, or sets it there; the result is at least 0.
+    """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; the result is at least 0.
 
     Args:
         box: The domain.
-        walls: As for `advection.advect`.
+        walls: Marks as in `advection.advect`.
         shape: `SPHERE` or `BOX`.
         centre: In fine cells.
-        size: Radii or half edges, fine cells, above 0.
+        size: Radii or half edges in fine cells, above 0.
         value: Density and temperature to add or to set.
-        fields: Changed.
-        fixed: Whether they are set.
-        bricks: Those where smoke comes in are marked as busy.
+        fields: The fields, modified.
+        fixed: Whether the values are set instead of added.
+        bricks: Bricks that receive smoke are marked as busy.
     """
     low = [max(0, int(c - h)) for c, h in zip(centre, size, strict=True)]
     high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, size, box.n, strict=True)]
@@ -255,13 +255,13 @@ def add_source(
 
 
 def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, bricks: Bricks = DENSE) -> None:
-    """Empties the cells that become solid and fills those that no longer are.
+    """Empties the cells that become solid and fills the cells that become fluid.
 
     Args:
         box: The domain.
         before, after: uint8 [coarse cells], from `advection_places.mark_walls`.
-        fields: Changed.
-        bricks: As for `add_source`.
+        fields: The fields, modified.
+        bricks: Bricks that receive smoke are marked as busy.
     """
     _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
 
@@ -275,20 +275,20 @@ def buoyancy(
     force: wp.array,
     bricks: Bricks = DENSE,
 ) -> None:
-    """The acceleration of the air by smoke, linear in the means of a coarse cell's density and temperature.
+    """Computes the acceleration of the air by smoke, linear in the mean density and temperature of a coarse cell.
 
     Args:
         box: The domain.
-        walls: As for `advection.advect`.
+        walls: Marks as in `advection.advect`.
         fields: The smoke.
-        by_density, by_temperature: (3,), at density 1 and at temperature 1, coarse cells a step squared.
-        force: vec3 [coarse cells], set; 0 in solids.
-        bricks: Where none is active the means are 0.
+        by_density, by_temperature: (3,), acceleration at density 1 and at temperature 1, coarse cells per step squared.
+        force: vec3 [coarse cells], written; 0 in solids.
+        bricks: Means are 0 where no brick is active.
     """
     inputs = [box, walls, fields.arrays, wp.vec3(*by_density), wp.vec3(*by_temperature), bricks]
     _launch("lift", force.shape[0], inputs, force, fields)
 
 
 def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
-    """Empties the bricks that `advection_places.relist` retired; needed in every buffer."""
+    """Empties the bricks that `advection_places.relist` retired; must be called for every buffer."""
     _launch("empty", bricks.workers * int(_BRICK_CELLS), [box, bricks], fields.arrays, fields)

@@ -1,4 +1,4 @@
-"""Sparse grids made dense, and voxels of any shape resampled to cubic ones."""
+"""Conversion of sparse grids to dense ones, and resampling of voxels of any shape to cubic voxels."""
 
 import warp as wp
 
@@ -29,9 +29,9 @@ def resample(
     # out:
     out: wp.array3d[float],
 ):
-    """Reads values, trilinear between the centres of their voxels and zero outside, at the centres of others.
+    """Samples values, trilinear between voxel centres and 0 outside, at the voxel centres of another grid.
 
-    The point p, in the voxels of `out`, is the point turn p + shift in those of `values`.
+    Point p in voxels of `out` is point turn p + shift in voxels of `values`.
     """
     i, j, k = wp.tid()
     p = turn * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5) + shift

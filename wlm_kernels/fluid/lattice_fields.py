@@ -1,8 +1,9 @@
-"""Solid bodies on a lattice: the cells that they cover and the velocity of their surfaces.
+"""Velocity and density of the air on a lattice, its initial state, and solid bodies: their cells and motion.
 
-Read `test_sphere_voxels` and `test_mesh_voxels` in `tests/kernels/test_lattice.py` first: the same in NumPy.
+Read `fields` and `equilibrium` of `tests/reference/lattice.py`, and `test_sphere_voxels` and `test_mesh_voxels` of
+`tests/kernels/test_lattice.py` first: the same in NumPy.
 
-An array of uint8 holds for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres lie at half
+An array of uint8 stores for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres are at half
 integers, in units of a cell. Bodies are rigid: u(x) = velocity + spin x (x - centre).
 """
 
@@ -25,17 +26,17 @@ from wlm_kernels.fluid.lattice_sets import (
 
 wp.set_module_options({"enable_backward": False})
 
-# A sign of the distance by rays is wrong where a ray only grazes a triangle; the winding number casts none.
+# The winding number, unlike a sign from rays, is right where a ray would graze a triangle.
 _INSIDE = wp.constant(0.5)
 
 
 @wp.struct
 class Bodies:
-    """The motion of bodies; element 0 stands for the fluid and is 0.
+    """Motion of bodies; element 0 represents the fluid and is 0.
 
     Attributes:
-        velocity: vec3 [K + 1], of the body's centre, cells a step.
-        spin: vec3 [K + 1], angular velocity, radians a step.
+        velocity: vec3 [K + 1], velocity of the body's centre, cells per step.
+        spin: vec3 [K + 1], angular velocity, radians per step.
         centre: vec3 [K + 1], cells.
     """
 
@@ -99,13 +100,12 @@ def _mesh(
 
 
 def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
-    """Marks the cells whose centres lie in a sphere with a body's number, and frees its others.
+    """Marks the cells whose centres are in a sphere with a body's number, and clears the body's other cells.
 
     Args:
-        solid: uint8 [X, Y, Z], changed.
+        solid: uint8 [X, Y, Z], modified.
         body: The body's number, 1 to 255.
-        centre: In cells.
-        radius: In cells.
+        centre, radius: In cells.
     """
     n = wp.vec3i(*solid.shape)
     inputs = [n, wp.uint8(body), wp.vec3(*centre), float(radius)]
@@ -113,15 +113,15 @@ def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
 
 
 def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rotation=None, scale: float = 1.0) -> None:
-    """Marks the cells whose centres lie in a closed mesh with a body's number, and frees its others.
+    """Marks the cells whose centres are in a closed mesh with a body's number, and clears the body's other cells.
 
     Args:
-        solid: uint8 [X, Y, Z], changed.
+        solid: uint8 [X, Y, Z], modified.
         body: The body's number, 1 to 255.
-        mesh: On the device of `solid`, made with `support_winding_number=True`.
-        position: In cells, of the mesh's origin.
-        rotation: `wp.quat`, None for none.
-        scale: Cells a unit of the mesh.
+        mesh: Mesh on the device of `solid`, made with `support_winding_number=True`.
+        position: Position of the mesh's origin, in cells.
+        rotation: `wp.quat`; None: no rotation.
+        scale: Cells per unit of the mesh.
     """
     n = wp.vec3i(*solid.shape)
     placed = wp.transform(wp.vec3(*position), wp.quat_identity() if rotation is None else rotation)
@@ -138,8 +138,8 @@ class FluidKernels:
     Attributes:
         fields: Density less 1 and velocity of every cell.
         start: Sets every cell to an equilibrium.
-        neighbours: The mean of the fluid around each cell that stops being solid.
-        uncover: Sets those cells to the equilibrium of that mean.
+        neighbours: Mean of the fluid around each cell that becomes fluid.
+        uncover: Sets these cells to the equilibrium of that mean.
     """
 
     fields: wp.Kernel
@@ -150,7 +150,7 @@ class FluidKernels:
 
 @functools.cache
 def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that don't run at every step; arguments as for `memory_functions`."""
+    """Builds (once) the kernels that do not run at every step; the arguments are those of `memory_functions`."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]
@@ -256,7 +256,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         p = cell_of(n, i)
         for q in range(t.w.shape[0]):
             value = equilibrium(t.w[q], t.c[q], drho, u)
-            # A link's element holds what comes in next: for this cell that is the equilibrium too.
+            # The element of a link stores the population that comes in next, for this cell also the equilibrium.
             if owned(n, bounded, walled, p + t.c[q]):
                 store(f, q, i, value)
             if not owned(n, bounded, walled, p - t.c[q]):

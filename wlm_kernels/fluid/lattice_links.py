@@ -1,19 +1,19 @@
-"""Boundary conditions of the lattice: what comes back from walls, and in through inlets and outlets.
+"""Boundary conditions of the lattice: walls, inlets and outlets.
 
 Read `tests/reference/lattice.py` first: `stream` there has the same conditions in float64 NumPy, link by link.
 
-A link is a fluid cell a and a direction q in which a population comes to it from beyond a face of the domain or out of
-a solid. (Axes closed by walls at rest have none: the step of `lattice` does those.) The element that cell a pulls it
-from, population q of the periodic image of the cell a - c_q, is read by a alone. So after every step the links' values
-are computed from the populations f* that have just left the cells, and then written into those elements: two passes,
-since the element of one link may hold what another reads.
+A link is a fluid cell a and a direction q from which a population arrives from beyond a face of the domain or out of a
+solid. (Axes closed by walls at rest have no links: the step of `lattice` handles them.) The element from which cell a
+pulls this population, population q of the periodic image of the cell a - c_q, is read by no other cell. After every
+step the values of the links are computed from the populations f* that have just left the cells, and are then written
+into these elements. This takes two passes, since the element of one link may be read by another.
 
 - bounce: f_q = f*_opposite + term, half-way bounce-back; the term 6 w_q c_q . u carries a wall's velocity at density 1.
-- inlet: the same, which lets in a mass of u for each cell of the face; its term may rise from 0 in the first steps.
-- slip: the mirror image of what leaves the neighbour, a wall without friction.
+- inlet: the same, which adds a mass of u per cell of the face; its term may rise from 0 in the first steps.
+- slip: the mirror image of the population that leaves the neighbour, a wall without friction.
 - outlet: the equilibrium at the cell's own density and velocity (zero gradient). It is then shifted, by w_q times the
-  same factor at all outlets, so that as much leaves through them as comes in elsewhere: mass is conserved to rounding.
-- pressure: the same without the shift, its density relaxed towards a given one, whose excess over 1 is the term.
+  same factor at all outlets, so that outflow equals inflow: mass is conserved to rounding.
+- pressure: the outlet without the shift; its density relaxes towards a given density, whose excess over 1 is the term.
 
 Velocities into the domain are set to 0 at an outlet: backflow would feed on itself.
 """
@@ -43,8 +43,8 @@ _BOUNCE, _SLIP, _OUTLET, _INLET = (wp.constant(kind) for kind in (BOUNCE, SLIP, 
 
 BLOCK = 256
 
-# An outlet of fixed density reflects all sound. Relaxed to its value at this rate over the crossing of the domain (0.25
-# to 0.6 in the literature, Poinsot and Lele 1992), it lets most of it out and still keeps its mean.
+# An outlet of fixed density reflects all sound. Relaxed at this rate per crossing of the domain (0.25 to 0.6 in the
+# literature, Poinsot and Lele 1992), it transmits most of the sound and still keeps the mean density.
 _HOLD = wp.constant(0.3)
 
 
@@ -56,9 +56,9 @@ class Links:
         cell: int [L], the fluid cell a.
         code: uint8 [L], the direction q + 32 times the kind.
         term: float [L], see the module.
-        value: float [L], between the two passes.
-        used: int [1], the number of elements in use.
-        faces: The number of links of faces.
+        value: float [L], result of the first pass.
+        used: int [1], number of elements in use.
+        faces: Number of links of faces.
     """
 
     cell: wp.array1d[int]
@@ -99,7 +99,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """The cell whose mirror image in a slip wall sends population q to cell i, and that cell's own direction."""
+        """Returns the cell whose mirror image in a slip wall sends population q to cell i, and its direction."""
         p = cell_of(n, i)
         c = t.c[q]
         x = _beyond(p[0] - c[0], n[0], bounded[0])
@@ -167,12 +167,12 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _BOUNCE:
                     v = out + links.term[at]
                 elif kind == _INLET:
-                    # The larger of the two counts the steps done; this is for the next.
+                    # The larger of the two is the number of steps done; this value is for the next step.
                     risen = wp.min(1.0, float(wp.max(clock[0], clock[1]) + 1) * rise)
                     v = out + risen * risen * (3.0 - 2.0 * risen) * links.term[at]
                 elif kind == _SLIP:
                     k, c = mirrored(t, n, bounded, i, q)
-                    # At the image of a solid it bounces back.
+                    # A solid at the mirrored cell bounces the population back.
                     v = load(f, t.index[9 * (c[0] + 1) + 3 * (c[1] + 1) + c[2] + 1], k)
                     if solid.shape[0] > 0:
                         if solid[k] != wp.uint8(0):
@@ -184,7 +184,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            # Every thread of a block takes part in its sums, most of which are 0.
+            # All threads of a block take part in its sums; most terms are 0.
             block_net = wp.tile_extract(wp.tile_sum(wp.tile(net)), 0)
             block_weight = wp.tile_extract(wp.tile_sum(wp.tile(weight)), 0)
             if wp.tid() % wp.block_dim() == 0:
@@ -236,13 +236,13 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         element = index_of(n, wrapped(n, cell_of(n, i) - c))
         k = int(element)
         if int(links.code[at]) >> 5 == _SLIP:
-            # Where a slip wall cuts a body, the mirror image of this link is one of the body's.
+            # Where a slip wall cuts a body, the mirror image of this link is a link of the body.
             k, c = mirrored(t, n, bounded, i, q)
         elif crosses(n, bounded, cell_of(n, i) - c):
             return
         if solid[k] == wp.uint8(0) or solid[i] != wp.uint8(0):
             return
-        # The element holds what came back; what went in is that less the term, and both push the same way.
+        # The element stores the population that came back; the one that went in is that minus the term.
         exchanged = wp.float64(links.term[at] - 2.0 * load(f, q, element))
         along = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
         wp.atomic_add(total, int(solid[k]), exchanged * along)
@@ -273,7 +273,7 @@ def _find(
         if not crosses(n, bounded, source):
             k = int(solid[index_of(n, wrapped(n, source))])
             if k > 0:
-                # The wall lies halfway between the two cells' centres.
+                # The wall is halfway between the centres of the two cells.
                 c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
                 x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5) - 0.5 * c
                 u = velocity_at(bodies, k, x)
@@ -287,18 +287,19 @@ def _find(
 
 
 def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, bodies: Bodies, links: Links):
-    """Lists the links of solid cells, in any order, after those of faces; `used` stays as it is.
+    """Lists the links of solid cells, in any order, after the links of faces; `used` is not changed.
 
     Args:
         tables: The velocity set.
         n: Cells along x, y and z.
-        bounded: 1 for each axis that isn't periodic.
+        bounded: 1 for each axis that is not periodic.
         solid: uint8 [N].
-        bodies: Their motion.
-        links: Changed.
+        bodies: Motion of the bodies.
+        links: The links, modified.
 
     Returns:
-        The number of these links, whether or not they fit, int [1], and the speed of the fastest surface, float [1].
+        Number of these links, int [1], which may exceed the size of the arrays; speed of the fastest surface, float
+        [1].
     """
     count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
     inputs = [tables, n, bounded, solid, bodies, links]
@@ -322,17 +323,17 @@ def apply(
     """Runs both passes over the links from element `first` on.
 
     Args:
-        kernels: Of the lattice and storage of `f`.
+        kernels: Kernels of the lattice and storage of `f`.
         tables: The velocity set.
         n: Cells along x, y and z.
-        bounded: 1 for each axis that isn't periodic.
+        bounded: 1 for each axis that is not periodic.
         first: 0, or the first link of a solid.
-        links: The links; `value` is changed.
+        links: The links; `value` is modified.
         solid: uint8 [N], or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
-        rise: Inlets are at their full velocity after 1 / rise steps.
-        f: [Q, N], the populations that have just left the cells, changed.
-        sums: float64 [2], 0 before: the mass that all links let in without the shift, and the weight of the outlets.
+        rise: Inlets reach their full velocity after 1 / rise steps.
+        f: [Q, N], the populations that have just left the cells, modified.
+        sums: float64 [2], 0 before: net mass through all links without the shift, and sum of the outlets' weights.
     """
     size, device = links.cell.shape[0] - first, f.device
     if size <= 0:

@@ -2,11 +2,11 @@
 
 Read `tests/reference/lattice.py` first: the same velocities and equilibria in float64 NumPy.
 
-Cells are counted with the last axis fastest, as arrays [X, Y, Z] lie in memory: cell = (x Y + y) Z + z. Velocities
-come in pairs, q and its opposite side by side: 0 rests, 1 and 2 are opposite, 3 and 4 are, and so on.
+Cells are numbered with the last axis fastest, as in the memory of arrays [X, Y, Z]: cell = (x Y + y) Z + z. Velocities
+are in pairs of opposites: 0 is at rest, 1 and 2 are opposite, 3 and 4 are opposite, and so on.
 
 Populations are stored as f_q - w_q, the deviation from fluid at rest at density 1. Their sum is rho - 1, which float32
-would otherwise round at 1e-7 of 1 at every step and 16 bits could not hold at all.
+would otherwise round to 1e-7 at every step and 16 bits could not represent.
 """
 
 import functools
@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 HALF_SCALE = 32768.0
-"""16-bit populations are stored times this: +-2 is the range, 1.9e-9 the smallest that keeps all 11 bits."""
+"""Factor of 16-bit populations: their range is +-2, and 1.9e-9 the smallest value with all 11 bits."""
 
 STORAGES = {"float32": (wp.float32, 1.0), "float16": (wp.float16, HALF_SCALE)}
 
@@ -29,8 +29,8 @@ class VelocitySet:
     Attributes:
         name: "D2Q9", "D3Q19" or "D3Q27".
         axes: 2 or 3; the plane of two axes is x, y.
-        c: The velocities, cells a step.
-        w: Their weights.
+        c: The velocities, cells per step.
+        w: The weights.
     """
 
     name: str
@@ -40,7 +40,7 @@ class VelocitySet:
 
 
 def _make(name: str, axes: int, weights: tuple[float, ...]) -> VelocitySet:
-    """A set of velocities of -1, 0 and 1; `weights` are by the squared length, and what has no weight is left out."""
+    """Makes a set of velocities of components -1, 0 and 1 whose squared length has an entry in `weights`."""
     signs = itertools.product(*[(-1, 0, 1) if a < axes else (0,) for a in range(3)])
     half = [c for c in signs if c > (0, 0, 0) and sum(map(abs, c)) < len(weights)]
     half.sort(key=lambda c: (sum(map(abs, c)), c))
@@ -58,10 +58,10 @@ LATTICES = {
 
 
 def lattice(name: str) -> VelocitySet:
-    """One of `LATTICES`.
+    """Returns one of `LATTICES`.
 
     Raises:
-        ValueError: There is no such lattice.
+        ValueError: The name is unknown.
     """
     if name not in LATTICES:
         raise ValueError(f"lattice: expected one of {', '.join(LATTICES)}, got {name!r}")
@@ -70,7 +70,7 @@ def lattice(name: str) -> VelocitySet:
 
 @wp.struct
 class Tables:
-    """A set of velocities for kernels that look directions up.
+    """A set of velocities for kernels that index directions.
 
     Attributes:
         c: vec3i [Q].
@@ -85,7 +85,7 @@ class Tables:
 
 @functools.cache
 def tables(name: str, device: str) -> Tables:
-    """The tables of a lattice on a device, made once."""
+    """Returns the tables of a lattice on a device; they are made once."""
     velocities = lattice(name)
     index = [0] * 27
     for q, (x, y, z) in enumerate(velocities.c):
@@ -107,7 +107,7 @@ def opposite(q: int) -> int:
 @wp.func
 def cell_of(n: wp.vec3i, i: int) -> wp.vec3i:
     """The coordinates of cell i."""
-    # Two divisions instead of four: a remainder would be another one. Signed divisions take twice as long.
+    # Two divisions instead of four: a remainder is a division too. Signed divisions take twice as long.
     row = int(wp.uint32(i) // wp.uint32(n[2]))
     x = int(wp.uint32(row) // wp.uint32(n[1]))
     return wp.vec3i(x, row - x * n[1], i - row * n[2])
@@ -120,13 +120,13 @@ def index_of(n: wp.vec3i, p: wp.vec3i) -> int:
 
 @wp.func
 def wrapped(n: wp.vec3i, p: wp.vec3i) -> wp.vec3i:
-    """The periodic image, within the domain, of a cell at most one outside."""
+    """Periodic image within the domain of a cell that is at most one cell outside."""
     return wp.vec3i((p[0] + n[0]) % n[0], (p[1] + n[1]) % n[1], (p[2] + n[2]) % n[2])
 
 
 @wp.func
 def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
-    """Whether a cell lies beyond a face of an axis that isn't periodic."""
+    """Whether a cell is beyond a face of an axis that is not periodic."""
     x = bounded[0] != 0 and (p[0] < 0 or p[0] >= n[0])
     y = bounded[1] != 0 and (p[1] < 0 or p[1] >= n[1])
     z = bounded[2] != 0 and (p[2] < 0 or p[2] >= n[2])
@@ -135,13 +135,13 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Whether what leaves a cell for p is stored in that cell's element; else a link writes the element."""
+    """Whether the population that leaves a cell for p is stored in the cell's element; otherwise a link writes it."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 
 @wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
-    """Second-order equilibrium less its weight, f_eq - w; `drho` is rho - 1.
+    """Second-order equilibrium minus its weight, f_eq - w; `drho` is rho - 1.
 
     f_eq = w rho (1 + 3 c.u + 9/2 (c.u)^2 - 3/2 u.u)
     """
@@ -150,7 +150,7 @@ def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
 
 
 NARROW = 2**31 - 1
-"""The largest number of populations, cells times directions, that 32 bits index."""
+"""Largest number of populations, cells times directions, that 32 bits can index."""
 
 
 @dataclass(frozen=True)
@@ -159,12 +159,12 @@ class MemoryFunctions:
 
     Attributes:
         vec: vec of Q floats.
-        gather: (f, n, p) -> scaled vec, the populations that arrive at cell p: each from the cell that it comes from,
-            or from cell p itself where a wall at rest closes a whole axis.
+        gather: (f, n, p) -> scaled vec, the populations that arrive at cell p: each is read from the cell that it left,
+            or from cell p itself at a wall at rest that closes a whole axis.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
-        put: (f, q, i, value), writes one scaled number.
-        load: (f, q, i) -> float, reads one number without the scale.
-        store: (f, q, i, value), writes one number without the scale.
+        put: (f, q, i, value), writes a scaled number.
+        load: (f, q, i) -> float, reads a number and removes the scale.
+        store: (f, q, i, value), scales and writes a number.
     """
 
     vec: Any
@@ -183,13 +183,13 @@ def memory_functions(
 
     Args:
         lattice_name: One of `LATTICES`.
-        storage: One of `STORAGES`; scaled numbers are times its scale.
-        walls: The axes that walls at rest close.
-        wide: Whether elements are indexed in 64 bits, which costs a sixth of a step's instructions; without, there may
-            be `NARROW` populations.
+        storage: One of `STORAGES`; scaled numbers are multiplied by its scale.
+        walls: For each axis whether walls at rest close it.
+        wide: Whether elements are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there may
+            be at most `NARROW` populations.
 
     Raises:
-        ValueError: There is no such lattice or storage.
+        ValueError: The lattice or the storage is unknown.
     """
     velocities = lattice(lattice_name)
     if storage not in STORAGES:
@@ -199,7 +199,7 @@ def memory_functions(
     vec = wp.types.vector(count, float)
     index_type = wp.int64 if wide else wp.int32
 
-    # Through the pointer: by Warp's strides, 64 bits wide each, the addresses would be half the work of a step.
+    # Through the pointer: addresses from Warp's 64-bit strides would take half the time of a step.
 
     @wp.func_native("return f.data[k];")
     def peek(f: wp.array2d[stored], k: index_type) -> stored: ...
@@ -229,8 +229,8 @@ def memory_functions(
         y = wp.vec3i(wp.where(p[1] == 0, n[1], p[1]) - 1, p[1], wp.where(p[1] == n[1] - 1, 0, p[1] + 1))
         z = wp.vec3i(wp.where(p[2] == 0, n[2], p[2]) - 1, p[2], wp.where(p[2] == n[2] - 1, 0, p[2] + 1))
         i = index_of(n, p)
-        # Warp's hash of a function leaves out what `wp.static` makes of a loop's variable: without these constants
-        # of its own, a gather with other walls would be taken for this one, and loaded in its place.
+        # Warp's hash of a function excludes `wp.static` expressions of loop variables: without these constants a gather
+        # with other walls would have the same hash, and would be loaded instead.
         closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
         low = wp.cw_mul(
             closed, wp.vec3i(wp.where(p[0] == 0, 1, 0), wp.where(p[1] == 0, 1, 0), wp.where(p[2] == 0, 1, 0))
@@ -244,7 +244,7 @@ def memory_functions(
             row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
             k = element_of(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
             if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
-                # Half-way bounce-back costs no branch: it only reads another element.
+                # Half-way bounce-back needs no branch: it reads another element.
                 back = bool(False)
                 for a in range(3):
                     if wp.static(walls[a] and c[q][a] > 0):

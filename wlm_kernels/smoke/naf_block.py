@@ -1,8 +1,7 @@
-"""The parts of a NAFBlock besides its matrix products, for one image whose pixels lie as rows of channels.
+"""Parts of a NAFBlock other than its matrix products, for one image stored as rows of channels, one row per pixel.
 
-`kernels` builds and caches them for a number of channels and a number type; sums are float32 whatever the type is.
-Nothing has a gradient: training is torch's. Read first: `NafBlock` of `wlm/smoke/model.py`, the whole block in
-torch.
+`kernels` builds and caches them for a number of channels and a number type; sums are always float32. There are no
+gradients: networks are trained in torch. Read `NafBlock` of `wlm/smoke/network/unet.py` first, the block in torch.
 """
 
 import functools
@@ -12,7 +11,7 @@ from typing import Any
 import warp as wp
 
 STRIP = 4
-"""Pixels below each other that one thread of `gate` computes."""
+"""Number of vertically adjacent pixels that one thread of `gate` computes."""
 
 _EPSILON = 1e-6
 _WARP = 32
@@ -21,7 +20,7 @@ _PER_LANE = 4
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Not the active threads: after a branch these needn't be the whole group yet.
+    // Not the mask of active threads: after a branch some threads of the group may not be active yet.
     const unsigned first = (threadIdx.x % 32) / count * count;
     const unsigned group = (0xffffffffu >> (32 - count)) << first;
     for (int step = count / 2; step > 0; step /= 2)
@@ -30,12 +29,12 @@ _PER_LANE = 4
     return value;
 """)
 def lane_sum(value: float, count: int) -> float:
-    """The sum of a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value."""
+    """Sum of a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value itself."""
     ...
 
 
 def lanes(channels: int, cuda: bool) -> int:
-    """Threads that share a row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
+    """Number of threads per row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
     if not cuda:
         return 1
     count = -(-channels // _PER_LANE)
@@ -47,12 +46,12 @@ class NafKernels:
     """The kernels of a number type T; L threads share a row of channels.
 
     Attributes:
-        norm: [P L]: rows plus a shift, less their mean, over their deviation. In: x T [P, C], shift float [G, C] of
-            each P / G rows, and how many these are. Out: T [P, C].
-        gate: [ceil(H / STRIP), W, C]: a 3 x 3 convolution of each channel by itself, with zeros outside; then the
-            product of the first half of the channels with the second. In: x T [H, W, 2 C], weights float [9, 2 C],
+        norm: [P L]: adds a shift to each row, subtracts the mean and divides by the standard deviation. In: x T [P, C],
+            shift float [G, C] for each P / G rows, and the number P / G. Out: T [P, C].
+        gate: [ceil(H / STRIP), W, C]: a depthwise 3 x 3 convolution with zeros outside; then the product of the first
+            half of the channels with the second. In: x T [H, W, 2 C], weights float [9, 2 C],
             biases float [2 C]. Out: T [H, W, C].
-        attend: [G c L]: weights of a product times the factors of the channel attention. In: means float [G c],
+        attend: [G c L]: weights of a product multiplied by the factors of the channel attention. In: means float [G c],
             weights float [G, c, c] and biases float [G, c] of the attention, weights float [G, c, c], from input to
             output. Out: T [G, c, c].
     """
@@ -64,7 +63,7 @@ class NafKernels:
 
 @functools.cache
 def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
-    """Builds (once) the kernels for rows of so many channels, of half floats or float32, for a GPU or a CPU."""
+    """Builds (once) the kernels for rows of `channels`, of half floats or float32, for a GPU or a CPU."""
     number: Any = wp.float16 if half else wp.float32
     count = lanes(channels, cuda)
     each = -(-channels // count)
@@ -123,7 +122,7 @@ def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
             q = wp.clamp(q, 0, x.shape[1] - 1)
             for i in range(wp.static(STRIP + 2)):
                 r = row + i - 1
-                # A factor, not a branch: all loads are under way at once.
+                # A factor instead of a branch: all loads are issued at once.
                 inside = across * float(r >= 0 and r < x.shape[0])
                 r = wp.clamp(r, 0, x.shape[0] - 1)
                 a = inside * float(x[r, q, c])

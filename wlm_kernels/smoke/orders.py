@@ -1,8 +1,9 @@
-"""Light of all orders, mixed from light scattered once and from what diffusion makes of it, pixel by pixel.
+"""Light of all orders of scattering, predicted per pixel from light scattered once and from diffusion.
 
-Of an albedo a all light is a S + a^2 R. R is a sum of features of a pixel: of S, of the same under the opposite light,
-of opacity, of the R that diffusion finds, and of what thin smoke has in the last two. Their weights are a polynomial of
-the cosine between light and camera and of the smoke's depth, and linear between the albedos that they are known at.
+At albedo a the light is a S + a^2 R, where S was scattered once. R is a weighted sum of features of a pixel: of S, of
+the same under the opposite light, of opacity, of the R of diffusion, and of the parts of the last two that come from
+thin smoke. The weights are a polynomial in the cosine between light and camera and in the smoke's depth, and are linear
+between the albedos for which they were fitted.
 """
 
 from collections.abc import Sequence
@@ -16,10 +17,10 @@ FEATURES = 28
 MIXES = 10
 
 THINNEST = 1e-4
-"""Transparency below which depths count the same."""
+"""Transparencies below this have the same optical depth."""
 
 _THINNEST = wp.constant(THINNEST)
-_BRIGHTEST = wp.constant(6.0)  # light of all orders over opacity: a white surface under irradiance 4 pi has 4
+_BRIGHTEST = wp.constant(6.0)  # limit of light over opacity: a white surface under irradiance 4 pi has 4
 
 _Features = wp.types.vector(length=FEATURES, dtype=float)
 _Mixes = wp.types.vector(length=MIXES, dtype=float)
@@ -103,7 +104,7 @@ def _write_mixes(
     # out:
     out: wp.array[float],
 ):
-    """One thread: depth in the range of those known, from -1 to 1."""
+    """For one thread; scales the depth from the range of the fit to -1 to 1."""
     at = (2.0 * depth[0] - known[0] - known[1]) / (known[1] - known[0])
     m = _mixes(cosine, wp.clamp(at, -1.0, 1.0))
     for n in range(MIXES):
@@ -120,7 +121,7 @@ def _weigh(
     # out:
     out: wp.array3d[float],
 ):
-    """Weights of a light's features at an albedo, a share of the way from one node to the next."""
+    """Weights of a light's features at an albedo, interpolated between two fitted albedos."""
     light, a, feature = wp.tid()
     total = float(0.0)
     for n in range(MIXES):
@@ -156,7 +157,7 @@ def _light(
             more += weights[n, a, m] * x[m]
         once = albedos[a] * s
         total = once + albedos[a] * albedos[a] * wp.max(more, 0.0)
-        # No more than a white surface's, and no less than was scattered once.
+        # At most the light of a white surface, and at least the light scattered once.
         found[a] = wp.max(wp.min(total, _BRIGHTEST * (1.0 - t)), once)
     for channel in range(3):
         out[n, row, column, channel] = found[places[channel]]
@@ -171,11 +172,11 @@ def features(
     thin: wp.array,
     out: wp.array,
 ) -> None:
-    """The features of one light.
+    """Computes the features of one light.
 
     Args:
-        single, opposite: float [H, W], light scattered once, of the light and of the opposite one.
-        diffused, from_thin: float [A, H, W], R by diffusion at some albedos, and what thin smoke has in it.
+        single, opposite: float [H, W], light scattered once, of the light and of the opposite light.
+        diffused, from_thin: float [A, H, W], R by diffusion at A albedos, and the part of it from thin smoke.
         transparency: float [H, W].
         thin: float [H, W], opacity of thin smoke.
         out: float [A, FEATURES, H, W], written.
@@ -185,12 +186,12 @@ def features(
 
 
 def mixes(depth: wp.array, known: wp.array, cosine: float, out: wp.array) -> None:
-    """What the weights of a light are mixed by.
+    """Computes the terms of the polynomial that gives the weights of a light.
 
     Args:
-        depth: float [1], the logarithm of the smoke's mean optical depth.
-        known: float [2], its range in the training; beyond it all is as at its end.
-        cosine: Of the angle between the directions to the light and to the camera.
+        depth: float [1], logarithm of the smoke's mean optical depth.
+        known: float [2], range of the depth in the fit; depths outside are clamped to it.
+        cosine: Cosine of the angle between the directions to the light and to the camera.
         out: float [MIXES], written.
     """
     wp.launch(_write_mixes, 1, [depth, known, float(cosine)], [out], device=out.device)
@@ -211,18 +212,18 @@ def light(
     buffer: wp.array,
     out: wp.array,
 ) -> None:
-    """All light of each light alone.
+    """Computes the light of all orders, for each light separately.
 
     Args:
         single, opposite: float [L, H, W].
-        diffused, from_thin: float [L, A, H, W], R by diffusion at one to three albedos, and what thin smoke has in it.
+        diffused, from_thin: float [L, A, H, W], R by diffusion at one to three albedos, and the part from thin smoke.
         transparency: float [H, W].
         thin: float [H, W], opacity of thin smoke.
         weights: float [N, MIXES, FEATURES], at N albedos.
-        mixed: float [L, MIXES], of `mixes`.
-        albedos: A.
-        nodes: Of each albedo the one of N before it, and the share of the way to the next.
-        places: The albedo of each channel.
+        mixed: float [L, MIXES], results of `mixes`.
+        albedos: The A albedos.
+        nodes: For each albedo the fitted albedo before it, and its share of the way to the next.
+        places: Index of the albedo of each colour channel.
         buffer: float [L, A, FEATURES], written.
         out: float [L, H, W, 3], written.
     """

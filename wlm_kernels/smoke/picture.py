@@ -1,6 +1,6 @@
-"""Pictures of smoke from lightmaps, or from light of each lamp: solid obstacles, and the smoke's light over them.
+"""Pictures of smoke from lightmaps, or from separate images of each light, composited over solid obstacles.
 
-Nothing is read back. All light is linear. `wlm.smoke.lightmaps.SixWay.shade` and
+No data is read back to the host. All light is linear. `wlm.smoke.lightmaps.SixWay.shade` and
 `wlm.smoke.transport.lighting.LitSmoke.compose` are the same in torch, without obstacles.
 """
 
@@ -20,8 +20,8 @@ class Solids:
     Attributes:
         points: vec3 [V], corners in the world.
         triangles: int32 [F, 3].
-        owner: int32 [F], whose each triangle is.
-        colours: vec3, each obstacle's albedo.
+        owner: int32 [F], index of each triangle's obstacle.
+        colours: vec3, albedo of each obstacle.
     """
 
     points: wp.array
@@ -32,14 +32,15 @@ class Solids:
 
 @dataclass(frozen=True)
 class Lamps:
-    """Lights on a device, at least one array's worth of room even where there is none.
+    """Lights on a device; without lights the arrays have one unused element.
 
     Attributes:
-        count: Of the lights.
-        toward: vec3 [L], directions to them in the world, of length 1; of a point light 0, which lights no obstacle.
-        irradiance: vec3 [L], of a point light its intensity.
-        weights: float [L, 6], of the lightmaps; of a point light 0.
-        visibility: float [L, H, W], the share of each that reaches the smoke.
+        count: Number of lights.
+        toward: vec3 [L], directions to the lights in the world, of length 1; 0 for a point light, which does not light
+            obstacles.
+        irradiance: vec3 [L]; the intensity of a point light.
+        weights: float [L, 6], weights of the lightmaps; 0 for a point light.
+        visibility: float [L, H, W], share of each light that reaches the smoke.
     """
 
     count: int
@@ -68,7 +69,7 @@ def _clip(
     elif away > 0.0:
         clip[n] = wp.vec4(x, y, away, 1.0)
     else:
-        # With parallel rays the rasteriser doesn't cut off what is behind the camera; what isn't finite it leaves out.
+        # With parallel rays the rasteriser does not clip geometry behind the camera, but it skips NaN.
         clip[n] = wp.vec4(wp.nan, wp.nan, wp.nan, wp.nan)
 
 
@@ -114,7 +115,7 @@ def _light_solids(
 
 @wp.func
 def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
-    """Linear between the stops, the end stops' colours beyond them; without stops grey, as it is."""
+    """Colour of an emission: linear between the stops, constant beyond them; grey without stops."""
     if count == 0:
         return wp.vec3(emission, emission, emission)
     colour = colours[0]
@@ -149,7 +150,7 @@ def _behind(
     solid_light: wp.array2d(dtype=wp.vec3),
     solid_depth: wp.array2d(dtype=float),
 ) -> wp.vec4:
-    """What is behind the smoke, and whether it is before it."""
+    """Light of the obstacle or background at a pixel, and 1 if it is an obstacle in front of the smoke."""
     if solids != 0 and solid_depth[i, j] < wp.inf:
         light = solid_light[i, j]
         return wp.vec4(light[0], light[1], light[2], wp.where(solid_depth[i, j] < surface[i, j], 1.0, 0.0))
@@ -225,7 +226,7 @@ def _compose_lights(
 
 
 def clip_points(solids: Solids, view: View, clip: wp.array) -> None:
-    """Brings corners to the clip space of a camera in the world, vec4 [V]; those that mustn't be drawn become NaN."""
+    """Transforms corners to clip space, vec4 [V], for a camera in the world; NaN where they must not be drawn."""
     wp.launch(_clip, solids.points.shape, [solids.points, view], [clip], device=clip.device)
 
 
@@ -239,16 +240,16 @@ def light_solids(
     light: wp.array,
     depth: wp.array,
 ) -> None:
-    """Lights the obstacles that pixels see; they cast no shadows on each other.
+    """Lights the obstacles that are visible in pixels; they cast no shadows on each other.
 
     Args:
         solids: The obstacles.
         lamps: The lights.
-        ambient: Light on all sides.
+        ambient: Ambient light.
         view: The camera in the world.
-        drawn, barycentric: int32 [H, W] and vec2 [H, W], as the rasteriser gives them.
-        light: vec3 [H, W], 0 where there is none.
-        depth: float [H, W], along the rays, infinite where there is none.
+        drawn, barycentric: int32 [H, W] and vec2 [H, W], results of the rasteriser.
+        light: vec3 [H, W], written; 0 where there is no obstacle.
+        depth: float [H, W], written: distance along the rays, infinite where there is no obstacle.
     """
     inputs = [*vars(solids).values(), lamps.count, lamps.toward, lamps.irradiance, ambient, view, drawn, barycentric]
     wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
@@ -259,10 +260,10 @@ def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp
 
     Args:
         emission: float [H, W].
-        ramp: Stops float [S] and their colours vec3 [S]; None: grey, as it is.
+        ramp: Stops float [S] and their colours vec3 [S]; None: grey.
         glow: vec3 [H, W], written.
     """
-    # In place of what there isn't, arrays that aren't read.
+    # Without a ramp, arrays that are not read.
     stops, colours = ramp or (emission.flatten(), glow.flatten())
     inputs = [emission, stops, colours, 0 if ramp is None else stops.shape[0]]
     wp.launch(_glow_of, emission.shape, inputs, [glow], device=glow.device)
@@ -278,18 +279,17 @@ def compose(
     solids: tuple[wp.array, wp.array, wp.array] | None,
     image: wp.array,
 ) -> None:
-    """Puts the smoke's light over obstacles and a background.
+    """Composites the smoke's light over obstacles and a background.
 
     Args:
         lightmaps: float [6, H, W].
         transparency: float [H, W].
-        glow: vec3 [H, W], the smoke's own light; None: it is cold.
+        glow: vec3 [H, W], light that the smoke emits; None: it is cold.
         albedo: R, G, B.
         lamps: The lights.
         background: A colour.
-        solids: The smoke's surface float [H, W], and the obstacles' light and depth of `light_solids`; None: there are
-            none.
-        image: vec3 [H, W].
+        solids: The smoke's surface float [H, W], and the light and depth from `light_solids`; None: no obstacles.
+        image: vec3 [H, W], written.
     """
     inputs = [lightmaps, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
     inputs += [lamps.irradiance, lamps.weights, lamps.visibility, wp.vec3(*albedo), wp.vec3(*background)]
@@ -306,7 +306,7 @@ def compose_lights(
     solids: tuple[wp.array, wp.array, wp.array] | None,
     image: wp.array,
 ) -> None:
-    """`compose` of what smoke scatters of each lamp of irradiance, or intensity, 4 pi: vec3 [L, H, W]."""
+    """`compose` for images vec3 [L, H, W] of each light at an irradiance, or intensity, of 4 pi."""
     inputs = [planes, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
     inputs += [lamps.irradiance, lamps.visibility, wp.vec3(*background)]
     inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]

@@ -1,9 +1,8 @@
-"""Planes of six lights before the network and behind it: the guide that it reads, and the lightmaps that it makes.
+"""Encoding of the network's input and decoding of its output, each in one pass over the image.
 
-Each is one pass over the image in place of some tens of small ones. `encode_six` turns the coarse march's planes into
-the guide, `decode` the network's planes into light. `kernels` builds and caches, for a number type, the kernels
-that add the outputs of the network's heads and a filter of the guide, where smoke is near; sums are float32 whatever
-the type is. Nothing has a gradient: training is torch's.
+`encode_six` turns the planes of the coarse march into the guide, `decode` the network's planes into light. `kernels`
+builds and caches, for a number type, the kernels that add the outputs of the network's heads and a filter of the guide
+where smoke is near; sums are always float32. There are no gradients: networks are trained in torch.
 Read first: `encode_guide`, `encode_lightmaps` and `decode_lightmaps` of `wlm/smoke/network/planes.py` for the
 encodings, and `_wanted` of `tests/kernels/test_six_planes.py`, which is `compose` in a few lines of torch.
 """
@@ -18,29 +17,29 @@ from wlm_kernels.smoke import march_coarse
 from wlm_kernels.smoke.naf_block import lane_sum
 
 LIGHTS = 6
-"""Planes of light, which come first; they may be above 1, the others may not."""
+"""Number of planes of light, which come first; they may exceed 1, the other planes may not."""
 
 PLANES = LIGHTS + 2
-"""Planes of the network's output: the lights, opacity and emission."""
+"""Number of planes of the network's output: the lights, opacity and emission."""
 
 STRIP = 4
-"""Pixels below each other that one thread of `compose` computes."""
+"""Number of vertically adjacent pixels that one thread of `compose` computes."""
 
 Taps = wp.types.vector(PLANES, wp.float32)
-"""The weights by which one pixel of one plane of the guide adds to each plane."""
+"""Weights by which a pixel of one plane of the guide adds to each output plane."""
 
 FOOT, FOOT_CODE = 0.0031308, 0.04045
-"""Where sRGB's straight foot ends (IEC 61966-2-1), in linear light and encoded."""
+"""End of the linear part of sRGB's curve (IEC 61966-2-1), in linear light and encoded."""
 
 _OPTIONS = {"enable_backward": False}
-_BOUNDS = (256, 2)  # threads of a block and blocks at a time: without, registers for half as many
+_BOUNDS = (256, 2)  # threads per block and blocks per multiprocessor: without it registers limit the occupancy to half
 _HALF_MAX = 65504.0
 _TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Two wide loads: alone, the compiler can't know that they are aligned.
+    // Two wide loads: the compiler does not know that the weights are aligned.
     const float4* wide = reinterpret_cast<const float4*>(weights.data + i);
     const float4 a = __ldg(wide), b = __ldg(wide + 1);
     wp::vec_t<8, float> taps;
@@ -52,13 +51,13 @@ _TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transp
 #endif
 """)
 def _load(weights: wp.array1d[Taps], i: int) -> Taps:
-    """The weights at a place; they begin at a multiple of 16 bytes."""
+    """Loads weights; the array begins at a multiple of 16 bytes."""
     ...
 
 
 @wp.func
 def _srgb(linear: float) -> float:
-    """Linear light to sRGB's curve, continued above 1; values below 0 count as 0."""
+    """Encodes linear light by sRGB's curve, continued above 1; values below 0 count as 0."""
     if linear <= FOOT:
         return 12.92 * wp.max(linear, 0.0)
     return 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
@@ -66,7 +65,7 @@ def _srgb(linear: float) -> float:
 
 @wp.func
 def _linear(code: float) -> float:
-    """The inverse; values below 0 count as 0."""
+    """Inverse of `_srgb`; values below 0 count as 0."""
     if code <= FOOT_CODE:
         return wp.max(code, 0.0) / 12.92
     return wp.pow((code + 0.055) / 1.055, 2.4)
@@ -74,13 +73,13 @@ def _linear(code: float) -> float:
 
 @wp.func
 def _at_most_one(value: float) -> float:
-    """Not `wp.min`, which would make a NaN 1."""
+    """Clamps to 1 and keeps NaN, which `wp.min` would turn into 1."""
     return wp.where(value > 1.0, 1.0, value)
 
 
 @wp.func
 def _at_least_zero(value: float) -> float:
-    """Not `wp.max`, which would make a NaN 0."""
+    """Clamps to 0 and keeps NaN, which `wp.max` would turn into 0."""
     return wp.where(value < 0.0, 0.0, value)
 
 
@@ -108,12 +107,12 @@ def _encode_six(
 
 
 def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.array) -> None:
-    """The planes of the coarse march as the network reads them.
+    """Encodes the planes of the coarse march for the network.
 
     Args:
         planes: float [9, H, W], of `march_coarse.PLANES`.
         near, far: Distances at which the smoke begins and ends, near < far.
-        hot: Whether the emission counts; otherwise it is 0.
+        hot: Whether the smoke emits light; otherwise that plane is 0.
         out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
             share of the span, 1 at its near end, 0 where there is no surface. A NaN stays one.
     """
@@ -139,7 +138,7 @@ def _decode(
 
 
 def decode(planes: wp.array, out: wp.array) -> None:
-    """Turns the network's planes into light.
+    """Decodes the network's planes into light.
 
     Args:
         planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
@@ -155,10 +154,10 @@ class PlaneKernels:
 
     Attributes:
         lanes: L, threads of `near` that share a block.
-        near: [blocks L], of reach x reach pixels: whether there is smoke in them. In: the guide. Out: int
+        near: [blocks L]: whether there is smoke in each block of reach x reach pixels. In: the guide. Out: int
             [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
-        compose: [ceil(H / STRIP), W]: the planes, clamped to each one's range, and 0 where neither a block nor one of
-            its eight neighbours has smoke; elsewhere a NaN stays one. In: T [G, ceil(H / stem), ceil(W / stem), N] or
+        compose: [ceil(H / STRIP), W]: the planes, clamped to their ranges, and 0 where neither a block nor one of its
+            eight neighbours has smoke; elsewhere NaN stays NaN. In: T [G, ceil(H / stem), ceil(W / stem), N] or
             larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
             first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; for
             each plane the group and the first of its stem x stem outputs, int [PLANES, 2]; stem; `near`. Out: float
@@ -181,15 +180,15 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         cuda: Whether for a GPU.
 
     Raises:
-        ValueError: An edge or a reach out of its range.
+        ValueError: The edge or the reach is out of its range.
     """
     if edge not in range(1, 16, 2):
         raise ValueError(f"edge: expected an odd number, at most 15, got {edge}")
     if reach not in (4, 8, 16, 32):
         raise ValueError(f"reach: expected 4, 8, 16 or 32, got {reach}")
     number: Any = wp.float16 if half else wp.float32
-    # Neighbouring threads read neighbouring pixels. One thread a block would read its rows with a block's width between
-    # it and its neighbour; maxima by atomics would need another launch that sets them to 0.
+    # Neighbouring threads read neighbouring pixels. With one thread per block, neighbouring threads would read pixels a
+    # block's width apart; maxima by atomics would need another launch that clears them.
     count = reach if cuda else 1
     column_type = wp.types.vector(STRIP + edge - 1, wp.float32)
     sums = wp.types.matrix((STRIP, PLANES), wp.float32)
@@ -209,7 +208,7 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         opacity = guide.shape[0] - 2
         pixels = float(0.0)
         for y in range(wp.static(reach)):
-            # Past the image's end its last pixels again, which are of the same block.
+            # Beyond the image's end its last pixels are read again, which belong to the same block.
             row = wp.min(i * wp.static(reach) + y, guide.shape[1] - 1)
             for x in range(wp.static(reach // count)):
                 column = wp.min(j * wp.static(reach) + x * wp.static(count) + lane, guide.shape[2] - 1)
@@ -232,7 +231,7 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
     ):
         strip, column = wp.tid()
         row = strip * wp.static(STRIP)
-        # A block's rows are whole strips.
+        # A block consists of whole strips.
         i = row // wp.static(reach)
         j = column // wp.static(reach)
         blocks = int(0)
@@ -250,12 +249,12 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
                     for y in range(wp.static(STRIP + edge - 1)):
                         r = row + y - wp.static(middle)
                         inside = across and r >= 0 and r < guide.shape[1]
-                        # Loaded in any case, not in a branch: all loads are under way at once.
+                        # Loaded without a branch: all loads are issued at once.
                         value = float(guide[c, wp.clamp(r, 0, guide.shape[1] - 1), q])
                         values[y] = wp.where(inside, value, 0.0)
                     for y in range(wp.static(edge)):
                         here = wp.vec4(values[y], values[y + 1], values[y + 2], values[y + 3])
-                        # Each weight serves a strip: loading one takes as long as using it.
+                        # Each weight is used for a whole strip: loading it takes as long as using it once.
                         total += wp.outer(here, _load(weights, (c * wp.static(edge) + x) * wp.static(edge) + y))
         for k in range(wp.static(PLANES)):
             group = places[k, 0]

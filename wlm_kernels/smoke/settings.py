@@ -1,8 +1,8 @@
-"""How smoke is marched through: the settings of all marches, with their defaults and ranges here alone."""
+"""Settings of ray marches through smoke, with their defaults and ranges."""
 
 from dataclasses import dataclass
 
-_LEAST_STEP = 0.01  # voxels: a march in shorter steps would hardly end
+_LEAST_STEP = 0.01  # voxels; shorter steps would take far too long
 
 
 @dataclass(frozen=True)
@@ -10,15 +10,15 @@ class March:
     """Settings of a march; lengths are in voxels.
 
     Attributes:
-        step: h, the longest step along a ray.
-        spacing: The largest distance between the nodes at which optical depths to the lights are known; None: as
-            `step`. For the coarse march of six lights, as `light_step` is.
-        light_step: The longest step between two nodes; None: as `spacing`.
-        jitter: Share of a step by which the samples of a pixel are shifted, 0 (each in its step's middle) to 1.
-        seed: Of the jitter, any whole number.
-        threshold: tau, the extinction per voxel above which smoke has a surface, whose distance is the depth.
-        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
-        cutoff: A ray ends where less than this is left of its transparency.
+        step: h, longest step along a ray.
+        spacing: Largest distance between the nodes of a lattice of optical depths to the lights; None: `step`. Used by
+            marches that have such a lattice, as is `light_step`.
+        light_step: Longest step between two nodes; None: `spacing`.
+        jitter: Range of the random shift of a pixel's samples, in steps: 0 (samples in the middles of steps) to 1.
+        seed: Seed of the jitter, any integer.
+        threshold: Extinction per voxel above which smoke has a surface; the depth is the distance to it.
+        g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
+        cutoff: A ray ends where its transparency falls below this.
 
     Raises:
         ValueError: A setting is out of its range.

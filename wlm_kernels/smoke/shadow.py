@@ -1,8 +1,8 @@
 """Shadows of obstacles on the surface of smoke, by a shadow map (section 4.5): bounds, map and look-up, four launches.
 
-The map is square, seen from the light, over the obstacles and two texels more on each side: its border is empty. None
-of it is read back, so that a graph can capture all. Lengths are the world's, measured from the first corner of the
-first triangle, so that float32 holds them wherever the scene lies.
+The map is square and is rendered from the light; it covers the obstacles and two texels on each side, so that its
+border is empty. No data is read back to the host, so that a CUDA graph can capture everything. Lengths are in the
+world's unit and relative to the first corner of the first triangle, so that float32 suffices wherever the scene is.
 """
 
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ import warp as wp
 from wlm_kernels.smoke.march import Empty, View, ray
 
 wp.set_module_options({"enable_backward": False})
-_BORDER = wp.constant(4.0)  # texels of the empty border, both sides together
-_LINES = wp.constant(32)  # threads of a triangle: each draws one row of so many
-_CORNERS = wp.constant(64)  # that a thread bounds
+_BORDER = wp.constant(4.0)  # texels of the empty border, sum of both sides
+_LINES = wp.constant(32)  # threads per triangle, each of which draws every 32nd row
+_CORNERS = wp.constant(64)  # corners per thread of `_bound`
 _FAR = wp.constant(3.0e38)
 _SMALLEST = wp.constant(1.0e-9)
 
 
 @wp.struct
 class _Map:
-    """Where the map lies, in the light's axes."""
+    """Position and size of the map, in the light's axes."""
 
     middle: wp.vec3
     half: float
@@ -47,7 +47,7 @@ def _place(bounds: wp.array(dtype=float), resolution: float) -> _Map:
 
 @wp.func
 def _on_map(m: _Map, resolution: float, p: wp.vec3) -> wp.vec3:
-    """Column and row, whole at texels' centres, and the height towards the light, of a point in the light's axes."""
+    """Column, row and height towards the light of a point in the light's axes; texel centres are at integers."""
     column = (p[0] - m.middle[0]) / m.texel + 0.5 * resolution - 0.5
     row = (m.middle[1] - p[1]) / m.texel + 0.5 * resolution - 0.5
     return wp.vec3(column, row, p[2])
@@ -107,7 +107,7 @@ def _draw(
     area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
     if area == 0.0:
         return
-    # The plane of the triangle, as heights over the map; one that is seen edge on has no height beyond its corners'.
+    # Slopes of the triangle's plane over the map; heights are clamped to those of its corners.
     across = ((b[2] - a[2]) * (c[1] - a[1]) - (c[2] - a[2]) * (b[1] - a[1])) / area
     down = ((b[0] - a[0]) * (c[2] - a[2]) - (c[0] - a[0]) * (b[2] - a[2])) / area
     lowest = wp.min(wp.min(a[2], b[2]), c[2])
@@ -160,7 +160,7 @@ def _look_up(
     p = _from_first(points, triangles, r.origin) + depth[i, j] * r.direction
     at = _on_map(m, float(size), axes * p)
     offset = wp.where(bias < 0.0, 1.5 * m.texel, bias)
-    # What lies outside is lit, as the border is, which is empty.
+    # Points outside the map are lit, as the empty border is.
     column = wp.clamp(at[0], -1.0, float(size))
     row = wp.clamp(at[1], -1.0, float(size))
     hidden = float(0.0)
@@ -185,18 +185,18 @@ def visibility(
     bias: float,
     empty: Empty,
 ) -> None:
-    """Finds the share of a directional light that obstacles leave to a surface.
+    """Computes the share of a directional light that reaches a surface past obstacles.
 
     Args:
         points: vec3 [V], corners.
         triangles: int32 [F, 3], rows of the points; at least one.
-        axes: 9 numbers, the rows of a turn to axes of which the third points to the light.
-        view: The camera in the world; its `voxel` and `moved` aren't used.
-        depth: float [H, W], distance along the rays to the surface; 0: there is none, which is lit.
-        out: float [H, W], in [0, 1].
+        axes: 9 numbers, rows of a rotation to axes of which the third points to the light.
+        view: The camera in the world; its `voxel` and `moved` are not used.
+        depth: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
+        out: float [H, W], written: in [0, 1].
         resolution: Texels along the map's edge.
-        bias: By how much an obstacle must be nearer to the light; below 0: 1.5 texels.
-        empty: Makes buffers.
+        bias: Distance by which an obstacle must be nearer to the light; below 0: 1.5 texels.
+        empty: Allocates buffers.
     """
     heights, bounds = empty((resolution, resolution), float), empty((6,), float)
     turn, device, faces = wp.mat33(*axes), depth.device, triangles.shape[0]

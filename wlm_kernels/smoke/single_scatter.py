@@ -8,11 +8,11 @@ x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps
     depth                   sum_n x_n
 
 where tau_l, the optical depth from a point to a light, is marched from the nodes of a lattice that all rays share, and
-is linear between them. All is exact in its derivatives: steps depend on the geometry alone, and a ray ends early
-only where float32 has nothing left of it. `wlm.ops.plain.march` is the same in torch.
+is linear between nodes. The derivatives are exact: steps depend only on the geometry, and a ray ends early only where
+its transparency is 0 in float32. `wlm.ops.plain.march` is the same in torch.
 
-Adjoints run from a ray's end to its start, so that what a sample hides is a running sum. They add to the density, the
-emission and the nodes by atomics: on CUDA in any order, so that the last bits change from run to run.
+Adjoints run from a ray's end to its start, so that the light behind a sample is a running sum. They add to the density,
+the emission and the nodes by atomics: on CUDA in any order, so that the last bits vary from run to run.
 """
 
 from typing import Any
@@ -23,17 +23,17 @@ from wlm_kernels.smoke.march import absorbed, mean_transparency, node_position, 
 
 wp.set_module_options({"enable_backward": False})
 
-# A length that is a whole number of steps mustn't be cut into one more by rounding.
+# Rounding must not add a step to a length that is a whole number of steps.
 _SLACK = 1.0001
 
-# exp(-104) is 0 in float32. Depths end there: the adjoint subtracts what was added, and a sum of thousands, of which
-# nothing is seen, would leave it no digits of what is.
+# exp(-104) is 0 in float32. Depths are limited to 104: the adjoint subtracts what was added, and a sum of thousands
+# would leave no digits for the visible part.
 _OPAQUE = wp.constant(104.0)
 
 
 @wp.struct
 class _Cell:
-    """The eight values that a point lies between; the weights of those outside the grid are 0."""
+    """The eight grid values around a point; values outside the grid have weight 0."""
 
     low: wp.vec3i
     high: wp.vec3i
@@ -43,7 +43,7 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """Where `q` lies, in units of the grid, whose value i is at i."""
+    """The values around q, in the grid's units: value i is at i."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))
@@ -223,7 +223,7 @@ def _march_backward(
     size = size_of(density)
     r = steps_along(size, origin[i], direction[i], step)
     tau = depth[i]
-    hidden = float(0.0)  # what the samples behind this one give to the objective
+    hidden = float(0.0)  # contribution of the samples behind this one to the objective
     for back in range(count[i]):
         n = count[i] - 1 - back
         p = point_on(r, n, 0.5)
@@ -250,24 +250,24 @@ def _march_backward(
 
 
 def depths(density, toward, step: float, nodes) -> None:
-    """Optical depths towards lights on a lattice.
+    """Computes optical depths towards lights at the nodes of a lattice.
 
     Args:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         toward: vec3 [L], the directions to the lights, of length 1.
         step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; `march_guide.nodes_along` has the number of nodes,
-            `march.node_position` their places.
+        nodes: float [L, A, B, C], written; `march.nodes_along` gives the numbers of nodes and `march.node_position`
+            their positions.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """The adjoint of `depths`.
+    """Adjoint of `depths`.
 
     Args:
-        toward, step: As for `depths`.
+        toward, step: Arguments of `depths`.
         grad_nodes: float [L, A, B, C].
         grad_density: float [X, Y, Z], added to.
     """
@@ -280,14 +280,14 @@ def march(density, emission, nodes, origin, direction, step: float, scattered, e
 
     Args:
         density: float [X, Y, Z], extinction per voxel, at least 0.
-        emission: vec3 [X, Y, Z], radiance emitted per voxel; of shape [0, 0, 0]: nothing emits.
+        emission: vec3 [X, Y, Z], radiance emitted per voxel; shape [0, 0, 0]: no emission.
         nodes: float [L, A, B, C] from `depths`; L may be 0.
         origin, direction: vec3 [R], in voxels; directions of length 1.
         step: The longest step, in voxels.
         scattered: float [R, L], written.
         emitted: vec3 [R], written.
-        depth: float [R], written: the optical depth along each ray, as far as light gets through.
-        count: int [R], written: the samples of each ray, as far as light gets through.
+        depth: float [R], written: optical depth along each ray, up to where it is opaque.
+        count: int [R], written: number of samples of each ray, up to where it is opaque.
     """
     inputs = [density, emission, nodes, origin, direction, step * _SLACK]
     wp.launch(_march, origin.shape, inputs=inputs, outputs=[scattered, emitted, depth, count], device=density.device)
@@ -309,15 +309,15 @@ def march_backward(
     grad_emission,
     grad_nodes,
 ) -> None:
-    """The adjoint of `march`; the density's share by way of the nodes is that of `depths_backward`.
+    """Adjoint of `march`; the gradient that reaches the density through the nodes is added by `depths_backward`.
 
     Args:
-        density, emission, nodes, origin, direction, step, depth, count: As for `march`, and as it wrote them.
+        density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
         grad_scattered: float [R, L].
         grad_emitted: vec3 [R].
         grad_depth: float [R].
         grad_density: float [X, Y, Z], added to.
-        grad_emission: vec3 [X, Y, Z], added to; of shape [0, 0, 0]: not computed.
+        grad_emission: vec3 [X, Y, Z], added to; shape [0, 0, 0]: not computed.
         grad_nodes: float [L, A, B, C], added to.
     """
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]

@@ -18,11 +18,9 @@ from builders.layered_sets import random_layers
 from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
-from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
 from wlm.atlas.mips import make_tail
 from wlm.export import ENGINES, export
-from wlm.export.engines.atlas import export_atlas
 from wlm.formats.light import read_light
 from wlm.inspection import inspect
 from wlm.lightmap.bundle import sheet_bundle
@@ -30,11 +28,8 @@ from wlm.lightmap.bundle import sheet_bundle
 ALL = (4, 3, 2, 1, 4, 0)
 
 
-def atlas_folder(folder, kind, stored="half", mesh=None):
-    mesh = sheet() if mesh is None else mesh
-    model = random_atlas(mesh, kind, stored)
-    exporter.export(model, folder, mesh)
-    return model, exporter.read_folder(folder)
+def atlas_model(kind, stored="half", mesh=None):
+    return random_atlas(sheet() if mesh is None else mesh, kind, stored)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -58,9 +53,9 @@ def test_one_engines_files_take_the_place_of_anothers(tmp_path):
     for engine in (*ENGINES[1:], ENGINES[0]):
         paths = export(random_lightmap((2, 1, 2, 0)), folder, engine)
         assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
-    _, output = atlas_folder(tmp_path / "made", "tiles")
-    for engine in (*ENGINES, "raw"):
-        paths = export_atlas(output, tmp_path / "atlas", engine)
+    model = atlas_model("tiles")
+    for engine in (*ENGINES, None):
+        paths = export(model, tmp_path / "atlas", engine)
         assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
         info = json.loads(paths[-1].read_text())
         assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "atlas"))
@@ -72,15 +67,13 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     mesh = sheet()
     model = random_atlas(mesh, MIXED)
     model = dataclasses.replace(model, tail=make_tail(mesh, "bc6h"))
-    exporter.export(model, tmp_path / "made", mesh)
-    output = exporter.read_folder(tmp_path / "made")
-    for engine in (*ENGINES, "raw"):
-        paths = export_atlas(output, tmp_path / "out", engine)
+    for engine in (*ENGINES, None):
+        paths = export(model, tmp_path / "out", engine)
         info = json.loads(paths[-1].read_text())
         text = "".join(path.read_text() for path in paths if path.suffix in TEXTS - {".md", ".cs"})
         assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks|tail)\b", text)) == set(info["textures"])
     assert info["textures"]["tail"]["file"] == "tail.dds"
-    assert (tmp_path / "out" / "tail.dds").read_bytes() == (tmp_path / "made" / "tail.dds").read_bytes()
+    assert (tmp_path / "out" / "tail.dds").read_bytes().endswith(model.tail.tobytes())
 
 
 def test_sheets_of_light_have_a_folder_each(tmp_path):
@@ -133,20 +126,19 @@ def test_atlases_of_one_lightmap_share_no_program_of_three(tmp_path):
     """three.js compiles once for each key: under one key one atlas would be drawn with the other's shader."""
     keys, sources = set(), set()
     for kind in ("tiles", "plain"):
-        folder, (_, output) = tmp_path / f"out-{kind}", atlas_folder(tmp_path / kind, kind)
-        export_atlas(output, folder, "three")
+        folder, model = tmp_path / f"out-{kind}", atlas_model(kind)
+        export(model, folder, "three")
         shutil.copy(folder / "atlas.js", folder / "atlas.mjs")
         (folder / "key.mjs").write_text(KEY)
         done = subprocess.run(["node", "key.mjs"], cwd=folder, capture_output=True, text=True, check=True)
         keys.add(done.stdout)
-        sources.add(output.model.source)
+        sources.add(model.source)
     assert len(sources) == 1 and len(keys) == 2
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: install nodejs")
 def test_a_file_that_three_cannot_load_is_named(tmp_path):
-    _, output = atlas_folder(tmp_path / "made", "plain")
-    export_atlas(output, tmp_path / "out", "three")
+    export(atlas_model("plain"), tmp_path / "out", "three")
     (tmp_path / "out" / "atlas.js").rename(tmp_path / "out" / "atlas.mjs")
     (tmp_path / "out" / "atlas.glsl").unlink()
     (tmp_path / "out" / "key.mjs").write_text(KEY)
@@ -159,24 +151,20 @@ def test_what_cannot_be_exported_for_an_engine(tmp_path):
     layers = random_layers()
     layers.sheets = {sheet: model for sheet, model in layers.sheets.items() if sheet.linear}
     assert "expected a layer of light" in error_of(export, layers, tmp_path / "a", "three")
-    _, output = atlas_folder(tmp_path / "made", "plain", "astc")
-    assert "engine: expected one of raw" in error_of(export_atlas, output, tmp_path / "a", "cry")
-    assert "there is no DDS of ASTC" in error_of(export_atlas, output, tmp_path / "a", "three")
-    assert {path.name for path in export_atlas(output, tmp_path / "a", "godot")} > {"colour.exr"}
-    assert {path.name for path in export_atlas(output, tmp_path / "a", "raw")} > {"colour.ktx2"}
-    assert "another folder" in error_of(export_atlas, output, output.folder, "godot")
-    (tmp_path / "made" / "colour.exr").unlink()
-    assert "colour.exr: no such file; compress again" in error_of(export_atlas, output, tmp_path / "b", "godot")
-    assert sorted(os.listdir(tmp_path)) == ["a", "made"]
+    model = atlas_model("plain", "astc")
+    assert "there is no DDS of ASTC" in error_of(export, model, tmp_path / "a", "three")
+    assert {path.name for path in export(model, tmp_path / "a", "godot")} > {"colour.exr"}
+    assert {path.name for path in export(model, tmp_path / "a")} > {"colour.ktx2"}
+    assert sorted(os.listdir(tmp_path)) == ["a"]
 
 
 def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
-    model, output = atlas_folder(tmp_path / "made", "plain", "bc6h")
-    assert model.texels.shape == (18, 23, 3)
-    export_atlas(output, tmp_path / "out", "three")
-    np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels)
-    export_atlas(output, tmp_path / "out", "raw")
-    assert (tmp_path / "out" / "colour.dds").read_bytes() == (tmp_path / "made" / "colour.dds").read_bytes()
+    model = atlas_model("plain", "bc6h")
+    assert model.texels.shape == (1, 18, 23, 3)
+    export(model, tmp_path / "out", "three")
+    np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels[0])
+    export(model, tmp_path / "out")
+    assert (tmp_path / "out" / "colour.dds").read_bytes().endswith(model.blocks.tobytes())
 
 
 def compiled(text, folder, *words):
@@ -218,12 +206,12 @@ def as_glsl(text):
 @pytest.mark.parametrize("kind", [*KINDS, MIXED])
 def test_godots_atlas_shows_its_light(kind, tmp_path):
     """Run as GLSL, with the EXRs as Godot imports them: in floats."""
-    model, output = atlas_folder(tmp_path / "made", kind, mesh=charts())
-    export_atlas(output, tmp_path / "out", "godot")
+    model = atlas_model(kind, mesh=charts())
+    export(model, tmp_path / "out", "godot")
     text = as_glsl((tmp_path / "out" / "atlas.gdshader").read_text())
     uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
     if model.method == "tiles":
-        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
         uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
     bound = {path.stem: read_light(path)[0] for path in (tmp_path / "out").glob("*.exr")}
     bound = {f"wlm_atlas_{name}": np.float32(np.pad(v[..., :3], ((0, 0), (0, 0), (0, 1)))) for name, v in bound.items()}
@@ -286,15 +274,15 @@ def test_unitys_light_has_its_top_where_unity_has_it(down, tmp_path):
 @pytest.mark.parametrize("down", [0, 1])
 def test_unitys_surface_shows_its_light(down, tmp_path):
     """At UVs whose v an importer turned round, and at glTF's own."""
-    model, output = atlas_folder(tmp_path / "made", "plain", mesh=charts())
-    export_atlas(output, tmp_path / "out", "unity")
+    model = atlas_model("plain", mesh=charts())
+    export(model, tmp_path / "out", "unity")
     text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "out" / "WlmAtlas.shader").read_text(), re.DOTALL)[1]
     text = re.sub(r"^ *(#pragma|#include \"UnityCG|sampler2D|float4 _MainTex_ST).*$", "", text, flags=re.MULTILINE)
     text = text.replace('#include "WlmAtlas.hlsl"', "\n" + (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
     head = "#define WLM_DOWN 0\n" + "#define WLM_V_DOWN\n" * down + "Texture2D<float4> u_points;\n"
     uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
     given = uv if down else np.float32([0, 1]) + np.float32([1, -1]) * uv
-    colour = np.concatenate([model.texels, np.ones_like(model.texels[..., :1])], 2).astype(np.float16)
+    colour = np.concatenate([model.texels[0], np.ones_like(model.texels[0, ..., :1])], 2).astype(np.float16)
     bound = {"u_points": np.pad(given, ((0, 0), (0, 2)))[None], "wlm_atlas_colour": colour}
     place = "u_points.Load(int3(pixel, 0)).xy"
     shown = f"frag(vert(float4(0, 0, 0, 1), float2(0.5, 0.5), {place}))"
@@ -313,8 +301,7 @@ Texture2D _MainTexture; SamplerState sampler_MainTexture;
 
 @pytest.mark.parametrize("kind", [*KINDS, MIXED])
 def test_unitys_surface_compiles(kind, tmp_path):
-    _, output = atlas_folder(tmp_path / "made", kind)
-    export_atlas(output, tmp_path / "out", "unity")
+    export(atlas_model(kind), tmp_path / "out", "unity")
     shader = (tmp_path / "out" / "WlmAtlas.shader").read_text()
     text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)[1]
     text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
@@ -330,8 +317,7 @@ def test_unitys_components_parse(tmp_path):
     from tree_sitter import Language, Parser
 
     export(random_lightmap(), tmp_path / "lightmap", "unity")
-    _, output = atlas_folder(tmp_path / "made", "tiles")
-    export_atlas(output, tmp_path / "atlas", "unity")
+    export(atlas_model("tiles"), tmp_path / "atlas", "unity")
     for path in (tmp_path / "lightmap" / "WlmLightmap.cs", tmp_path / "atlas" / "WlmAtlas.cs"):
         tree = Parser(Language(sharp.language())).parse(path.read_bytes())
         assert not tree.root_node.has_error, path

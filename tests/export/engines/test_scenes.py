@@ -1,4 +1,4 @@
-"""Engine folders of scenes: each object reads its part, as far as what runs here tells."""
+"""Kits of scenes: each object reads its part of a sheet, as far as the compilers and players here can tell."""
 
 import json
 import os
@@ -12,9 +12,8 @@ from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
 from test_folders import TEXTS, UNITY, as_glsl, compiled
 
-from wlm.atlas.scene.model import SHORT_ENTRY
-from wlm.export import ENGINES
-from wlm.export.engines.scene import export_scene
+from wlm.atlas.model import SHORT_ENTRY
+from wlm.export import ENGINES, export
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.inspection import inspect
 
@@ -23,9 +22,7 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A folder of the compression, and its model."""
-    folder = tmp_path_factory.mktemp("scene") / "scene"
-    return folder / "made", scene_folder(folder)
+    return scene_folder(tmp_path_factory.mktemp("scene") / "scene")
 
 
 @pytest.fixture(scope="module", params=["mixed", "rgb9e5", "short", "apart"])
@@ -38,7 +35,7 @@ def each_form(request, tmp_path_factory):
     model = scene_folder(folder, colour="rgb9e5", **settings.get(request.param, {}))
     assert bool(model.levels) == (request.param == "short") and bool(model.later) == (request.param == "apart")
     assert (model.lut.shape[2] == SHORT_ENTRY) == (request.param in settings)
-    return folder / "made", model
+    return model
 
 
 def squares(info):
@@ -61,9 +58,9 @@ def check(found, model, state):
 
 
 def test_each_engines_files_take_the_place_of_anothers(made, tmp_path):
-    source, model = made
+    model = made
     for engine in (*ENGINES, "raw"):
-        paths = export_scene(source, tmp_path / "out", engine)
+        paths = export(model, tmp_path / "out", None if engine == "raw" else engine)
         assert set(os.listdir(tmp_path / "out")) == {path.name for path in paths} and len(paths) <= 12
         text = "".join(path.read_text() for path in paths if path.suffix in TEXTS)
         assert "wlm_object" in text and not re.search(r"@[A-Z]+@", text)
@@ -71,40 +68,34 @@ def test_each_engines_files_take_the_place_of_anothers(made, tmp_path):
         assert info["uv_set"] == 1 and info["states"] == list(model.states) and len(info["objects"]) == 3
         assert set(info["textures"]) == {"sheets", "lut", "factors", "colour", "blocks"}
         assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "out"))
-    paths = export_scene(source, tmp_path / "out", "raw", shader="wgsl")
-    assert "fn wlm_object" in (tmp_path / "out" / "scene.wgsl").read_text() and paths[-1].name == "bundle.json"
+    paths = export(model, tmp_path / "out", shader="wgsl")
+    assert "fn wlm_object" in (tmp_path / "out" / "atlas.wgsl").read_text() and paths[-1].name == "bundle.json"
 
 
-def test_inspect_names_a_scenes_folders(made, tmp_path):
+def test_inspect_names_a_scenes_files(made, tmp_path):
     """Their pictures are no lightmaps to compress, the file no network."""
-    source, _ = made
-    ((folder,), (file,)) = inspect(source), inspect(source / "scene.wlm")
-    assert folder.what.startswith("the compressed lightmaps of a scene") and not folder.command
-    assert file.what.startswith("the lightmaps of a scene, compressed") and not file.command
-    for engine in (*ENGINES, "raw"):
-        export_scene(source, tmp_path / engine, engine)
-        (found,) = inspect(tmp_path / engine)
+    made.save(tmp_path / "made.wlm")
+    (file,) = inspect(tmp_path / "made.wlm")
+    assert file.what.startswith("atlas") and not file.command
+    for engine in (*ENGINES, None):
+        export(made, tmp_path / f"{engine}", engine)
+        (found,) = inspect(tmp_path / f"{engine}")
         assert "wlm export wrote" in found.what and not found.command
 
 
-def test_what_cannot_be_exported(made, tmp_path):
-    source, _ = made
-    assert "engine: expected one of raw" in error_of(export_scene, source, tmp_path / "a", "cry")
-    assert "another folder" in error_of(export_scene, source, source, "three")
-    assert "expected a folder that compress wrote of a scene" in error_of(export_scene, tmp_path, tmp_path / "a", "raw")
+def test_scenes_that_cannot_be_exported(made, tmp_path):
+    assert "engine: expected one of three" in error_of(export, made, tmp_path / "a", "cry")
     other = scene_folder(tmp_path / "other", 2)
-    line = error_of(export_scene, tmp_path / "other" / "made", tmp_path / "deep" / "a", "godot")
+    line = error_of(export, other, tmp_path / "deep" / "a", "godot")
     assert line.startswith(f"{other.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1")
-    (tmp_path / "other" / "made" / "scene.glb").unlink()
-    assert "scene.glb: no such file" in error_of(export_scene, tmp_path / "other" / "made", tmp_path / "a", "three")
     assert os.listdir(tmp_path) == ["other"]
 
 
 @pytest.mark.parametrize("state", [-0.5, 1.5])
 def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     """With the textures as they lie in their files; of the blocks the bytes are compared, and their texels bound."""
-    source, model = each_form
-    export_scene(source, tmp_path, "raw")
+    model = each_form
+    export(model, tmp_path)
     info = json.loads((tmp_path / "bundle.json").read_text())
     assert ("blocks" in info["textures"]) == (model.colour == "mixed")
 
@@ -121,7 +112,7 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
         data = (tmp_path / info["textures"]["blocks"]["file"]).read_bytes()
         assert data[148:] == model.blocks.tobytes()
         bound["wlm_scene_blocks"] = np.pad(model.block_texels, [(0, 0)] * 3 + [(0, 1)])
-    text = (tmp_path / "scene.glsl").read_text()
+    text = (tmp_path / "atlas.glsl").read_text()
     assert ("wlm_scene_grad" in text) == bool(model.levels)
     picture = np.zeros((SIZE, SIZE, 3))
     for (x, y, width, height), place, sheet in squares(info):
@@ -135,8 +126,8 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
 
 @pytest.mark.parametrize("state", [0.0, 1.5, 2.0])
 def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkeypatch):
-    source, model = each_form
-    export_scene(source, tmp_path, "unreal")
+    model = each_form
+    export(model, tmp_path, "unreal")
     script = Script(tmp_path / "wlm_scene.py", monkeypatch, ["left", "above", "floor"])
     # One of the level's actors has no light, one object no actor.
     assert script.slots == [("left", 0), ("above", 0)] and "below" in script.unreal.log_warning.call_args.args[0]
@@ -156,8 +147,8 @@ def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkey
 
 
 def test_godots_shader_reads_each_objects_part(each_form, tmp_path):
-    source, model = each_form
-    export_scene(source, tmp_path, "godot")
+    model = each_form
+    export(model, tmp_path, "godot")
     text = as_glsl((tmp_path / "scene.gdshader").read_text())
     info = json.loads((tmp_path / "bundle.json").read_text())
     bound = textures_of(tmp_path, info)
@@ -179,8 +170,8 @@ def test_godots_shader_reads_each_objects_part(each_form, tmp_path):
 
 
 def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
-    source, model = each_form
-    export_scene(source, tmp_path, "unity")
+    model = each_form
+    export(model, tmp_path, "unity")
     assert (tmp_path / "factors.bytes").stat().st_size == 148 + 16 * len(model.states) * model.factor.shape[1]
     text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmScene.shader").read_text(), re.DOTALL)[1]
     text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")

@@ -12,11 +12,9 @@ from builders.checks import error_of
 from builders.engine_scripts import Script, node_gives, pixels_of
 from builders.synthetic import random_model as random_lightmap
 
-from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
 from wlm.export import export
 from wlm.export.engines import kit
-from wlm.export.engines.atlas import export_atlas
 from wlm.export.engines.kit import asset_name
 from wlm.lightmap.decode import Decoder
 
@@ -25,17 +23,15 @@ ALL = (4, 3, 2, 1, 4, 0)
 
 @pytest.mark.parametrize("kind", [*KINDS, MIXED])
 def test_an_atlas_node_gives_its_light(kind, tmp_path, monkeypatch):
-    mesh = charts()
-    model = random_atlas(mesh, kind)
-    exporter.export(model, tmp_path / "made", mesh)
-    export_atlas(exporter.read_folder(tmp_path / "made"), tmp_path / "out", "unreal")
+    model = random_atlas(charts(), kind)
+    export(model, tmp_path / "out", "unreal")
     script = Script(tmp_path / "out" / "wlm_atlas.py", monkeypatch)
     files = json.loads((tmp_path / "out" / "bundle.json").read_text())["textures"]
     assert set(script.settings) == {each["file"] for each in files.values()} and script.slots == [0]
     ((code, inputs),) = script.customs()
     uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
     if model.method == "tiles":
-        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
         uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
     bound = {f"wlm_atlas_{name}": pixels_of(str(tmp_path / "out" / each["file"])) for name, each in files.items()}
     # What is filtered are halves there; a table of coordinates is floats, which WebGPU doesn't filter.

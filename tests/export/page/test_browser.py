@@ -213,9 +213,9 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
     """A cube of six charts, and one inside that is never seen."""
     mesh = atlas_meshes.charts()
     model = atlas_models.random_model(mesh, kind)
-    wlm.atlas.export(model, tmp_path / "cube", mesh)
+    model.save(tmp_path / "cube.wlm")
     _, light = atlas_meshes.write_files(tmp_path, mesh)
-    write_page(tmp_path / "page.html", [tmp_path / "cube"], original=light)
+    write_page(tmp_path / "page.html", [tmp_path / "cube.wlm"], original=light)
     page = show(tmp_path / "page.html")
     box, exposure = page.locator("#view").bounding_box(), page.evaluate("wlm.then(({manifest}) => manifest.exposure)")
     shown, decoder, seen = picture(page), model.decoder(), set()
@@ -234,7 +234,7 @@ def test_a_texel_of_an_atlas(kind, tmp_path, show):
         else:
             place = torch.tensor([[(column + 0.5) / 64, (row + 0.5) / 48]], dtype=torch.float32)
             assert np.abs(decoded - decoder.read(place).numpy()[0]).max() < 2 / 255 * 3
-        original = mesh.filled[row, column]
+        original = mesh.sheets[0].lightmap[row, column]
         assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
         if kind == "tiles":
             wide, high, left, top = map(int, re.search(r"(\d+) × (\d+) texels at (\d+), (\d+)", text).groups())
@@ -348,8 +348,8 @@ def test_the_help_tells_what_the_page_can_do(compared, tmp_path, show):
     for words in ("the hour", "play, pause", "decoded, original, split, error", "error factor", "fold this panel"):
         assert words in text
     mesh = atlas_meshes.sheet()
-    wlm.atlas.export(atlas_models.random_model(mesh, atlas_models.KINDS[0]), tmp_path / "sheet", mesh)
-    write_page(tmp_path / "atlas.html", [tmp_path / "sheet"])
+    atlas_models.random_model(mesh, atlas_models.KINDS[0]).save(tmp_path / "sheet.wlm")
+    write_page(tmp_path / "atlas.html", [tmp_path / "sheet.wlm"])
     text = told(show(tmp_path / "atlas.html"))
     assert "exposure" in text and "turn the camera" in text
     for words in ("hour", "frame", "play", "original", "error"):
@@ -360,8 +360,8 @@ def test_the_help_tells_what_the_page_can_do(compared, tmp_path, show):
 def test_atlases_read_as_in_python(kind, tmp_path, show):
     mesh = atlas_meshes.sheet()
     model = atlas_models.random_model(mesh, kind)
-    wlm.atlas.export(model, tmp_path / "sheet", mesh)
-    write_page(tmp_path / "page.html", [tmp_path / "sheet"])
+    model.save(tmp_path / "sheet.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "sheet.wlm"])
     page = show(tmp_path / "page.html")
     uv = np.random.default_rng(0).random((500, 2)).astype(np.float32)
     expected = model.decoder().read(torch.from_numpy(uv)).numpy()
@@ -375,7 +375,7 @@ def test_atlases_read_as_in_python(kind, tmp_path, show):
 
 @pytest.mark.parametrize("outputs", [27, _long(12), _long(48)])
 def test_probes_decode_as_in_python(outputs, tmp_path, show):
-    model = probe_models.random_model(count=12, probes=40, outputs=outputs, positions=True)
+    model = probe_models.whole_model(count=12, probes=40, outputs=outputs, positions=True)
     model.save(tmp_path / "probe.wlm")
     position = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]) + model.origin
     document, _ = document_from_arrays(position, np.array([[0, 1, 2]]), np.zeros((3, 2)), "triangle")

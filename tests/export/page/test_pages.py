@@ -87,8 +87,8 @@ def test_frames_of_the_original_are_spread_over_the_day(tmp_path):
 
 
 def test_what_has_no_page_is_said_in_one_line(tmp_path):
-    probe_models.random_model(positions=False).save(tmp_path / "probe.wlm")
-    probe_models.random_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
+    probe_models.whole_model(positions=False).save(tmp_path / "probe.wlm")
+    probe_models.whole_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
     probes = tmp_path / "probes.npz"
     np.savez(probes, position=np.zeros((2, 3)))
     write_exr(tmp_path / "day.exr", np.ones((4, 4, 3), np.float32))
@@ -96,7 +96,6 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
         ([], {}, "found none"),
         ([tmp_path / "absent.wlm"], {}, "absent.wlm"),
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
-        ([FILES / "atlas-tiles.wlm"], {}, "expected the folder"),
         ([FILES / "lightmap.wlm", FILES / "lightmap.wlm"], {}, "expected one file"),
         ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
         ([FILES / "lightmap.wlm"], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
@@ -121,7 +120,7 @@ def test_the_scores_of_a_page_are_those_of_evaluate(tmp_path):
     page = make_page([tmp_path / "city.wlm"], original=tmp_path / "set", hours=3)
     expected = wlm.lightmap.evaluate(model, lightmaps, metrics=("psnr",)).light.psnr_by_time[[0, 2, 4]]
     np.testing.assert_allclose(page.manifest["reference"]["psnr"], expected)
-    probes = probe_models.random_model(positions=True)
+    probes = probe_models.whole_model(positions=True)
     probes.save(tmp_path / "probe.wlm")
     values = np.random.default_rng(0).random((probes.probes, 9, 3), np.float32)
     values[probes.dead] = 0.0
@@ -143,7 +142,7 @@ def test_a_dark_hour_has_no_score_and_its_page_is_made(tmp_path):
 
 
 def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
-    probe_models.random_model(probes=50, dead=0, positions=True).save(tmp_path / "live.wlm")
+    probe_models.whole_model(probes=50, dead=0, positions=True).save(tmp_path / "live.wlm")
     assert make_page([tmp_path / "live.wlm"]).manifest["probe"]["count"] == 50
 
 
@@ -173,9 +172,9 @@ def test_frames_of_smoke_are_of_one_size(tmp_path):
 
 def test_the_command_writes_a_page_of_a_folder(tmp_path):
     mesh = atlas_meshes.sheet()
-    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=0))
-    wlm.atlas.export(model, tmp_path / "sheet", mesh)
-    result = CliRunner().invoke(app, ["web", str(tmp_path / "sheet"), "-o", str(tmp_path / "page.html")])
+    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
+    model.save(tmp_path / "sheet.wlm")
+    result = CliRunner().invoke(app, ["web", str(tmp_path / "sheet.wlm"), "-o", str(tmp_path / "page.html")])
     assert result.exit_code == 0, result.output
     manifest, _ = parts(tmp_path / "page.html")
     assert manifest["kind"] == "atlas" and dict(manifest["figures"])["profile"] == "tiny"

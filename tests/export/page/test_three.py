@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from builders.probe_models import random_model
+from builders.probe_models import whole_model as random_model
 
 from wlm.export import export
 from wlm.probe.sphere import irradiance

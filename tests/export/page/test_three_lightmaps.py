@@ -10,10 +10,8 @@ from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
 from builders.synthetic import random_model as random_lightmap
 
-from wlm.atlas import exporter
 from wlm.atlas.exact import decode64
 from wlm.export import export
-from wlm.export.engines.atlas import export_atlas
 
 _SIZE = 96
 _PAGE = """<!doctype html>
@@ -106,10 +104,8 @@ def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, brows
     ("kind", "colour"), [*((kind, "rgb9e5") for kind in KINDS), ("plain", "bc6h"), (MIXED, "mixed")]
 )
 def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
-    mesh = charts()
-    model = random_atlas(mesh, kind, colour)
-    exporter.export(model, tmp_path / "made", mesh)
-    export_atlas(exporter.read_folder(tmp_path / "made"), tmp_path / "three_js", "three")
+    model = random_atlas(charts(), kind, colour)
+    export(model, tmp_path / "three_js", "three")
     page, errors = opened(browser, tmp_path / "three_js", serve, _ATLAS)
     v, u = np.mgrid[:_SIZE, :_SIZE] / _SIZE + 0.5 / _SIZE
     uv = np.stack([u, v], -1).reshape(-1, 2).astype(np.float32)
@@ -117,7 +113,7 @@ def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
     inside = np.ones((_SIZE, _SIZE), bool)
     if model.method == "tiles":
         # A point on a border of tiles may be read from either.
-        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
         inside = (np.abs(place - np.rint(place)).min(1) > 1e-3).reshape(_SIZE, _SIZE)
     # As of the shader alone: a filter's place between two texels has 8 bits, in a table too.
     allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))

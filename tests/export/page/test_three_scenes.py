@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from builders.scene_folders import expected_picture, scene_folder
 
-from wlm.export.engines.scene import export_scene
+from wlm.export import export
 
 _SIZE = 96
 _PAGE = """<!doctype html>
@@ -17,7 +17,7 @@ import { loadScene } from './scene.js';
 const renderer = new THREE.WebGLRenderer(), size = SIZE;
 const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
 window.draw = async (name, state) => {
-  const { scene } = await new GLTFLoader().loadAsync('scene.glb');
+  const { scene } = await new GLTFLoader().loadAsync('mesh.glb');
   const shared = new THREE[`Mesh${name}Material`]({color: 0xffffff});
   scene.traverse((each) => { if (each.isMesh) each.material = shared; });
   // A node below one that has light, and its own has none.
@@ -47,7 +47,7 @@ window.ready = true;
 def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, browser, serve):
     model = scene_folder(tmp_path / "scene", uv_set, colour=colour)
     assert model.colour == colour
-    export_scene(tmp_path / "scene" / "made", tmp_path / "out", "three")
+    export(model, tmp_path / "out", "three")
     (tmp_path / "out" / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
     page, errors = browser.new_page(), []
     page.on("pageerror", lambda error: errors.append(str(error)))

@@ -20,17 +20,15 @@ from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
+from wlm.atlas.bundles import sheet_texels
 from wlm.atlas.colour import quantise
+from wlm.atlas.decode import Decoder as AtlasDecoder
 from wlm.atlas.exact import decode64
-from wlm.atlas.scene.decode import Decoder as SceneDecoder
-from wlm.atlas.scene.exporter import factor_texels, sheet_texels
-from wlm.atlas.scene.model import SceneModel, SceneProfile, SheetPlace, pack_tiles
-from wlm.atlas.scene.shader import scene_glsl
-from wlm.atlas.shader import atlas_glsl
+from wlm.atlas.model import AtlasModel, Profile, SheetPlace, pack_tiles
+from wlm.atlas.shader import glsl as atlas_glsl
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
-from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
@@ -55,14 +53,15 @@ def atlas(kind, _) -> Subject:
     uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
     if model.method == "tiles":
         # A point on a border of tiles may be read from either.
-        place = (uv * [model.width, model.height] - 0.5) / model.profile.tile
+        (sheet,) = model.sheets
+        place = (uv * [sheet.width, sheet.height] - 0.5) / model.profile.tile
         uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
-    bound = {"u_points": points_of(uv), "wlm_atlas_colour": rgba(model.texels)}
+    bound = {"u_points": points_of(uv), "wlm_atlas_colour": rgba(model.texels[0])}
     if model.method != "plain":
         tiles = model.method == "tiles"
         bound["wlm_atlas_lut"] = model.lut.astype(np.uint16) if tiles else (model.lut / 65535).astype(np.float32)
     if kind == MIXED:
-        bound["wlm_atlas_blocks"] = rgba(model.block_texels)
+        bound["wlm_atlas_blocks"] = rgba(model.block_texels[0])
     main = POINTS + "vec4 shown(ivec2 pixel) { return vec4(wlm_atlas(texelFetch(u_points, pixel, 0).xy), 1.0); }\n"
     # Neighbouring texels differ by up to 3, and a 512th of a step is lost along each axis. Where a table is filtered
     # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
@@ -78,13 +77,14 @@ def mips(kind, _) -> Subject:
     near = atlas(kind, None)
     model = replace(random_atlas(charts(), kind), tail=np.zeros((1, 16), np.uint8))
     texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
-    near.bound["u_change"] = points_of(np.stack([texels / model.width, 0 * texels], 1))
-    rows, columns = -(-model.height // 16) * 4 + 4, -(-model.width // 16) * 4 + 4
+    height, width = model.sheets[0].size
+    near.bound["u_change"] = points_of(np.stack([texels / width, 0 * texels], 1))
+    rows, columns = -(-height // 16) * 4 + 4, -(-width // 16) * 4 + 4
     tail = np.zeros((rows, columns, 4), np.float16)
     tail[:] = (np.arange(columns) / columns)[None, :, None]
     near.bound["wlm_atlas_tail"] = tail
     points = near.bound["u_points"][0, :, :2]
-    place = points[:, 0].astype(np.float64) * model.width / 4 - 0.5
+    place = points[:, 0].astype(np.float64) * width / 4 - 0.5
     far = (np.clip(place, 0, columns - 1) / columns)[:, None]
     place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
     if len(model.uv):
@@ -99,14 +99,14 @@ def rgba(texels: np.ndarray) -> np.ndarray:
     return np.pad(texels.astype(np.float16), ((0, 0), (0, 0), (0, 1)))
 
 
-def random_scene(short: bool, mixed: bool, apart: bool) -> SceneModel:
+def random_scene(short: bool, mixed: bool, apart: bool) -> AtlasModel:
     """Two sheets, the first with two smaller levels.
 
     On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks;
     apart: each state has tiles of its own, which lie elsewhere in the table.
     """
     random = np.random.default_rng(1)
-    texels = pack_rgb9e5(random.random((2 * 20, 24, 3)).astype(np.float32)).reshape(2, 20, 24)
+    texels = quantise(random.random((2 * 20, 24, 3)), "rgb9e5")["texels"].reshape(2, 20, 24, 3)
     size = random.integers(1, 8, (13, 11, 2))
     count = np.minimum(random.integers(0, 4, (13, 11)), 24 // size[..., 0])
     first = random.integers(0, np.array([24, 20]) - size * np.stack([np.maximum(count, 1), np.ones_like(count)], 2) + 1)
@@ -128,7 +128,8 @@ def random_scene(short: bool, mixed: bool, apart: bool) -> SceneModel:
     factor = random.uniform(-0.3, 1.0, (3, 8, 3)).astype(np.float32)
     if short:
         factor, texels, lut = np.abs(factor[:, :2]), texels[:1], lut[..., :2]
-    parts = (sheets, factor, texels, lut, levels)
+    profile = Profile(name="s", colour="mixed" if mixed else "rgb9e5")
+    fixed = ("s", "0" * 16, profile, "shared", profile.colour, ("a", "b", "c"), sheets, texels, lut)
     if apart:
         rows = enumerate((*sheets, *levels) * 2)
         second["later"] = tuple(
@@ -136,12 +137,12 @@ def random_scene(short: bool, mixed: bool, apart: bool) -> SceneModel:
             for n, row in rows
             for at in [4 + 4 * (n // 4)]
         )
-    return SceneModel("s", "0" * 16, SceneProfile(name="s"), ("a", "b", "c"), *parts, **second)
+    return AtlasModel(*fixed, factor=factor, levels=levels, **second)
 
 
 def scene(short, mixed, apart, _) -> Subject:
     model, random = random_scene(short, mixed, apart), np.random.default_rng(2)
-    decoder, number = SceneDecoder(model), random.integers(0, 2, 600)
+    decoder, number = AtlasDecoder(model), random.integers(0, 2, 600)
     uv = random.uniform(-0.05, 1.05, (600, 2)).astype(np.float32)
     texels = np.array([0.0, 1.0, 2.0**1.5, 2.0**2.25, 2.0**7])[random.integers(0, 5, 600)]  # along a pixel
     lod = torch.from_numpy(np.log2(np.maximum(texels, 1.0)).astype(np.float32))
@@ -160,13 +161,13 @@ def scene(short, mixed, apart, _) -> Subject:
         "u_points": points_of(np.column_stack([uv, number, texels / heights])),
         "wlm_scene_sheets": sheet_texels(model),
         "wlm_scene_lut": model.lut,
-        "wlm_scene_factors": factor_texels(model),
+        "wlm_scene_factors": np.pad(model.factor, ((0, 0), (0, 0), (0, 1))),
         # Of one layer wgpu would make no array.
-        "wlm_scene_colour": np.stack([rgba(unpack_rgb9e5(layer)) for layer in (*model.texels, model.texels[0])]),
+        "wlm_scene_colour": np.stack([rgba(layer) for layer in (*model.texels, model.texels[0])]),
     }
     if mixed:
         bound["wlm_scene_blocks"] = np.stack([rgba(page) for page in model.block_texels])
-    return Subject(scene_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
+    return Subject(atlas_glsl(model), main, expected[None], bound, "", 2 / 255 * expected.max())
 
 
 def volume(folder) -> Subject:

@@ -1,171 +1,174 @@
-"""A compressed lightmap for an engine: a material that reads it, and its textures."""
+"""Kits of compressed lightmaps: textures, the mesh, and a material that reads them.
 
-import dataclasses
-import os
-import shutil
+Materials read the lightmaps at their own resolution: a kit has no mips. A kit of one lightmap has the files `atlas.*`,
+and one of shared tiles has `scene.*` with a component that sets the objects' rectangles and states.
+"""
+
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from wlm.atlas.exporter import MESH_FILE, Output
-from wlm.atlas.model import BLOCK_SIDE, AtlasModel
-from wlm.atlas.shader import atlas_glsl
+from wlm.atlas.bundles import bundle as make_bundle
+from wlm.atlas.model import BLOCK_SIDE
+from wlm.bundle import Bundle, Texture
 from wlm.errors import WlmError
-from wlm.export.engines.kit import ENGINES, README_FILE, asset_name, filled, godot_uniforms
-from wlm.export.shading import ENDINGS, check_language, custom_node, translate
-from wlm.formats.dds import write_dds
-from wlm.formats.folder import made_parents, staged, write_index
+from wlm.export.engines.kit import (
+    README_FILE,
+    asset_name,
+    check_sides,
+    filled,
+    godot_uniforms,
+    picture_entry,
+    stacked,
+    write_texts,
+)
+from wlm.export.files import decode_texture, write_texture
+from wlm.export.shading import custom_node, translate
+from wlm.formats.dds import DXGI_FORMATS
+from wlm.formats.exr import write_exr
 
-FORMAT = "wlm-bundle"
-_VERSION = 1
-INFO_FILE = "bundle.json"
 
-
-def export_atlas(
-    output: Output, directory: str | os.PathLike[str], engine: str, *, shader: str = "glsl", exact: bool = False
-) -> list[Path]:
-    """Writes what `wlm atlas compress` left for an engine: textures, the mesh, a material, and a page about it.
-
-    Engines' materials read the tiles alone: the mips of a model that has some are in "raw" only.
+def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
+    """Writes the kit of compressed lightmaps.
 
     Args:
-        output: The folder of the compression.
-        directory: Another folder; made if it isn't there. A new export replaces an earlier one.
-        engine: One of `wlm.export.engines.ENGINES`, or "raw": the shader alone beside textures and mesh.
-        shader: Of "raw", its language, one of `wlm.export.shading.LANGUAGES`.
-        exact: Of "raw", texels are fetched and mixed in floats rather than filtered.
+        bundle: The bundle.
+        folder: The folder; it must exist.
+        engine: One of `wlm.export.ENGINES`.
 
     Returns:
-        The files written, `atlas.json` last.
+        Entries of the index: shader and textures.
 
     Raises:
-        WlmError: No such engine or language, a colour texture in ASTC for an engine that has no such textures, the
-            folder holds something else, or a file is missing or can't be written.
+        WlmError: The colours are ASTC, which the engine's kit can't load, the engine can't read the UV set, or a
+            texture is larger than the engine accepts.
     """
-    if engine not in (*ENGINES, "raw"):
-        raise WlmError(f"engine: expected one of raw, {', '.join(ENGINES)}, got {engine!r}")
-    check_language(shader)
-    model, ending = output.model, ".exr" if engine in ("godot", "unreal") else ".dds"
-    if model.colour == "astc" and engine == "raw":
-        ending = ".ktx2"
-    if model.colour == "astc" and ending == ".dds":
-        raise WlmError(f"{output.folder}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
-    if engine != "raw":
-        model = dataclasses.replace(model, tail=model.tail[:0])
-    has = {"lut": model.method != "plain", "blocks": model.colour == "mixed", "tail": len(model.tail) > 0}
-    names = ["colour", *(name for name, given in has.items() if given)]
-    sizes = {name: made.shape[1::-1] for name, made in _made(model).items()}
-    texts = _raw(model, shader, exact) if engine == "raw" else _TEXTS[engine](model)
-    files = {name: name + (".bytes" if engine == "unity" else ending) for name in names}
-    folder = Path(directory)
-    if folder.resolve() == output.folder.resolve():
-        raise WlmError(f"{folder}: expected another folder than that of the compression")
-    with made_parents(folder), staged(folder, INFO_FILE, FORMAT, _is_exported) as staging:
-        for name, file in files.items():
-            if name == "colour" and engine != "raw" and ending == ".dds" and _odd_blocks(model):
-                _write_halves(staging / file, model.texels)
-            else:
-                _copy(output.folder / (name + ending), staging / file)
-        _copy(output.folder / MESH_FILE, staging / MESH_FILE)
-        for name, text in texts.items():
-            (staging / name).write_bytes(text.encode())
-        info = {
-            "format": FORMAT,
-            "version": _VERSION,
-            "name": model.name,
-            "source": model.source,
-            "method": model.method,
-            "colour": model.colour,
-            "system": "atlas",
-            "engine": engine,
-            "textures": {
-                name: {"file": file, "width": sizes[name][0], "height": sizes[name][1], "layers": 0}
-                for name, file in files.items()
-            },
-            "shader": next(iter(texts)),
-            "uv_set": output.report.get("new_uv_set") if len(model.uv) else output.report.get("uv_set"),
-        }
-        write_index(staging / INFO_FILE, info)
-    return [folder / name for name in (*texts, *files.values(), MESH_FILE, INFO_FILE)]
+    if bundle.model.mips:
+        bundle = make_bundle(bundle.model.without_mips())
+    pictures = engine in ("godot", "unreal")
+    entries = _write_pictures(bundle, folder, engine) if pictures else _write_textures(bundle, folder, engine)
+    for name, content in bundle.files.items():
+        (folder / name).write_bytes(content)
+    texts = (_SCENE if bundle.document["method"] == "shared" else _ONE)[engine](bundle, entries)
+    write_texts(folder, texts)
+    return {"shader": next(iter(texts)), "textures": entries}
 
 
-def _made(model: AtlasModel) -> dict[str, np.ndarray]:
-    """The model's textures by name."""
-    return {"colour": model.texels, "lut": model.lut, "blocks": model.block_texels, "tail": model.tail}
+def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
+    """Writes DDS files."""
+    ending, entries = ".bytes" if engine == "unity" else None, {}
+    for name, texture in bundle.textures.items():
+        if texture.fmt not in DXGI_FORMATS:
+            raise WlmError(f"{bundle.name}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
+        if texture.image is not None and (texture.width % BLOCK_SIDE or texture.height % BLOCK_SIDE):
+            # Direct3D and browsers refuse blocks that don't fill their texture.
+            whole = np.concatenate([texture.image, np.ones((*texture.image.shape[:2], 1), np.float32)], 2)
+            texture = Texture.from_texels(whole.astype("<f2"), "R16G16B16A16_FLOAT")
+        entries[name] = write_texture(folder, name, texture, ending)
+    return entries
 
 
-def _odd_blocks(model: AtlasModel) -> bool:
-    """Whether the colours are blocks that don't fill their texture, which Direct3D and browsers refuse."""
-    return model.colour == "bc6h" and any(side % BLOCK_SIDE for side in model.texels.shape[:2])
+def _write_pictures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
+    """Writes EXR files, the layers of an array one below the other; whole numbers are exact in floats."""
+    entries = {}
+    for name, texture in bundle.textures.items():
+        pixels = stacked(decode_texture(texture)).astype(np.float32)
+        if pixels.shape[2] == 2:
+            pixels = np.pad(pixels, ((0, 0), (0, 0), (0, 1)))
+        if name in ("colour", "blocks"):
+            pixels = pixels[..., :3]
+        check_sides(bundle.name, engine, f"{name}.exr", pixels)
+        write_exr(folder / f"{name}.exr", pixels, half=name in ("colour", "blocks"))
+        entries[name] = picture_entry(f"{name}.exr", pixels, texture.layers)
+    return entries
 
 
-def _write_halves(path: Path, texels: np.ndarray) -> None:
-    height, width = texels.shape[:2]
-    whole = np.concatenate([texels.astype("<f2"), np.ones((height, width, 1), "<f2")], 2)
-    # Under another ending in Unity's folder.
-    made = path.with_suffix(".dds")
-    write_dds(made, whole.tobytes(), width, height, fmt="R16G16B16A16_FLOAT")
-    made.rename(path)
-
-
-def _copy(source: Path, target: Path) -> None:
-    try:
-        shutil.copyfile(source, target)
-    except FileNotFoundError as error:
-        raise WlmError(f"{source}: no such file; compress again") from error
-
-
-def _raw(model: AtlasModel, language: str, exact: bool) -> dict[str, str]:
-    text = translate(atlas_glsl(model), language, ["WLM_ATLAS_EXACT"] if exact else [])
-    return {"atlas" + ENDINGS[language]: text}
-
-
-def _three(model: AtlasModel) -> dict[str, str]:
+def _three(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
     return {
-        "atlas.glsl": atlas_glsl(model),
+        "atlas.glsl": bundle.shader,
         "atlas.js": filled("three_atlas.js", DDS=filled("three_dds.js")),
-        README_FILE: filled("three_atlas.md", NAME=model.name),
+        README_FILE: filled("three_atlas.md", NAME=bundle.name),
     }
 
 
-def _godot(model: AtlasModel) -> dict[str, str]:
+def _godot(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
     return {
-        "atlas.gdshader": filled("godot_atlas.gdshader", SHADER=godot_uniforms(atlas_glsl(model))),
-        README_FILE: filled("godot_atlas.md", NAME=model.name),
+        "atlas.gdshader": filled("godot_atlas.gdshader", SHADER=godot_uniforms(bundle.shader)),
+        README_FILE: filled("godot_atlas.md", NAME=bundle.name),
     }
 
 
-def _unity(model: AtlasModel) -> dict[str, str]:
+def _unity(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
     return {
-        "WlmAtlas.hlsl": translate(atlas_glsl(model), "hlsl"),
+        "WlmAtlas.hlsl": translate(bundle.shader, "hlsl"),
         "WlmAtlas.shader": filled("unity_atlas.shader"),
         "WlmAtlas.cs": filled("unity_atlas.cs", DDS=filled("unity_dds.cs")),
-        README_FILE: filled("unity_atlas.md", NAME=model.name),
+        README_FILE: filled("unity_atlas.md", NAME=bundle.name),
     }
 
 
-def _unreal(model: AtlasModel) -> dict[str, str]:
-    code, _ = custom_node(atlas_glsl(model), "wlm_atlas", "UV")
-    place = asset_name(model.name)
+def _unreal(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
+    code, _ = custom_node(bundle.shader, "wlm_atlas", "UV")
+    place = asset_name(bundle.name)
     return {
         "wlm_atlas.py": filled("unreal_atlas.py.in", NAME=place, CODE=code, KIT=filled("unreal_kit.py.in")),
-        README_FILE: filled("unreal_atlas.md", NAME=model.name, PLACE=place),
+        README_FILE: filled("unreal_atlas.md", NAME=bundle.name, PLACE=place),
     }
 
 
-_TEXTS: dict[str, Callable[[AtlasModel], dict[str, str]]] = {
-    "three": _three,
-    "godot": _godot,
-    "unity": _unity,
-    "unreal": _unreal,
-}
-_STEMS = {"atlas", "colour", "lut", "blocks", "tail", "WlmAtlas", "wlm_atlas"}
-# ".usf" is of earlier versions.
-_ENDINGS = {*ENDINGS.values(), ".dds", ".ktx2", ".exr", ".bytes", ".js", ".gdshader", ".shader", ".cs", ".py", ".usf"}
+def _scene_three(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
+    return {
+        "scene.glsl": bundle.shader,
+        "scene.js": filled("three_scene.js", DDS=filled("three_dds.js")),
+        README_FILE: filled("three_scene.md", NAME=bundle.name),
+    }
 
 
-def _is_exported(name: str) -> bool:
-    """Whether a file's name is one that such a folder may have."""
-    path = Path(name)
-    return name in (MESH_FILE, README_FILE, INFO_FILE) or (path.stem in _STEMS and path.suffix in _ENDINGS)
+def _scene_godot(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
+    uv_set = bundle.document["uv_set"]
+    if uv_set > 1:
+        raise WlmError(
+            f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the light is at {uv_set}"
+        )
+    shader = godot_uniforms(bundle.shader)
+    return {
+        "scene.gdshader": filled("godot_scene.gdshader", SHADER=shader, UV=("UV", "UV2")[uv_set]),
+        "wlm_scene.gd": filled("godot_scene.gd"),
+        README_FILE: filled("godot_scene.md", NAME=bundle.name),
+    }
+
+
+def _scene_unity(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
+    return {
+        "WlmScene.hlsl": translate(bundle.shader, "hlsl"),
+        "WlmScene.shader": filled("unity_scene.shader", SET=str(bundle.document["uv_set"])),
+        "WlmScene.cs": filled("unity_scene.cs", DDS=filled("unity_dds.cs")),
+        README_FILE: filled("unity_scene.md", NAME=bundle.name),
+    }
+
+
+def _scene_unreal(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
+    arrays = {f"wlm_scene_{name}": (each.height, each.layers) for name, each in bundle.textures.items() if each.layers}
+    code, _ = custom_node(bundle.shader, "wlm_object", "UV, Place, int(Sheet + 0.5), State", arrays)
+    rows = [
+        f'    "wlm_scene_{name}": {{"file": "{entry["file"]}", "form": "{_form(name)}", '
+        f'"size": [{entry["width"]}, {entry["height"]}]}},\n'
+        for name, entry in entries.items()
+    ]
+    place = asset_name(bundle.name)
+    parts = {"CODE": code, "TEXTURES": "{\n" + "".join(rows) + "}", "KIT": filled("unreal_kit.py.in")}
+    return {
+        "wlm_scene.py": filled("unreal_scene.py.in", NAME=place, **parts),
+        README_FILE: filled("unreal_scene.md", NAME=bundle.name, PLACE=place),
+    }
+
+
+def _form(name: str) -> str:
+    return "halves" if name in ("colour", "blocks") else "floats"
+
+
+_Texts = dict[str, Callable[[Bundle, dict[str, Any]], dict[str, str]]]
+_ONE: _Texts = {"three": _three, "godot": _godot, "unity": _unity, "unreal": _unreal}
+_SCENE: _Texts = {"three": _scene_three, "godot": _scene_godot, "unity": _scene_unity, "unreal": _scene_unreal}

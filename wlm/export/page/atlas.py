@@ -1,4 +1,4 @@
-"""The page of a mesh's compressed lightmap."""
+"""The page of a compressed lightmap on its mesh."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from wlm.atlas.exporter import geometry, read_folder
+from wlm.atlas import codec
 from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS, AtlasModel
-from wlm.atlas.shader import atlas_glsl
+from wlm.atlas.shader import glsl
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import Geometry
@@ -20,44 +20,46 @@ from wlm.texels import exposure, fill_gaps
 _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "ASTC", "mixed": "RGB9E5"}
 
 
-def folder_page(
-    folder: str | os.PathLike[str], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
+def model_page(
+    model: AtlasModel, *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
-    """Makes the page of what `wlm atlas compress` wrote.
+    """Makes the page of a model with one lightmap.
 
     Args:
-        folder: The folder: its mesh is shown.
+        model: The model.
         original: The lightmap that was compressed, to compare with.
         up: The axis that points up in the scene.
 
     Raises:
-        WlmError: The folder isn't a whole one, or the lightmap can't be read or is of another size.
+        WlmError: The model has several lightmaps, or the original can't be read or has another size.
     """
-    output = read_folder(folder)
-    model, mesh = output.model, geometry(output)
+    if model.method == "shared":
+        raise WlmError(f"{model.name}: the page shows one lightmap, found {len(model.sheets) * len(model.states)}")
+    mesh, (height, width) = model.scene.sheets[0], model.sheets[0].size
+    colours, blocks = model.texels[0], model.block_texels[0] if model.colour == "mixed" else model.texels[0]
     triangles = mesh.triangle[mesh.active]
     # One vertex a corner: new UVs are of corners.
     corners = triangles.reshape(-1)
     position, uv = mesh.position[corners].astype(np.float32), mesh.uv[corners].astype(np.float32)
     drawn = Geometry(position, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), uv)
-    texels = np.ascontiguousarray(model.texels, np.float16)
+    texels = np.ascontiguousarray(colours, np.float16)
     arrays, box = pack_triangles(drawn, up)
     arrays["colour"] = texels
     if model.colour == "mixed":
-        arrays["blocks"] = np.ascontiguousarray(model.block_texels, np.float16)
+        arrays["blocks"] = np.ascontiguousarray(blocks, np.float16)
     if len(model.uv):
         arrays["coordinate"] = model.uv[mesh.active].reshape(-1, 2).astype(np.float32)
     if model.method != "plain":
         arrays["lut"] = np.ascontiguousarray(model.lut, np.uint16)
     manifest: dict[str, Any] = {
-        "width": model.width,
-        "height": model.height,
-        "shader": atlas_glsl(model),
+        "width": width,
+        "height": height,
+        "shader": glsl(model),
         "exposure": exposure(_all_texels(model)),
         "atlas": {
             "method": model.method,
             "colour": texels.shape[1::-1],
-            "blocks": model.block_texels.shape[1::-1],
+            "blocks": model.block_texels.shape[2:0:-1],
             "lut": model.lut.shape[1::-1],
             "tile": model.profile.tile,
             "size_bits": SIDE_BITS,
@@ -68,27 +70,26 @@ def folder_page(
     }
     if original is not None:
         lightmap = read_light(original)[0][..., :3]
-        if lightmap.shape[:2] != (model.height, model.width):
+        if lightmap.shape[:2] != (height, width):
             raise WlmError(
-                f"{original}: expected a lightmap of {model.width}x{model.height}, found {lightmap.shape[1]}x"
-                f"{lightmap.shape[0]}"
+                f"{original}: expected a lightmap of {width}x{height}, found {lightmap.shape[1]}x{lightmap.shape[0]}"
             )
         light = np.nan_to_num(lightmap.astype(np.float32), posinf=65504.0)
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
         arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
     figures = [
-        ("file", f"{output.model_bytes:,} bytes"),
+        ("file without the mesh", f"{np.subtract(*codec.sizes(model)):,} bytes"),
         ("size of textures", f"{100 * (1.0 - model.compression_ratio):.1f}% of half floats"),
-        ("lightmap", f"{model.width} × {model.height} texels"),
+        ("lightmap", f"{width} × {height} texels"),
         ("colour texture", f"{texels.shape[1]} × {texels.shape[0]}, {_FORMATS[model.colour]}"),
         ("method", model.method),
         ("triangles", f"{len(triangles):,}"),
         ("profile", model.profile.name),
     ]
     if model.colour == "mixed":
-        height, width = model.block_texels.shape[:2]
-        figures.insert(4, ("its blocks", f"{width} × {height}, BC6H"))
+        rows, columns = model.block_texels.shape[1:3]
+        figures.insert(4, ("its blocks", f"{columns} × {rows}, BC6H"))
     return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)
 
 

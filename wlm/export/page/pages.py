@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from wlm.atlas.exporter import REPORT_FILE
 from wlm.errors import WlmError
 from wlm.export.page.html import Page
 from wlm.smoke.data import is_six_way, six_way_files
@@ -73,15 +72,8 @@ def make_page(
         return smoke_page(paths, rate=rate, progress=progress)
     if len(paths) > 1:
         raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
-    if path.is_dir() and (path / REPORT_FILE).is_file():
-        from wlm.export.page.atlas import folder_page
-
-        _refuse(path, mesh=mesh, key=key)
-        return folder_page(path, original=original, up=up)
     if path.is_dir() or path.suffix.lower() != ".wlm":
-        raise WlmError(
-            f"{path}: expected a .wlm, a folder of wlm atlas compress, or six-way EXRs; wlm view shows inputs too"
-        )
+        raise WlmError(f"{path}: expected a .wlm or six-way EXRs; wlm view shows inputs too")
     model = load(path)
     if model.SYSTEM == "lightmap":
         from wlm.export.page.lightmap import lightmap_page
@@ -95,7 +87,10 @@ def make_page(
 
         return probe_page(model, path.stat().st_size, mesh=mesh, original=original, key=key, up=up)
     if model.SYSTEM == "atlas":
-        raise WlmError(f"{path}: expected the folder that wlm atlas compress wrote, which has the mesh")
+        from wlm.export.page.atlas import model_page
+
+        _refuse(path, mesh=mesh, key=key)
+        return model_page(model, original=original, up=up)
     raise WlmError(f"{path}: a network has no picture of its own; expected the lightmaps that it predicts")
 
 

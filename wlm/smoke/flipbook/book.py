@@ -1,4 +1,4 @@
-"""A flip book in its textures, with all that an engine has to know to read them."""
+"""A flip book: textures of six-way lightmaps, and the facts that an engine needs to read them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,29 +15,29 @@ from wlm.smoke.shading import Ramp
 from wlm.system import OnProgress
 
 RATE = 25.0
-"""Frames a second where the smoke doesn't say."""
+"""Frames per second if the smoke has no rate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Book:
-    """A flip book in its textures.
+    """A flip book.
 
     Attributes:
         first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4], see
             `wlm.smoke.flipbook.textures`.
         motion: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; or None.
-        depth: Likewise, see `wlm.smoke.flipbook.depth`; or None.
+        depth: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.depth`; or None.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
-        rows, columns, count: Of cells, and of frames in them.
+        rows, columns, count: Numbers of rows and columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
-        padding: Pixels around it.
-        gain: The factor on the light in the textures.
-        hot: Whether they have a channel of emission.
-        scale: What the motion's numbers end at, in shares of a frame; None without.
-        reach: What the depth's numbers end at, in heights of a frame; None without.
-        rate: Frames a second.
-        extent: Height of what a frame shows, in the world's unit.
-        ramp: Colour of the emission; None: grey, as it is.
+        padding: Pixels around a frame.
+        gain: Factor of the light in the textures.
+        hot: Whether there is a channel of emission.
+        scale: Range of the motion in shares of a frame; None: no motion.
+        reach: Range of the depth in heights of a frame; None: no depth.
+        rate: Frames per second.
+        extent: Height of the view in the world's unit.
+        ramp: Colour of the emission; None: grey.
     """
 
     first: np.ndarray
@@ -60,20 +60,20 @@ class Book:
 
     @property
     def pages(self) -> dict[str, np.ndarray]:
-        """The textures by name."""
+        """Textures by name."""
         pages = {"first": self.first, "second": self.second, "motion": self.motion, "depth": self.depth}
         return {name: page for name, page in pages.items() if page is not None}
 
     @property
     def channels(self) -> dict[str, tuple[str, ...]]:
-        """What is in each texture's channels."""
+        """Content of each texture's channels."""
         first, second = LAYOUTS[self.layout]
         named = {"first": first, "second": second, "motion": ("right", "up"), "depth": ("depth",)}
         return {name: named[name][: page.shape[2]] for name, page in self.pages.items()}
 
     @property
     def levels(self) -> int:
-        """The smallest level of a texture's mips whose frames show no neighbour."""
+        """Smallest mip level at which frames do not show their neighbours."""
         return mip_levels(*self.size, self.padding)
 
 
@@ -94,17 +94,17 @@ def pack_book(
     Args:
         shots: The frames, at least one, of one size.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
-        columns: Of cells, at most; None: as near to a square as can be.
-        gain: Factor on the light; None: the greatest that 8 bits hold.
+        columns: Largest number of columns; None: nearest to a square.
+        gain: Factor of the light; None: the largest without clipping in 8 bits.
         padding: Pixels around each frame that repeat its border.
-        air: Of `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: none.
-        volumes: The frames' smoke, for a texture of depth; None: none.
-        rate: Frames a second; None: as the scene's frames are apart, or `RATE`.
-        progress: Of the motion and the depth, called after each frame.
+        air: Frames from `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: no motion.
+        volumes: The smoke of the frames, for a texture of depth; None: no depth.
+        rate: Frames per second; None: that of the scene, or `RATE`.
+        progress: Called after each frame of motion and depth.
 
     Raises:
-        ValueError: Frames of several sizes, or as `pack`.
-        WlmError: As `frames_motion` and `frames_depth`.
+        ValueError: The frames have several sizes, or as for `pack`.
+        WlmError: As for `frames_motion` and `frames_depth`.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
@@ -145,7 +145,7 @@ def pack_book(
 
 
 def _rate(shots: Sequence[Shot]) -> float:
-    """Frames a second, by the times of a scene's first and last frame."""
+    """Returns frames per second, from the times of a scene's first and last frame."""
     first, last = shots[0].looks, shots[-1].looks
     if first is None or last is None or not last.time > first.time:
         return RATE

@@ -1,10 +1,6 @@
-"""How far before its billboard a flip book's smoke lies, for lights at a point: their direction and distance are others
-at each pixel and each depth.
+"""Distance of a flip book's smoke in front of its billboard, for point lights, whose direction and distance depend on
+the depth of the smoke."""
 
-Read first: `from_point`, which `wlm.smoke.flipbook.shader` writes for engines.
-"""
-
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,30 +9,27 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.smoke.camera import DIRECTIONS, Camera
+from wlm.smoke.camera import Camera
 from wlm.smoke.data import Frames
 from wlm.smoke.flipbook.motion import ZERO, spread_out
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
 
 _STEP = March(step=1.0, jitter=0.0)
-_PAIRS = (("right", "left"), ("top", "bottom"), ("front", "back"))  # of the lightmaps along x, y and z
-_NEAREST = 1e-6  # squared distance to a light below which it counts the same
 
 
 def middle_depth(volume: DensityVolume, camera: Camera) -> torch.Tensor:
-    """The mean depth of the smoke that pixels see, each part weighed by how much of it is seen.
+    """Computes the mean depth of the visible smoke of each pixel, weighted by visibility.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
 
     Returns:
-        float32 [H, W], the world's unit: how far the smoke lies before the plane through the volume's middle that
-        faces the camera. Where there is no smoke it is that of the smoke around.
+        float32 [H, W] in the world's unit: distance of the smoke in front of the plane through the volume's centre that
+        faces the camera. Where there is no smoke, it is filled from the smoke around.
 
     Raises:
         ValueError: The camera is in perspective.
@@ -48,8 +41,8 @@ def middle_depth(volume: DensityVolume, camera: Camera) -> torch.Tensor:
     for axis, (count, along) in enumerate(zip(volume.shape, camera.toward, strict=True)):
         at = (torch.arange(count, device=volume.device) + 0.5 - 0.5 * count) * (volume.voxel * float(along))
         before = before + at.reshape([-1 if n == axis else 1 for n in range(3)])
-    # A march adds up what hot smoke gives off: heat that is the depth, from behind all smoke on, and of density 1 is
-    # seen as much as the smoke is.
+    # A march integrates emission: with the depth, measured from behind all smoke, times the density as temperature, the
+    # emission is the depth weighted by visibility.
     density = volume.density.float()
     glowing = replace(volume, density=density, temperature=density * (before + reach), emission=volume.extinction)
     seen = light_smoke(glowing, camera, [], _STEP)
@@ -61,12 +54,12 @@ def middle_depth(volume: DensityVolume, camera: Camera) -> torch.Tensor:
 def frames_depth(
     frames: Frames, numbers: Sequence[int], book: Sequence[SixWay], progress: OnProgress | None = None
 ) -> torch.Tensor:
-    """`middle_depth` of the frames of a flip book.
+    """Computes `middle_depth` for the frames of a flip book.
 
     Args:
         frames: The smoke.
-        numbers: Of the flip book's frames.
-        book: These, with their cameras.
+        numbers: Numbers of the flip book's frames.
+        book: These frames, with their cameras.
         progress: Called after each.
 
     Returns:
@@ -86,35 +79,5 @@ def frames_depth(
 
 
 def encoded_depth(depths: torch.Tensor, scale: float) -> np.ndarray:
-    """A texture's cells, float32 [N, H, W, 3], all channels alike: `ZERO` on the billboard, more before it."""
+    """Returns a texture's cells, float32 [N, H, W, 3] with equal channels: `ZERO` on the billboard, more in front."""
     return np.repeat(np.float32(ZERO) + depths.numpy()[..., None] / np.float32(2.0 * scale), 3, axis=-1)
-
-
-def from_point(six: SixWay, depth: torch.Tensor, light: PointLight, middle: Sequence[float]) -> torch.Tensor:
-    """The light of a point light on a billboard.
-
-    Each pixel is lit as from the direction to the light, by its irradiance there, at the place where its smoke lies.
-
-    Args:
-        six: Lightmaps with their camera.
-        depth: float32 [H, W], of `middle_depth`; 0: all is on the billboard.
-        light: The light.
-        middle: Of the smoke's volume, [3].
-
-    Returns:
-        float32 [H, W, 3], linear.
-    """
-    camera = six.camera
-    start, _ = camera.rays(depth.device)
-    axes = torch.tensor(camera.axes, device=depth.device)
-    place = start - torch.tensor(np.asarray(middle, np.float64), device=depth.device)
-    across, rise, _ = (place @ axes.T).unbind(-1)
-    lamp = camera.axes @ (np.asarray(light.position, np.float64) - np.asarray(middle, np.float64))
-    way = torch.stack([float(lamp[0]) - across, float(lamp[1]) - rise, float(lamp[2]) - depth], -1)
-    square = way.square().sum(-1)
-    shares = way.square() / square.clamp(min=_NEAREST)[..., None]
-    pairs = torch.tensor([[DIRECTIONS.index(name) for name in pair] for pair in _PAIRS], device=depth.device)
-    ahead, behind = six.lightmaps[pairs[:, 0]], six.lightmaps[pairs[:, 1]]
-    grey = (shares.movedim(-1, 0) * torch.where(way.movedim(-1, 0) > 0, ahead, behind)).sum(0)
-    grey = grey / square.clamp(min=max(light.radius**2, _NEAREST)) / (4.0 * math.pi)
-    return grey.float()[..., None] * torch.tensor(light.intensity, device=depth.device)

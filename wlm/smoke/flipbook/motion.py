@@ -1,10 +1,9 @@
-"""Motion between a flip book's frames: a texture of motion vectors, and pictures between two frames by them.
+"""Motion between a flip book's frames: a texture of motion vectors, by which frames are interpolated.
 
-A frame's cell has its motion to the next frame, in shares of the frame's width and height: in the first channel to the
-right, in the second up, each as 127/255 + motion / (2 scale), so that 8 bits hold 0 exactly. A picture between two
-frames reads the earlier one back along the motion and the later one ahead of it, and mixes both: what moves stays
-sharp, where a cross-fade would show it twice. Read first: `between`, which
-`wlm.smoke.flipbook.shader` writes for engines.
+A frame's cell stores its motion to the next frame, in shares of the frame's width and height: to the right in the first
+channel, up in the second, each as 127/255 + motion / (2 scale), so that 8 bits represent 0 exactly. An interpolated
+picture reads the earlier frame backwards along the motion and the later frame forwards, and blends both: moving smoke
+stays sharp, where a cross-fade would show it twice.
 """
 
 import os
@@ -22,21 +21,21 @@ from wlm.smoke.march.motion import motion, read_velocity, velocity_file
 from wlm.system import Meter, OnProgress
 
 ZERO = 127.0 / 255.0
-"""No motion, in the texture."""
+"""Value of zero motion in the texture."""
 
-_TRACE = 1e-3  # weight of what is around a pixel with a motion of its own
+_TRACE = 1e-3  # weight of the surroundings of a pixel that has a motion
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-_BLUR = 0.75  # pixels of motion up to which reading between pixels blurs more than a cross-fade does
-_ABOUT = 9  # pixels along the square that two frames are compared in, and shares are smoothed over
-_FEW = 1e-4  # square of a difference of light that doesn't count
-_STILL = 1e-6  # the least scale
+_BLUR = 0.75  # pixels of motion up to which resampling blurs more than a cross-fade
+_ABOUT = 9  # edge in pixels of the squares for comparing frames and for smoothing
+_FEW = 1e-4  # squared difference of light that is ignored
+_STILL = 1e-6  # smallest scale
 
 
 def open_motion(path: str | os.PathLike[str], device: str = "cpu") -> Frames:
     """Opens a simulation's frames, for `frames_motion`.
 
     Raises:
-        WlmError: As `load_frames`, it is no folder, or a frame's velocity isn't there.
+        WlmError: As for `load_frames`, the path is not a folder, or a frame's velocity is missing.
     """
     if not os.path.isdir(path):
         raise WlmError(f"{path}: expected a folder of frames, with the air's velocity, found none")
@@ -51,20 +50,20 @@ def open_motion(path: str | os.PathLike[str], device: str = "cpu") -> Frames:
 def frames_motion(
     frames: Frames, numbers: Sequence[int], book: Sequence[SixWay], progress: OnProgress | None = None
 ) -> torch.Tensor:
-    """How the smoke of each frame of a flip book moves to the next.
+    """Computes the motion of the smoke from each frame of a flip book to the next.
 
-    What a picture shows doesn't all go with the air: the smoke's edge at an inlet stays, as light and shadow do. So of
-    the air's motion each place takes the share by which the next frame looks most like this one there.
+    Not everything in a picture moves with the air: the smoke's edge at an inlet stays, as do light and shadow. At each
+    pixel the air's motion is therefore multiplied by the share for which the next frame is most similar there.
 
     Args:
-        frames: Of `open_motion`.
-        numbers: Of the flip book's frames, rising.
-        book: These, with their transparency and their cameras, orthographic.
+        frames: Frames from `open_motion`.
+        numbers: Numbers of the flip book's frames, increasing.
+        book: These frames, with transparency and orthographic cameras.
         progress: Called after each.
 
     Returns:
         float32 [N, 2, H, W] on the CPU: to the right and down, in shares of the frame's width and height. The last
-        frame goes on as it came. Where there is no smoke it is that of the smoke around.
+        frame repeats the motion before it. Where there is no smoke, the motion is filled from the smoke around.
 
     Raises:
         WlmError: A frame or a velocity is missing or damaged.
@@ -80,7 +79,7 @@ def frames_motion(
         mean = sum(read_velocity(velocity_file(frames.path, each)) for each in between) / len(between)
         volume = frames.load(number)
         carried = wp.array(mean, dtype=wp.vec3, device=wp.device_from_torch(volume.device))
-        # Forward: where the smoke of this frame will be, and not where that of the next was.
+        # Forward motion: from this frame to the next.
         moved = -motion(volume, carried, six.camera, reach=-float(apart)).cpu()
         moved = spread_out(moved, (moved != 0).any(0).float())
         moved /= torch.tensor([six.camera.width, six.camera.height])[:, None, None]
@@ -90,7 +89,7 @@ def frames_motion(
 
 
 def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Fills [C, H, W] where its weight [H, W] is 0, from what is around: of means over larger and larger squares."""
+    """Fills [C, H, W] where its weight [H, W] is 0 from the surroundings, by means over ever larger squares."""
     sums, weights = [values[None] * weight], [weight[None, None]]
     while max(sums[-1].shape[2:]) > 1:
         for parts in (sums, weights):
@@ -103,8 +102,8 @@ def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
-    """The share of a motion [2, H, W], place by place, by which the second frame looks most like the first; none of one
-    within a pixel."""
+    """Multiplies a motion [2, H, W] at each pixel by the share for which the second frame is most similar to the first;
+    motion of less than a pixel becomes 0."""
     before, after = _planes(one).cpu(), _planes(other).cpu()
     off = []
     for share in _SHARES:
@@ -117,65 +116,48 @@ def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
 
 
 def _smooth(plane: torch.Tensor) -> torch.Tensor:
-    """The mean over squares, [H, W]."""
+    """Returns means over squares, [H, W]."""
     return F.avg_pool2d(plane[None], _ABOUT, 1, _ABOUT // 2, count_include_pad=False)[0]
 
 
 def scale_of(motions: torch.Tensor) -> float:
-    """The greatest motion of a flip book, in shares of a frame: what the texture's numbers end at."""
+    """Returns the range of a texture of motion: the largest motion of the flip book."""
     return max(float(motions.abs().max()), _STILL)
 
 
 def encoded(motions: torch.Tensor, scale: float) -> np.ndarray:
-    """A texture's cells, float32 [N, H, W, 3]: to the right, up, and 0."""
+    """Returns a texture's cells, float32 [N, H, W, 3]: motion to the right, motion up, 0."""
     way = motions.permute(0, 2, 3, 1).numpy() * np.float32([1.0, -1.0])
     cells = np.float32(ZERO) + way / np.float32(2.0 * scale)
     return np.concatenate([cells, np.zeros_like(cells[..., :1])], -1)
 
 
-def between(one: SixWay, other: SixWay, moved: torch.Tensor, share: float) -> SixWay:
-    """The lightmaps at a share of the way from a frame to the next.
-
-    Args:
-        one, other: The frames, with their transparency.
-        moved: float32 [2, H, W], of the first one: see `frames_motion`.
-        share: 0 is the first frame, 1 the next.
-    """
-    place = _places(moved)
-    # The motion of what is here at this time, which was elsewhere in the first frame.
-    way = _read(moved, place - share * _read(moved, place))
-    ends = (one, place - share * way), (other, place + (1.0 - share) * way)
-    mixed = torch.lerp(*(_read(_planes(six), at) for six, at in ends), share)
-    hot = one.emission is not None or other.emission is not None
-    return SixWay(mixed[:6], 1.0 - mixed[6], mixed[7] if hot else None, one.camera)
-
-
 def _planes(six: SixWay) -> torch.Tensor:
-    """Light, opacity and emission, [8, H, W]."""
+    """Returns light, opacity and emission, [8, H, W]."""
     glow = torch.zeros_like(six.transparency) if six.emission is None else six.emission
     return torch.cat([six.lightmaps, torch.stack([1.0 - six.transparency, glow])])
 
 
 def _places(moved: torch.Tensor) -> torch.Tensor:
-    """The pixels' own places, to the right and down, [2, H, W] of 0 to 1."""
+    """Returns the positions of the pixels, to the right and down, [2, H, W] in 0 to 1."""
     axes = [(torch.arange(n, device=moved.device) + 0.5) / n for n in moved.shape[1:]]
     return torch.stack(torch.meshgrid(*axes, indexing="ij")[::-1])
 
 
 def _read(planes: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Planes [C, H, W] at places [2, H, W] of 0 to 1, at the border beyond it."""
+    """Samples planes [C, H, W] at positions [2, H, W] in 0 to 1; constant beyond the border."""
     grid = (2.0 * place - 1.0).permute(1, 2, 0)[None]
     return F.grid_sample(planes[None], grid, padding_mode="border", align_corners=False)[0]
 
 
 def mip_padding(height: int, width: int, levels: int) -> int:
-    """The least padding of frames whose smaller textures, down to a level, show no neighbour.
+    """Returns the least padding with which frames do not show their neighbours in mips down to a level.
 
-    Each level halves the one before: its texels must not lie in two cells, and the half texel beyond a frame's border
-    that a filter reads must be the frame's own padding.
+    A texel of a level must not span two cells, and the half texel beyond a frame's border that a filter reads must be
+    within the frame's padding.
 
     Raises:
-        WlmError: No padding does for such frames.
+        WlmError: No padding suffices for such frames.
     """
     part = 2**levels
     for padding in range(part // 2, part // 2 + part):
@@ -185,7 +167,7 @@ def mip_padding(height: int, width: int, levels: int) -> int:
 
 
 def mip_levels(height: int, width: int, padding: int) -> int:
-    """The smallest level at which padded frames show no neighbour, 0: none but the first."""
+    """Returns the smallest mip level at which padded frames do not show their neighbours; 0: no mips."""
     level = 0
     while 2**level <= padding and not any((n + 2 * padding) % 2 ** (level + 1) for n in (height, width)):
         level += 1

@@ -1,4 +1,4 @@
-"""The shader of a six-way flip book: where a frame lies, its light from a direction or a point, its motion."""
+"""Shaders of six-way flip books: functions that read the textures, and a billboard that plays and lights a book."""
 
 import math
 
@@ -10,7 +10,7 @@ from wlm.smoke.shading import Ramp
 
 _TEXT = """\
 // Six-way smoke of {count} frames, in {rows} x {columns} cells, in the channels of "{layout}".
-// (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; lights weigh by squares, as in engines.)
+// (Neural Six-way Lightmaps for Real-time Smoke Rendering, eq. 4; weights are squares, as in engines.)
 // For GLSL 3.30, GLSL ES 3.00 and later; include it below #version.
 // Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
 //
@@ -107,7 +107,7 @@ vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
 }}
 """
 
-_NEAREST = 1e-12  # squared distance to a light below which it counts the same
+_NEAREST = 1e-12  # least squared distance to a light
 
 
 def smoke_shader(
@@ -127,12 +127,12 @@ def smoke_shader(
 
     Args:
         layout: One of `wlm.smoke.camera.LAYOUTS`.
-        rows, columns, count: Of cells, and of frames in them.
+        rows, columns, count: Numbers of rows and columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
-        padding: Pixels around it.
-        gain: The factor on the light in the textures.
-        hot: Whether they have a channel of emission.
-        motion, depth: The scales of its textures of motion and of depth; None: it has none.
+        padding: Pixels around a frame.
+        gain: Factor of the light in the textures.
+        hot: Whether there is a channel of emission.
+        motion, depth: Ranges of the textures of motion and depth; None: no such texture.
 
     Raises:
         ValueError: Unknown layout.
@@ -171,7 +171,7 @@ def smoke_shader(
 
 
 def _literal(number: float) -> str:
-    """A number that GLSL ES too takes for a float."""
+    """Returns a number as a float literal of GLSL ES."""
     text = f"{number:.9g}"
     return text if "." in text or "e" in text else f"{text}.0"
 
@@ -263,7 +263,7 @@ def billboard_shader(book: Book) -> str:
 
 
 def _glow(ramp: Ramp | None) -> str:
-    """The colour of an emission: each mix leaves what the ones before gave, or takes its own stop's colour whole."""
+    """Writes the colour of an emission as a chain of mixes between stops."""
     lines = ["float emission = wlm_smoke_emission(first, second);"]
     if ramp is None:
         lines.append("return vec3(emission, emission, emission);")
@@ -281,7 +281,7 @@ def _colour(colour: tuple[float, float, float]) -> str:
 
 
 def _number(number: float) -> str:
-    """A number that GLSL ES too takes for a float, in brackets below 0."""
+    """Returns a number as a float literal of GLSL ES, in brackets below 0."""
     text = f"{number:.9g}"
     text = text if "." in text or "e" in text else f"{text}.0"
     return f"({text})" if number < 0 else text

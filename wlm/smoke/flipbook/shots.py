@@ -1,4 +1,4 @@
-"""Frames to be drawn: lightmaps, baked from smoke or read from files, with a scene's obstacles and colours."""
+"""Frames to render: lightmaps, baked from smoke or read from files, with a scene's obstacles and colours."""
 
 import os
 from collections.abc import Iterator
@@ -16,18 +16,18 @@ from wlm.smoke.scene import CameraSettings, Looks
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke.settings import March
 
-_SURFACE = March(step=1.0, jitter=0.0)  # of the depth at which obstacles' shadows fall
+_SURFACE = March(step=1.0, jitter=0.0)  # march for the depth at which shadows of obstacles fall
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One frame to be drawn.
+    """A frame to render.
 
     Attributes:
-        number: Of the frame.
-        six: Lightmaps with their camera; with obstacles, with their depth too.
-        looks: Lights, colours and obstacles of the scene; None: there is none.
-        warnings: The volume's repairs, one line each.
+        number: Number of the frame.
+        six: Lightmaps with their camera; if there are obstacles, also with their depth.
+        looks: Lights, colours and obstacles of the scene; None: there is no scene.
+        warnings: Repairs of the volume, one line each.
     """
 
     number: int
@@ -37,9 +37,9 @@ class Shot:
 
 
 def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
-    """The lightmaps with the depth at which obstacles and their shadows are drawn, if the looks have any.
+    """Returns the lightmaps with the depth at which obstacles and their shadows are drawn, if there are obstacles.
 
-    Whichever way the lightmaps were made, it is that of a march in steps of a voxel.
+    The depth is always that of a march in steps of a voxel.
     """
     if looks is None or not looks.obstacles:
         return replace(six, depth=None)
@@ -48,7 +48,7 @@ def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> Six
 
 @dataclass(frozen=True)
 class FramesToBake:
-    """Smoke whose lightmaps are baked for each frame.
+    """Smoke whose lightmaps are baked frame by frame.
 
     Attributes:
         frames: The smoke.
@@ -63,15 +63,15 @@ class FramesToBake:
 
     @property
     def single(self) -> bool:
-        """Whether it is one file and not a folder."""
+        """Whether this is a single file instead of a folder."""
         return self.frames.single
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
-        """Bakes one frame after the other.
+        """Bakes frames one after the other.
 
         Args:
-            count: At most so many frames, evenly spread; None: all.
-            progress: Called after each.
+            count: Largest number of frames, evenly spread; None: all.
+            progress: Called after each frame.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -88,9 +88,9 @@ class BakedFiles:
     """Lightmaps that `bake` or `predict` wrote.
 
     Attributes:
-        files: The EXR files by number.
-        single: Whether it is one file and not a folder.
-        device: Where the lightmaps go.
+        files: EXR files by number.
+        single: Whether this is a single file instead of a folder.
+        device: Device of the lightmaps.
     """
 
     files: dict[int, Path]
@@ -98,7 +98,7 @@ class BakedFiles:
     device: str = "cpu"
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
-        """Reads one frame after the other; arguments as for `FramesToBake.shots`.
+        """Reads frames one after the other; arguments as for `FramesToBake.shots`.
 
         Raises:
             WlmError: A file is damaged or of another kind.
@@ -112,12 +112,12 @@ class BakedFiles:
 
 @dataclass(frozen=True)
 class FlipBook:
-    """Lightmaps in an engine's textures, seen from the front: the camera isn't known.
+    """Lightmaps in an engine's textures; the camera is unknown and taken to be in front.
 
     Attributes:
-        files: The two textures, and maybe one of opacity.
+        files: Two textures, and optionally one of opacity.
         layout, rows, columns, straight: As for `wlm.smoke.flipbook.textures.read_flipbook`.
-        device: Where the lightmaps go.
+        device: Device of the lightmaps.
     """
 
     files: tuple[Path, ...]
@@ -129,11 +129,11 @@ class FlipBook:
 
     @property
     def single(self) -> bool:
-        """Whether it has one frame."""
+        """Whether there is only one frame."""
         return self.rows * self.columns == 1
 
     def shots(self, count: int | None = None, progress: OnProgress | None = None) -> Iterator[Shot]:
-        """Reads the textures, then gives one cell after the other; arguments as for `FramesToBake.shots`.
+        """Reads the textures and yields their cells; arguments as for `FramesToBake.shots`.
 
         Raises:
             WlmError: A file is damaged, of another size, or lacks a channel.
@@ -154,10 +154,10 @@ class FlipBook:
 
 
 def baked_files(path: str | os.PathLike[str], device: str = "cpu") -> BakedFiles | None:
-    """Finds what `bake` or `predict` wrote: the file itself, or those of a folder.
+    """Finds files that `bake` or `predict` wrote: the path itself, or files in the folder.
 
     Returns:
-        None where the path is another file or folder.
+        None if the path is another file or folder.
     """
     path = Path(path)
     if path.suffix.lower() == ".exr":

@@ -1,7 +1,7 @@
-"""Flip books of six-way lightmaps, as engines read them: two textures with the frames in rows, from the top left.
+"""Textures of six-way flip books: two textures with the frames in rows of cells from the top left.
 
-EXR holds half floats as they are. PNG and TGA hold 8 bits a channel, linear, so that 1 is the brightest: import the
-textures without sRGB decoding. Light is premultiplied: it is added to the background times 1 - alpha.
+EXR stores half floats. PNG and TGA store 8 bits per channel, linear in 0 to 1: import them without sRGB decoding. Light
+is premultiplied by the opacity: it is added to the background times 1 - alpha.
 `wlm.smoke.camera.LAYOUTS` lists the channels.
 """
 
@@ -27,24 +27,24 @@ from wlm.smoke.lightmaps import SixWay
 
 _SUFFIXES = (".exr", ".png", ".tga")
 _MODES, _GREY = ("RGB", "RGBA"), ("L", "LA")
-_BARE, _LIT = 0.999, 0.05  # transparency without smoke; light that is none there
+_BARE, _LIT = 0.999, 0.05  # least transparency without smoke; largest mean light there
 
 
 def cells(count: int, columns: int | None = None) -> tuple[int, int]:
-    """Rows and columns of cells for frames: of at most so many columns; None: as near to a square as can be."""
+    """Returns rows and columns of cells for frames, with at most `columns` columns; None: nearest to a square."""
     columns = min(columns or math.ceil(count**0.5), count)
     return -(-count // columns), columns
 
 
 def brightest_gain(frames: Sequence[SixWay]) -> float:
-    """The gain by which the brightest light of the frames becomes 1; 1 where all is black."""
+    """Returns the gain that scales the brightest light of the frames to 1; 1 if all frames are black."""
     planes = [plane for six in frames for plane in (six.lightmaps, six.emission) if plane is not None]
     brightest = max(float(plane.max()) for plane in planes)
     return 1.0 / brightest if brightest > 0 else 1.0
 
 
 def channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
-    """Channels of the two textures; one that is last and that no frame fills is left out."""
+    """Returns the channels of the two textures; a last channel that no frame has is omitted."""
     planes = {ALPHA: "transparency", EMISSION: "emission"}
     absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
     return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])
@@ -60,16 +60,15 @@ def pack(
     Args:
         frames: At least one, at most rows x columns, all of one size. Cells without a frame are empty: black, alpha 0.
         layout: One of `LAYOUTS`.
-        rows, columns: Of cells.
-        gain: Factor on the lightmaps and the emission, to use the range of 8 bits.
-        padding: Pixels around each frame that repeat its border, so that neighbours don't show in filtered or smaller
-            textures.
+        rows, columns: Numbers of rows and columns of cells.
+        gain: Factor of the lightmaps and the emission, to use the range of 8 bits.
+        padding: Pixels around each frame that repeat its border, so that filters and mips do not show neighbours.
 
     Returns:
         Two arrays float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
 
     Raises:
-        ValueError: The frames don't fit, no such layout, or a gain that isn't above 0.
+        ValueError: The frames do not fit, the layout is unknown, or the gain is not above 0.
     """
     _check_cells(layout, rows, columns, gain, padding)
     if not 1 <= len(frames) <= rows * columns:
@@ -86,7 +85,7 @@ def pack(
 
 
 def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
-    """Lays pictures [N, H, W, C] out in cells, each in `padding` pixels that repeat its border: one texture."""
+    """Lays pictures [N, H, W, C] out in cells of one texture, each with `padding` pixels that repeat its border."""
     count, height, width, channels = frames.shape
     page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
     around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
@@ -106,21 +105,21 @@ def unpack(
     gain: float = 1.0,
     padding: int = 0,
 ) -> list[SixWay]:
-    """Cuts two textures into frames, the inverse of `pack`.
+    """Cuts two textures into frames; inverse of `pack`.
 
     Args:
         first, second: [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
         layout: One of `LAYOUTS`.
-        rows, columns: Of cells.
-        count: Frames; None: all cells.
-        gain: The factor on the light.
+        rows, columns: Numbers of rows and columns of cells.
+        count: Number of frames; None: all cells.
+        gain: Factor of the light.
         padding: Pixels around each frame.
 
     Returns:
         The frames, float32 on the CPU, without a camera; None for a plane without a channel.
 
     Raises:
-        ValueError: The shapes don't fit each other, the cells or the layout.
+        ValueError: The shapes do not fit each other, the cells or the layout.
     """
     _check_cells(layout, rows, columns, gain, padding)
     count = rows * columns if count is None else count
@@ -158,18 +157,18 @@ def write_flipbook(
     gain: float = 1.0,
     padding: int = 0,
 ) -> int:
-    """Writes frames as two textures, each whole or not at all.
+    """Writes frames as two textures, atomically.
 
     Args:
         paths: The two files, .exr, .png or .tga; their folders must exist.
         frames, layout, rows, columns, gain, padding: As for `pack`.
 
     Returns:
-        How many numbers were above their file's range and became its greatest.
+        Number of values above the range of the file, which were clipped.
 
     Raises:
         ValueError: As for `pack`.
-        WlmError: Another suffix, a number that isn't finite, or a file that can't be written.
+        WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
     """
     for path in paths:
         _suffix(path)
@@ -178,7 +177,7 @@ def write_flipbook(
 
 
 def write_page(path: str | os.PathLike[str], page: np.ndarray) -> int:
-    """Writes a texture [H, W, 3 or 4], whole or not at all; returns and raises as `write_flipbook`."""
+    """Writes a texture [H, W, 3 or 4], atomically; returns and raises as `write_flipbook`."""
     if not np.isfinite(page).all():
         raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
     if _suffix(path) == ".exr":
@@ -204,18 +203,18 @@ def read_flipbook(
     """Reads frames from two textures, or three.
 
     Args:
-        paths: The files, .exr, .png or .tga (8 bits a channel, linear): those of the layout, and maybe one of opacity,
-            its alpha or else its first channel.
+        paths: The files, .exr, .png or .tga (8 bits per channel, linear): two of the layout, and optionally one with
+            the opacity in its alpha or first channel.
         layout, rows, columns, count, gain, padding: As for `unpack`.
-        straight: Whether the light isn't multiplied by the opacity yet; it is here.
+        straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.
 
     Returns:
         As `unpack`.
 
     Raises:
-        WlmError: A file is missing, damaged, of another kind or size, holds numbers that aren't finite, or lacks a
-            channel of the layout; or the light is straight, and there is no opacity.
-        ValueError: Not two or three paths.
+        WlmError: A file is missing, damaged, of another kind or size, has numbers that are not finite, or lacks a
+            channel of the layout; or alpha is straight and there is no opacity.
+        ValueError: There are not two or three paths.
     """
     if len(paths) not in (2, 3):
         raise ValueError(f"expected two or three textures, got {len(paths)}")
@@ -244,14 +243,14 @@ def read_flipbook(
 
 
 def is_straight(frames: Sequence[SixWay]) -> bool:
-    """Whether there is light where there is no smoke: it isn't multiplied by the opacity then. False without one."""
+    """Whether there is light where there is no smoke, which suggests straight alpha; False without opacity."""
     bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
     light = torch.cat(bare) if bare else torch.zeros(0)
     return len(light) > 0 and float(light.mean()) > _LIT
 
 
 def _covered(frame: SixWay) -> SixWay:
-    """A frame with its light multiplied by its opacity."""
+    """Returns a frame with its light multiplied by its opacity."""
     opacity = 1.0 - frame.transparency
     emission = None if frame.emission is None else frame.emission * opacity
     return replace(frame, lightmaps=frame.lightmaps * opacity, emission=emission)
@@ -265,7 +264,7 @@ def _read(path: str | os.PathLike[str], *, grey: bool = False) -> np.ndarray:
         return page
     data = read_file(path, IMAGE_BYTES, "the picture")
     try:
-        # From memory: of a file on disk Pillow would make room for as many bytes as a chunk claims to have.
+        # From memory: for a file on disk Pillow would allocate as many bytes as a chunk claims.
         with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
             modes = (*_MODES, *_GREY) if grey else _MODES
             if image.mode not in modes:
@@ -280,7 +279,7 @@ def _read(path: str | os.PathLike[str], *, grey: bool = False) -> np.ndarray:
 
 def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
     if name == ALPHA:
-        # A frame without transparency among others that have it is taken as transparent.
+        # A frame without transparency among others that have it counts as transparent.
         return 0.0 if frame.transparency is None else 1.0 - frame.transparency.cpu().numpy()
     if name == EMISSION:
         return 0.0 if frame.emission is None else gain * frame.emission.cpu().numpy()

@@ -1,10 +1,10 @@
-"""Six-way lightmaps at the cost of a guiding map: one march in large steps that keeps the lights apart.
+"""Marches in large steps: the paper's guiding maps (section 4.2), and six-way lightmaps at the same cost.
 
-The paper marches in steps of 10 voxels for the sum of three lights, and leaves it to a network to recover six lightmaps
-from it (section 4.2). The same march can keep the lights apart: those from the sides are marched to along the lines of
-a lattice, once for all pixels; those from the front and the back follow from the ray's transparency T alone, exactly,
-as (1 - T^2) / 2 and -T ln T. Its errors are those of its steps: along the rays, in T too, of the distance between the
-lattice's nodes, where light is interpolated, and of the steps to the lights. Each is a setting of `March`.
+The paper marches in steps of 10 voxels for the sum of three lights, and a network recovers six lightmaps from it. The
+same march can compute six separate lightmaps: optical depths to the lights from the sides are computed along the lines
+of a lattice, once for all pixels; light from the front and the back follows exactly from the ray's transparency T, as
+(1 - T^2) / 2 and -T ln T. The errors are those of the steps along the rays, of the interpolation between the lattice's
+nodes, and of the steps to the lights, all of which are settings of `March`.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ _TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transp
 
 
 def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -> SixWay:
-    """Marches through smoke in large steps.
+    """Computes six-way lightmaps by one march in large steps.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
-        march: With steps below 8 voxels empty space is left out, which changes no result. Nodes are a quarter of a
-            voxel apart at least, and more where there would be more than 2^28 of them; each takes 24 bytes while this
-            runs. The jitter is a pattern that varies little over a few pixels, of which 64 seeds differ.
+        march: Settings. Steps below 8 voxels skip empty bricks, which changes no result. Nodes are at least a quarter
+            of a voxel apart, and farther where there would be more than 2^28 of them; a node takes 24 bytes. The
+            jitter is gradient noise with 64 different seeds.
 
     Returns:
         Lightmaps, transparency, emission of hot smoke, and depth, on the smoke's device.
@@ -43,7 +43,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:
-    """`bake_coarse` as one tensor, float32 [9, H, W]: `wlm_kernels.smoke.march_coarse.PLANES`. Cold smoke emits 0."""
+    """Returns `bake_coarse` as float32 [9, H, W], the planes of `wlm_kernels.smoke.march_coarse.PLANES`."""
     return run(march_coarse.coarse_six_way, volume, camera, (len(march_coarse.PLANES),), march)
 
 
@@ -76,15 +76,14 @@ class Guide:
 
 
 def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shared: bool = True) -> Guide:
-    """Marches through smoke in large steps (algorithm 1).
+    """Computes a guiding map by a march in large steps (algorithm 1).
 
     Args:
         volume: The smoke.
-        camera: Orthographic or in perspective; inside the smoke it sees what is in front of it, lit from the front by a
-            light in its own place.
-        march: Without `spacing` and `light_step`: nodes and steps to the lights are those of the rays.
-        shared: Whether pixels share marches to the lights, on a lattice with a node each step. Far quicker; the light
-            between nodes is then interpolated.
+        camera: Orthographic or in perspective; inside the smoke, the light from the front is at the camera.
+        march: Settings without `spacing` and `light_step`, which equal the step.
+        shared: Whether pixels share marches to the lights, on a lattice with a node per step, which is much faster;
+            light is then interpolated between nodes.
 
     Returns:
         The maps, on the smoke's device.

@@ -1,7 +1,7 @@
-"""Six-way lightmaps of smoke by a fine march: single scattering without noise, and with its own error beside it.
+"""Six-way lightmaps of smoke by a fine march: single scattering without noise, with an estimate of its error.
 
-The paper's references are one bounce by path tracing, 512 samples a pixel (section 5). One bounce is an integral, which
-is computed here as such. The camera must be orthographic, as the lightmaps are.
+The paper's references are single scattering by path tracing with 512 samples per pixel (section 5). Single scattering
+is an integral, which is computed here by quadrature. The camera must be orthographic.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,15 @@ def bake(
     supersample: int = 1,
     estimate: bool = True,
 ) -> SixWay:
-    """Makes the lightmaps, the transparency and, of hot smoke, the emission (eq. 4).
+    """Computes the lightmaps, the transparency and, for hot smoke, the emission (eq. 4).
 
     Args:
         volume: The smoke.
-        camera: Orthographic. Smoke behind its plane or outside the image isn't seen and still casts its shadow.
-        step: The longest step, in voxels, along rays and to the lights. Samples lie in their steps' middles.
-        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
-        supersample: Rays along a pixel's edge, whose mean is the pixel; 1: the ray through its centre.
-        estimate: Whether to march in steps of twice the length too, for the error: half as much work again.
+        camera: Orthographic. Smoke behind its plane or outside the image is not visible but casts shadows.
+        step: Longest step, in voxels, along rays and to the lights. Samples lie in the middles of the steps.
+        g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
+        supersample: Number of rays along a pixel's edge, which are averaged; 1: the ray through the centre.
+        estimate: Whether to estimate the error by a second march with twice the step, half as much work again.
 
     Returns:
         The lightmaps on the smoke's device.
@@ -69,16 +69,16 @@ def lit(
     step: float = 0.5,
     g: float = 0.0,
 ) -> torch.Tensor:
-    """Smoke under one light from any direction, of irradiance 4 pi, which six-way shading approximates.
+    """Computes smoke under one light from any direction, of irradiance 4 pi, which six-way shading approximates.
 
-    Each sample of each ray marches to the light: slow, and independent of `bake`, so that it serves as its check.
+    Each sample of each ray marches to the light: slow, but independent of `bake`, which it verifies.
 
     Args:
         volume: The smoke, of albedo 1.
         camera: Any.
-        toward: [3], the direction to the light in the world, of any length but 0.
-        step: In voxels.
-        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
+        toward: [3], direction to the light in the world, of any length except 0.
+        step: Longest step, in voxels.
+        g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
 
     Returns:
         float32 [H, W].
@@ -90,6 +90,6 @@ def lit(
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
-    """Lightmaps, transparency and emission, [8, H, W]."""
+    """Returns lightmaps, transparency and emission, [8, H, W]."""
     out = run(march_six.six_way, volume, camera.finer(supersample), (8,), march)
     return out if supersample == 1 else torch.nn.functional.avg_pool2d(out[None], supersample)[0]

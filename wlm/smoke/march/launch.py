@@ -1,4 +1,4 @@
-"""Marches over a volume, on its device and in torch's memory."""
+"""Launches of ray marches over a volume, on its device and in torch's memory, also as CUDA graphs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,11 +23,11 @@ def run(
     """Runs a march.
 
     Args:
-        launch: `launch(medium, view, *arguments, out, **options)`, of `wlm_kernels.smoke`.
+        launch: Function of `wlm_kernels.smoke`, called as `launch(medium, view, *arguments, out, **options)`.
         volume: The smoke.
         camera: The view.
-        planes: Sizes of the result before those of the image.
-        arguments, options: Passed on; lengths in voxels.
+        planes: Leading dimensions of the result.
+        arguments, options: Further arguments; lengths in voxels.
 
     Returns:
         float32 [*planes, H, W] on the smoke's device.
@@ -40,7 +40,7 @@ def run(
 
 
 def medium_of(volume: DensityVolume) -> Medium:
-    """The smoke as marches take it, inside `wlm.interop.stream`."""
+    """Returns the smoke as kernels take it; to be called inside `wlm.interop.stream`."""
     density, temperature = volume.arrays()
     factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
     return Medium(density, *factors, empty=torch_memory(volume.device))
@@ -50,20 +50,19 @@ _Made = TypeVar("_Made")
 
 
 class VolumeGraph(Generic[_Made]):
-    """A function of smoke, captured as a graph on CUDA and replayed; on the CPU it is called.
+    """A function of smoke that is captured as a CUDA graph and replayed; on the CPU it is called.
 
-    It reads a copy of the smoke, since that of a solver moves. Its results lie where they lay before: each call
-    overwrites those of the last.
+    The function reads a copy of the smoke, since a solver's buffers swap. Each call overwrites the results of the last.
     """
 
     def __init__(self, work: Callable[[DensityVolume], _Made], device: str, warmup: int = 2) -> None:
-        """Makes it.
+        """Prepares the function.
 
         Args:
-            work: Waits for nothing on the device: `wlm.smoke.march`, `transport.light_smoke` and `transport.scatter`
-                with a camera and directional lights do not.
-            device: As `wlm.interop.check_device` returns it.
-            warmup: Calls before it is captured, in which kernels are loaded.
+            work: Function that does not wait for the device, such as `bake_coarse`, `transport.light_smoke` and
+                `transport.scatter` with directional lights.
+            device: Result of `wlm.interop.check_device`.
+            warmup: Calls before the capture, in which kernels are loaded.
         """
         self._work = work
         self._device = device
@@ -72,10 +71,10 @@ class VolumeGraph(Generic[_Made]):
         self._step = StepGraph(self._make, device, warmup=warmup)
 
     def __call__(self, volume: DensityVolume) -> _Made:
-        """What is made of smoke.
+        """Returns the result for smoke.
 
         Raises:
-            ValueError: Its shape, place or factors aren't those of the first.
+            ValueError: Its shape, position or factors differ from those of the first call.
         """
         with stream(self._device):
             if self._volume is None:
@@ -94,6 +93,6 @@ class VolumeGraph(Generic[_Made]):
 
 
 def _kind(volume: DensityVolume) -> tuple:
-    """What a graph takes as given."""
+    """Returns the properties that are fixed in a graph."""
     place = (volume.voxel, tuple(volume.origin), volume.extinction, volume.emission)
     return (volume.shape, volume.density.dtype, volume.temperature is not None, *place)

@@ -1,6 +1,9 @@
-"""How smoke moves across the image between two frames, from the solver's own velocities.
+"""Motion of smoke across the image between two frames, from the solver's velocities, and files of these velocities.
 
 The paper's temporal loss estimates this optical flow from images (neural-six-way-lightmaps, eq. 9).
+
+`velocity_0001.npz` beside a frame has `velocity`, float16 [A, B, C, 3] on cells over the smoke's box: the velocity of
+the air that carried the smoke to that frame, in lengths of the world per frame.
 """
 
 import math
@@ -19,7 +22,7 @@ from wlm.smoke.march.launch import run
 from wlm_kernels.smoke import march_motion
 from wlm_kernels.smoke.settings import March
 
-_CUTOFF = 1e-3  # of a ray's transparency: smoke behind it hardly counts
+_CUTOFF = 1e-3  # transparency of a ray at which it ends
 
 
 def motion(
@@ -27,24 +30,25 @@ def motion(
 ) -> torch.Tensor:
     """Projects the air's motion into the image, weighted by the visibility of the smoke that it carries.
 
-    A pixel shows smoke at many depths, each with a motion of its own: this is their mean, and hidden smoke hardly
-    counts. Light that moves while smoke doesn't, such as a shadow's edge, isn't in it.
+    A pixel shows smoke at many depths with different motions: the result is their mean, in which hidden smoke has
+        little
+    weight. Motion of light without motion of smoke, such as that of a shadow's edge, is not included.
 
     Args:
         volume: The later frame's smoke.
-        velocity: vec3 [A, B, C] on the smoke's device, of the air over the volume's box in cells of any size, as
-            `Solver.velocity` has it.
+        velocity: vec3 [A, B, C] on the smoke's device, velocity of the air over the volume's box in cells of any size,
+            as `Solver.velocity`.
         camera: Orthographic, the same for both frames.
-        reach: Lengths of the world that a velocity of 1 goes between the frames: of a solver, a cell's edge times the
-            steps of its lattice.
-        step: The longest step, in voxels.
+        reach: Lengths of the world that a velocity of 1 moves between the frames: for a solver, the edge of a cell
+            times the steps of its lattice.
+        step: Longest step, in voxels.
 
     Returns:
         float32 [2, H, W]: pixels to the right and down by which the smoke of a pixel has moved since the earlier frame;
-        0 where there is no smoke. So the earlier frame, read at the pixel less this, shows the same smoke.
+        0 where there is no smoke. The earlier frame, read at the pixel minus this motion, shows the same smoke.
 
     Raises:
-        ValueError: The camera is in perspective, the velocity isn't vec3 [A, B, C], or a number is out of its range.
+        ValueError: The camera is in perspective, the velocity is not vec3 [A, B, C], or a number is out of its range.
     """
     march = March(step=step, cutoff=_CUTOFF)
     if not math.isfinite(reach):
@@ -59,7 +63,7 @@ _LARGEST = 3 * 320**3  # numbers
 
 
 def velocity_file(folder: Path, number: int) -> Path:
-    """The file of a frame's velocity."""
+    """Returns the file of a frame's velocity."""
     return folder / f"{_NAME}_{number:04d}.npz"
 
 
@@ -69,10 +73,10 @@ def write_velocity(path: Path, velocity: wp.array, reach: float) -> None:
     Args:
         path: The file.
         velocity: vec3 [A, B, C].
-        reach: Lengths of the world a frame that a velocity of 1 is.
+        reach: Lengths of the world per frame of a velocity of 1.
 
     Raises:
-        WlmError: It can't be written, or has more cells than `read_velocity` takes.
+        WlmError: The file cannot be written, or there are more cells than `read_velocity` accepts.
     """
     if 3 * velocity.size > _LARGEST:
         raise WlmError(f"{path}: expected at most {_LARGEST // 3} cells of air, found {velocity.size}")
@@ -85,7 +89,7 @@ def read_velocity(path: Path) -> np.ndarray:
     """Reads a velocity, float32 [A, B, C, 3].
 
     Raises:
-        WlmError: The file is missing, damaged or holds something else.
+        WlmError: The file is missing, damaged or has other content.
     """
     values = read_npz(path, lambda names: [_NAME], numbers=_LARGEST)[_NAME]
     if values.dtype != np.float16 or values.ndim != 4 or values.shape[3] != 3 or 0 in values.shape:

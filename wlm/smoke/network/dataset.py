@@ -1,28 +1,26 @@
-"""Samples, simulated on the device while a network trains (neural-six-way-lightmaps, sections 4.4 and 5).
+"""Samples that are simulated on the device during a training (neural-six-way-lightmaps, sections 4.4 and 5).
 
 The paper stores 25,200 images of 14 sequences. Here nothing is stored: a pool is a function of its settings, a seed and
-a round. Scenes are drawn, simulated and rendered from several sides. A sample is two successive frames, each with its
-guiding map and its lightmaps, and the motion between them. Images show smoke alone: obstacles shape it and are left out
-(section 5).
+a round. Scenes are drawn at random, simulated, and rendered from several sides. A sample consists of two successive
+frames, each with its guiding map and its lightmaps, and the motion between them. Images show only smoke: obstacles
+shape it but are not rendered (section 5).
 
-The paper's sizes, 400^3 voxels, 512^2 pixels and steps of 10 voxels, are more than learning needs. Lengths are shares
-of the box, so that a smaller grid shows the same: the guiding map's step is 1/40 of its edge, and so is the density
+The paper's sizes, 400^3 voxels, 512^2 pixels and steps of 10 voxels, are larger than needed. Lengths are shares of the
+box, so that a smaller grid gives the same images: the guiding map's step is 1/40 of the edge, and so is the density
 from which smoke counts as a surface. A trained network's guiding maps must be made with its own
-`DatasetSettings.look`.
+`DatasetSettings.look`. Special cases:
 
 =======================================  =============================================================
-an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn in its place
+an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn instead
 `ATTEMPTS` such scenes in a row          error
-a frame with almost no smoke             a small random share of these is kept
+a frame with almost no smoke             only a small random share of these is used
 =======================================  =============================================================
 """
 
 import os
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -44,35 +42,32 @@ from wlm.smoke.simulation import make_solver, volume_of
 from wlm.system import Meter, OnProgress
 
 ATTEMPTS = 8
-"""Scenes drawn for one sequence before it is given up."""
+"""Number of scenes drawn for a sequence before an error."""
 
-STAGES = ("simulate", "guide", "reference", "motion")
-"""Stages whose seconds are counted."""
-
-_EXTENT = 1.1  # edge of a fixed view's image over the box's edge
-_EARLY = 0.35  # of the warmup, for sources that soon stop
-_BRIGHT = 0.99  # quantile of a volume's non-empty voxels that stands for its density
+_EXTENT = 1.1  # image edge of a fixed view over the box's edge
+_EARLY = 0.35  # factor of the warmup for sources that stop early
+_BRIGHT = 0.99  # quantile of a volume's non-empty voxels that represents its density
 
 
 def make_pool(
     settings: DatasetSettings, *, seed: int, round: int = 0, device: str = "cpu", progress: OnProgress | None = None
 ) -> Pool:
-    """Makes the samples of one training round, from sequences that no other round has.
+    """Makes the samples of one training round, from sequences that no other round uses.
 
     Args:
-        settings: How samples are made.
+        settings: Settings of the samples.
         seed: Seed of all rounds, at least 0.
         round: Number of the round, from 0.
         device: "cpu", "cuda" or "cuda:N".
-        progress: Called after each sequence with the figures "samples", "skipped" scenes, "dropped" samples without
-            smoke, and the seconds of each of `STAGES`.
+        progress: Called after each sequence with the figures "samples", "skipped" scenes, and "dropped" samples without
+            smoke.
 
     Returns:
         At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
         device.
 
     Raises:
-        WlmError: The memory isn't enough, or scene after scene is unstable.
+        WlmError: There is not enough memory, or too many scenes in a row are unstable.
     """
     return _Maker(settings, seed, False, device).pool(round * settings.sequences, settings.sequences, progress)
 
@@ -85,15 +80,15 @@ def make_validation(
     scale: float = 1.0,
     progress: OnProgress | None = None,
 ) -> Pool:
-    """Makes samples of sequences that no round has, each pair seen from every fixed view.
+    """Makes samples of sequences that no round uses, each pair from all fixed views.
 
     Args:
         settings, device, progress: As for `make_pool`.
-        test: Use `test_seed`, which is held out from model selection.
-        scale: Factor on the extinction of the same smoke, 0.5 and 2 in the paper's ablation.
+        test: Whether to use `test_seed`, which takes no part in model selection.
+        scale: Factor of the extinction of the same smoke, 0.5 and 2 in the paper's ablation.
 
     Raises:
-        WlmError: As `make_pool`.
+        WlmError: As for `make_pool`.
     """
     seed = settings.test_seed if test else settings.validation_seed
     return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)
@@ -107,21 +102,20 @@ def pool_of_volume(
     extinction: float | None = None,
     emission: float = 1.0,
 ) -> Pool:
-    """Makes samples of any volume, one from each fixed view: a test on smoke from elsewhere.
+    """Makes samples of any volume, one from each fixed view, to test a network on other smoke.
 
     Args:
-        path: A `.npz`, `.nvdb` or `.vdb` volume, as `load_volume` reads it.
-        settings: Views and march; the volume's longest edge counts as the box's.
+        path: A `.npz`, `.nvdb` or `.vdb` volume for `load_volume`.
+        settings: Views and march; the volume's longest edge counts as the box's edge.
         device: "cpu", "cuda" or "cuda:N".
-        extinction: Extinction of density 1, per unit of length; None: such that its dense smoke is as opaque as a
-            scene's.
-        emission: Emission of temperature 1, per unit of length.
+        extinction: Extinction at density 1 per unit of length; None: dense smoke becomes as opaque as in a scene.
+        emission: Emission at temperature 1 per unit of length.
 
     Returns:
-        The samples. There is one frame: both of a sample are equal, the motion is 0, and so is the sequence.
+        The samples. The two frames of a sample are equal; the motion and the sequence are 0.
 
     Raises:
-        WlmError: As `load_volume`; or the volume is empty and no extinction is given.
+        WlmError: As for `load_volume`; or the volume is empty and no extinction is given.
     """
     volume = load_volume(path, extinction=1.0, emission=emission, device=check_device(device))
     if extinction is None:
@@ -142,14 +136,14 @@ def pool_of_volume(
 
 
 def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
-    """The fixed views of a box, all of one extent."""
+    """Returns the fixed views of a box, all of one extent."""
     first = CameraSettings(extent=_EXTENT * float(np.max(size)), resolution=settings.resolution)
     turns = settings.arc / settings.views * np.arange(settings.views)
     return [make_camera(first.turned(float(turn)), origin, size) for turn in turns]
 
 
 class _Shot(NamedTuple):
-    """A view of a frame pair: camera, factor on the extinction, seed of the first frame's jitter."""
+    """A view of a frame pair: camera, factor of the extinction, seed of the first frame's jitter."""
 
     camera: Camera
     scale: float
@@ -157,15 +151,14 @@ class _Shot(NamedTuple):
 
 
 class _Maker:
-    """Makes the pools of one set: training, validation or test."""
+    """Makes the pools of a training, validation or test set."""
 
     def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0) -> None:
         self._settings, self._seed, self._validation, self._scale = settings, seed, validation, scale
         self._device = check_device(device)
-        self._clock = _Clock(self._device)
 
     def pool(self, first: int, count: int, progress: OnProgress | None) -> Pool:
-        """The samples of consecutive sequences."""
+        """Returns the samples of consecutive sequences."""
         meter = Meter(progress, "dataset", count)
         pools: list[Pool] = []
         samples = skipped = dropped = 0
@@ -174,11 +167,11 @@ class _Maker:
             pools.append(pool)
             samples, skipped, dropped = samples + len(pool), skipped + unstable, dropped + empty
             if progress is not None:
-                meter.report(len(pools), samples=samples, skipped=skipped, dropped=dropped, **self._clock.seconds())
+                meter.report(len(pools), samples=samples, skipped=skipped, dropped=dropped)
         return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
 
     def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """A sequence's samples, the number of unstable scenes before it, and the number of samples dropped."""
+        """Returns a sequence's samples, the number of unstable scenes before it, and of dropped samples."""
         for attempt in range(ATTEMPTS):
             index = number * ATTEMPTS + attempt
             settings = self._sequence_settings(index)
@@ -190,13 +183,13 @@ class _Maker:
                     guides, targets, moved = self._render(settings, scene, solver, random)
                 solver.check()
             except WlmError as error:
-                # Memory was checked by `make_solver`, so this can only be an unstable flow.
-                problem = str(error)  # its traceback would keep the solver in memory
+                # `make_solver` has checked the memory, so the flow is unstable.
+                problem = str(error)  # the error's traceback would keep the solver in memory
                 continue
             if not all(bool(torch.isfinite(part).all()) for part in (guides, targets, moved)):
                 problem = "NaN or infinity in its images"
                 continue
-            # Negative in validation and test: never a training sequence's.
+            # Negative in validation and test, unlike numbers of training sequences.
             label = -1 - index if self._validation else index
             sequence = torch.full((len(guides),), label, dtype=torch.int64, device=guides.device)
             pool = Pool(guides, targets, moved, sequence)
@@ -207,7 +200,7 @@ class _Maker:
         raise WlmError(f"{ATTEMPTS} scenes in a row were unstable, the last with: {problem}")
 
     def _sequence_settings(self, index: int) -> DatasetSettings:
-        """The settings with a training sequence's random number of cells."""
+        """Returns the settings with a random number of cells for a training sequence."""
         settings = self._settings
         if settings.least_cells is None or self._validation:
             return settings
@@ -218,8 +211,8 @@ class _Maker:
     def _render(
         self, settings: DatasetSettings, scene: Scene, solver: Solver, random: np.random.Generator
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Simulates a scene and renders its pairs: guides, targets and motion of a `Pool`."""
-        clock, simulation = self._clock, _Simulation(scene, solver)
+        """Simulates a scene and renders its pairs; returns guides, targets and motion of a `Pool`."""
+        simulation = _Simulation(scene, solver)
         views = settings.views if self._validation else settings.views_a_frame
         size = (settings.frames * views, 2)
         pixels = (settings.resolution, settings.resolution)
@@ -228,27 +221,22 @@ class _Maker:
         targets = torch.empty((*size, len(PLANES), *pixels), **half)
         moved = torch.empty((*size, *pixels), **half)
         early = _EARLY if any(source.stop is not None for source in scene.sources) else 1.0
-        with clock("simulate"):
-            simulation.advance(settings.lattice_steps(early * settings.warmup * random.uniform(0.6, 1.6)))
+        simulation.advance(settings.lattice_steps(early * settings.warmup * random.uniform(0.6, 1.6)))
         for pair in range(settings.frames):
             shots = self._shots(scene, random)
             for frame in range(2):
                 if pair or frame:
-                    with clock("simulate"):
-                        simulation.advance(settings.steps if frame else settings.lattice_steps(settings.apart))
+                    simulation.advance(settings.steps if frame else settings.lattice_steps(settings.apart))
                 smoke = volume_of(scene, solver)
                 for number, shot in enumerate(shots, pair * views):
                     volume = replace(smoke, extinction=smoke.extinction * shot.scale)
-                    with clock("guide"):
-                        march = settings.look(volume.shape, shot.seed + frame)
-                        guides[number, frame] = render_guide(volume, shot.camera, settings.guide, march)
-                    with clock("reference"):
-                        six = bake(volume, shot.camera, step=settings.reference_step, estimate=False)
-                        targets[number, frame] = encode_lightmaps(six)
+                    march = settings.look(volume.shape, shot.seed + frame)
+                    guides[number, frame] = render_guide(volume, shot.camera, settings.guide, march)
+                    six = bake(volume, shot.camera, step=settings.reference_step, estimate=False)
+                    targets[number, frame] = encode_lightmaps(six)
                     if frame:
-                        with clock("motion"):
-                            reach = scene.grid.cell * settings.steps
-                            moved[number] = motion(volume, solver.velocity, shot.camera, reach=reach)
+                        reach = scene.grid.cell * settings.steps
+                        moved[number] = motion(volume, solver.velocity, shot.camera, reach=reach)
         return guides, targets, moved
 
     def _shots(self, scene: Scene, random: np.random.Generator) -> list[_Shot]:
@@ -273,7 +261,7 @@ class _Maker:
 
 
 class _Simulation:
-    """Advances a solver, on a GPU by replaying a graph, and switches a scene's sources on and off in time."""
+    """Advances a solver, on a GPU by replaying a graph, and switches the scene's sources on and off."""
 
     def __init__(self, scene: Scene, solver: Solver) -> None:
         self._solver, self._period = solver, PERIOD * scene.smoke.substeps
@@ -286,7 +274,7 @@ class _Simulation:
         self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:
-        """Advances by air steps, a multiple of what a graph holds."""
+        """Advances by a number of air steps, a multiple of the steps in a graph."""
         for _ in range(steps // self._period):
             now = self._done * self._seconds
             active = tuple(source for source, is_active in self._sources if is_active(now))
@@ -296,7 +284,7 @@ class _Simulation:
             self._done += self._period
 
     def _step(self) -> None:
-        # The first steps load the kernels' modules, which a capture must not.
+        # The first steps load the kernels' modules, which is not allowed during a capture.
         if not self._graphs or not self._done:
             self._solver.step(PERIOD)
             return
@@ -305,34 +293,3 @@ class _Simulation:
                 self._solver.step(PERIOD)
             self._graph = capture.graph
         wp.capture_launch(self._graph)
-
-
-class _Clock:
-    """Seconds of alternating stages; on a GPU by the stream's events, without waiting for it."""
-
-    def __init__(self, device: str) -> None:
-        self._cuda = device != "cpu"
-        self._spans: list[tuple[str, Any, Any]] = []
-        self._total = dict.fromkeys(STAGES, 0.0)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        begin = self._now()
-        yield
-        self._spans.append((stage, begin, self._now()))
-
-    def seconds(self) -> dict[str, float]:
-        """Totals by stage; waits for the device."""
-        for stage, begin, end in self._spans:
-            if self._cuda:
-                end.synchronize()
-            self._total[stage] += begin.elapsed_time(end) / 1000.0 if self._cuda else end - begin
-        self._spans.clear()
-        return dict(self._total)
-
-    def _now(self) -> Any:
-        if not self._cuda:
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event

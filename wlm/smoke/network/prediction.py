@@ -1,10 +1,10 @@
-"""Six-way lightmaps of smoke by a trained network: guiding map, network, gate and decoded planes in one call.
+"""Six-way lightmaps of smoke by a trained network: guiding map, network, gate and decoding in one call.
 
-A network may be worse than the guiding map that it reads: on smoke that is smoother, coarser or finer than any of its
-training the map has little noise to remove. So each image has a gate. A second map of a ninth of the pixels, with other
-noise, tells it: of guide A, network N and second guide B the share s of A + s (N - A) that is nearest to B is nearest
-to the truth too, since the noise of B is in neither; it is <N - A, B - A> / |N - A|^2. That is what Noise2Noise
-(Lehtinen et al. 2018) learns by, at run time.
+A network may be worse than its guiding map: for smoke that is smoother, coarser or finer than in its training, the map
+has little noise to remove. Each image therefore has a gate, which is computed from a second map of a ninth of the
+pixels with other noise. For guide A, network N and second guide B, the share s for which A + s (N - A) is nearest to B
+is also nearest to the truth, since neither A nor N contains the noise of B: s = <N - A, B - A> / |N - A|^2. This is the
+principle of Noise2Noise (Lehtinen et al. 2018) at run time.
 """
 
 import functools
@@ -23,33 +23,34 @@ from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import GUIDES, PLANES, decode_lightmaps, render_guide
 from wlm_kernels.smoke.settings import March
 
-_GROUPS = ((0, 6), (6, 7), (7, 8))  # of planes that share a gate: lightmaps, opacity, emission
-_APART = 3  # pixels between those of the second guide
-_OTHER = 32  # seeds on, of 64 that differ
+_GROUPS = ((0, 6), (6, 7), (7, 8))  # ranges of planes that share a gate: lightmaps, opacity, emission
+_APART = 3  # distance of the second guide's pixels in pixels of the image
+_OTHER = 32  # offset of the second guide's seed; 64 seeds differ
 _HALF = 0.5
-_SIZES = 4  # of images whose buffers are kept
+_SIZES = 4  # number of image sizes whose buffers are kept
 
 
 class SmokePredictor:
-    """A network at run time, which marches its guiding maps as those that it was trained with.
+    """A network at run time, with guiding maps made as in its training.
 
-    The buffers for an image's size are made once, for the last few sizes.
+    Buffers are kept for the last few image sizes.
 
     Attributes:
-        device: Where it runs.
-        share: Of the last image, a tensor of one number: how much of what the network changes in the lightmaps is
-            taken, 0 to 1. None: its guide isn't lightmaps, so that there is nothing to take instead, or no image yet.
+        device: Device on which it runs.
+        share: Gate of the last image's lightmaps, a tensor of one number: 0 is the guide, 1 the network. None: there
+            was no image yet, or the guide has no lightmaps, so that there is no gate.
     """
 
     def __init__(self, model: SmokeModel | str | os.PathLike[str] | None = None, device: str = "cpu") -> None:
         """Loads the network.
 
         Args:
-            model: A network or its file; None: the network that comes with wlm.
+            model: A network or its file; None: the network that ships with wlm.
             device: "cpu", "cuda" or "cuda:N".
 
         Raises:
-            WlmError: No such device; the file is missing or damaged, or lacks the settings of its guiding maps.
+            WlmError: The device does not exist; the file is missing or damaged, or lacks the settings of its guiding
+                maps.
         """
         self.device = check_device(device)
         self._model = model if isinstance(model, SmokeModel) else open_network(model)
@@ -58,12 +59,12 @@ class SmokePredictor:
         self._decoders: dict[tuple[int, int], Decoder] = {}
 
     def __call__(self, smoke: DensityVolume, camera: Camera, seed: int = 0) -> SixWay:
-        """Makes lightmaps.
+        """Predicts lightmaps.
 
         Args:
-            smoke: On any device.
+            smoke: The smoke, on any device.
             camera: Orthographic.
-            seed: Of the guiding map's jitter.
+            seed: Seed of the guiding map's jitter.
 
         Returns:
             The lightmaps on the network's device, with emission if the smoke has a temperature.
@@ -91,12 +92,12 @@ class SmokePredictor:
     def _gated(
         self, guide: torch.Tensor, planes: torch.Tensor, smoke: DensityVolume, camera: Camera, march: March
     ) -> torch.Tensor:
-        """What is taken of planes [8, H, W] and of the guide in their place, both encoded."""
+        """Returns planes [8, H, W] and guide blended by the gate, all encoded."""
         size = [n // _APART - (n - n // _APART) % 2 for n in (camera.height, camera.width)]
         if min(size) < 1:
             self.share = torch.zeros((), device=guide.device)
             return guide
-        # Centres of these pixels are centres of the image's.
+        # The centres of these pixels are centres of pixels of the image.
         small = replace(camera, height=size[0], width=size[1], extent=_APART * size[0] * camera.pitch)
         second = _as_planes(render_guide(smoke, small, "six", replace(march, seed=march.seed + _OTHER, jitter=1.0)))
         first = [(n - _APART * few) // 2 + _APART // 2 for n, few in zip(planes.shape[1:], size, strict=True)]
@@ -111,14 +112,14 @@ class SmokePredictor:
         return torch.lerp(guide, planes, torch.cat(shares)[:, None, None])
 
     def note(self) -> str | None:
-        """A line where the gate has taken less than half of what the network changed in the last image."""
+        """Returns a message if the gate of the last image was below a half."""
         if self.share is None or (share := float(self.share)) >= _HALF:
             return None
-        return f"{share:.0%} of the network is taken: on this smoke the coarse march that it reads is as near or nearer"
+        return f"the network has a weight of {share:.0%}: on this smoke its guide, the coarse march, is as accurate"
 
 
 def _as_planes(guide: torch.Tensor) -> torch.Tensor:
-    """A guiding map of kind "six" in the order of `PLANES`: without depth, opacity before emission."""
+    """Returns a guiding map of kind "six" in the order of `PLANES`: without depth, opacity before emission."""
     of = dict(zip(GUIDES["six"], guide, strict=True))
     return torch.stack([of[name] for name in PLANES])
 
@@ -130,22 +131,22 @@ def predict(
     device: str | None = None,
     seed: int = 0,
 ) -> SixWay:
-    """Makes six-way lightmaps of smoke by a network: what `bake` makes, sooner.
+    """Predicts six-way lightmaps of smoke by a network, faster than `bake`.
 
     Args:
-        smoke: On any device.
+        smoke: The smoke, on any device.
         camera: Orthographic.
-        model: A network, its file, or a `SmokePredictor` for many frames; None: the network that comes with wlm,
-            which is loaded once for each device.
-        device: Where a network that isn't loaded runs; None: where the smoke is.
-        seed: Of the guiding map's jitter.
+        model: A network, its file, or a `SmokePredictor` for many frames; None: the network that ships with wlm, which
+            is loaded once per device.
+        device: Device of a network that is not loaded yet; None: that of the smoke.
+        seed: Seed of the guiding map's jitter.
 
     Returns:
         The lightmaps, with emission if the smoke has a temperature.
 
     Raises:
         ValueError: The camera is in perspective.
-        WlmError: As `SmokePredictor`.
+        WlmError: As for `SmokePredictor`.
     """
     if not isinstance(model, SmokePredictor):
         device = check_device(device_name(smoke.device) if device is None else device)

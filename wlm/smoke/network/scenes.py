@@ -1,13 +1,13 @@
 """Random scenes: jets, plumes, flames and bursts past obstacles (neural-six-way-lightmaps, section 5).
 
-The paper has 14 jets past cylinders. A scene here is one of four kinds, in a box of 1 m whose fastest air is to move at
-1 m/s, so that it crosses the box in a second:
+The paper has 14 jets past cylinders. A scene here is of one of four kinds, in a box of 1 m in which the fastest air
+moves at 1 m/s, so that it crosses the box in a second:
 
 =======  =====================================================  ====================
 kind     smoke                                                  obstacles
 =======  =====================================================  ====================
 jet      one or two inlets in the floor, sometimes in wind      1 to 3
-plume    a sphere that keeps emitting warm, rising smoke        0 to 3
+plume    a sphere that emits warm, rising smoke                 0 to 3
 flame    a hot jet that glows and cools                         0 to 2
 burst    one to three spheres, hot for a moment, that glow      0 to 2
 =======  =====================================================  ====================
@@ -21,25 +21,25 @@ from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.network.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
 from wlm.smoke.scene import Air, Grid, Inlet, ObstacleSettings, Scene, Smoke, SourceSettings
 
-# Of the air, m^2/s: at the low end the eddies come from the turbulence model, at the high end the smoke is smooth.
+# Viscosity in m^2/s: at the low end the turbulence model dominates, at the high end the smoke is smooth.
 _VISCOSITY = (1.5e-5, 6e-4)
-_RADIUS = (0.055, 0.14)  # of inlets and spheres; at least a cell of the coarsest grid
-_CYLINDERS, _SPHERES = 0.65, 0.85  # cumulative shares of the obstacles' shapes; the rest are boxes
-# A moving obstacle is no faster than the smoke's source, or it would sweep the box empty.
+_RADIUS = (0.055, 0.14)  # radii of inlets and spheres; at least a cell of the coarsest grid
+_CYLINDERS, _SPHERES = 0.65, 0.85  # cumulative probabilities of the obstacles' shapes; the rest are boxes
+# A moving obstacle is at most as fast as the air; a faster one would empty the box.
 _CROSSING = (0.9, 1.6)  # seconds in which it crosses the box
 
 
 class Tilted(ObstacleSettings):
-    """An obstacle whose y axis is turned to another direction.
+    """An obstacle whose y axis is rotated to another direction.
 
     Attributes:
-        axis: The direction, of any length but 0.
+        axis: The direction, of any length except 0.
     """
 
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """As `ObstacleSettings.mesh`, turned."""
+        """Returns the rotated mesh; see `ObstacleSettings.mesh`."""
         points, triangles = super().mesh()
         up = np.array(self.axis) / np.linalg.norm(self.axis)
         right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -48,21 +48,21 @@ class Tilted(ObstacleSettings):
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
-    """The random generator of a sequence's part; validation and training never share one."""
+    """Returns the random generator for a part of a sequence; validation and training have different ones."""
     return np.random.default_rng([int(validation), *numbers])
 
 
 def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False) -> Scene:
-    """Draws a scene; the same arguments give the same scene.
+    """Draws a random scene; the same arguments give the same scene.
 
     Args:
-        settings: Grids, times and shares.
+        settings: Grids, times and probabilities.
         seed: Seed of a set of scenes, at least 0.
         index: Number of the scene in its set, at least 0.
-        validation: Whether the set is held out from training.
+        validation: Whether the set is not used in training.
 
     Returns:
-        The scene; its frame rate is that of the two frames of a pair.
+        The scene; its frame interval is that between the two frames of a pair.
     """
     random = generator(validation, seed, index, 0)
     if random.random() < settings.hot:
@@ -105,12 +105,12 @@ def _place(random: np.random.Generator, low: tuple, high: tuple) -> tuple[float,
 
 
 def _jet(random: np.random.Generator) -> dict[str, Any]:
-    """Smoke blown up from the floor, upright or leaning."""
+    """Returns settings of a jet from the floor, upright or leaning."""
     inlets = []
     for number in range(1 + (random.random() < 0.3)):
         speed = SPEED * (1.0 if number == 0 else random.uniform(0.5, 1.0))
         lean, around = np.radians(random.uniform(0.0, 28.0)), random.uniform(0.0, 2 * np.pi)
-        # Leaning jets start off the middle, so that they lean into the box.
+        # Leaning jets start off-centre, so that they lean into the box.
         back = -0.35 * np.tan(lean) * np.array([np.cos(around), 0.0, np.sin(around)])
         centre = np.array(_place(random, (0.38, 0.0, 0.38), (0.62, 0.0, 0.62))) + EDGE * back
         velocity = speed * np.array([np.sin(lean) * np.cos(around), np.cos(lean), np.sin(lean) * np.sin(around)])
@@ -132,7 +132,7 @@ def _jet(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _flame(random: np.random.Generator) -> dict[str, Any]:
-    """A jet that enters hot."""
+    """Returns settings of a hot jet."""
     parts = _jet(random)
     inlets = tuple(inlet.model_copy(update={"temperature": float(inlet.density > 0.0)}) for inlet in parts["inlets"])
     smoke = {"buoyancy": random.uniform(0.5, 2.0), "cooling": random.uniform(1.0, 3.0)}
@@ -140,7 +140,7 @@ def _flame(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _plume(random: np.random.Generator) -> dict[str, Any]:
-    """A sphere held at a density and a temperature; smoke rises from it and rolls up."""
+    """Returns settings of a sphere of constant density and temperature, from which smoke rises."""
     sphere = SourceSettings(
         centre=_place(random, (0.35, 0.1, 0.35), (0.65, 0.16, 0.65)),
         radius=EDGE * _log(random, *_RADIUS),
@@ -152,7 +152,7 @@ def _plume(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _burst(random: np.random.Generator) -> dict[str, Any]:
-    """Spheres side by side, hot for a moment."""
+    """Returns settings of spheres that emit hot smoke for a short time."""
     spheres = [
         SourceSettings(
             centre=_place(random, (0.32, 0.12, 0.32), (0.68, 0.3, 0.68)),
@@ -182,7 +182,7 @@ def _obstacle(random: np.random.Generator) -> Tilted:
 
 
 def _moving(random: np.random.Generator, obstacle: Tilted, begin: float) -> Tilted:
-    """The same obstacle on a path through the box, from one side to the other."""
+    """Returns the obstacle on a path through the box, from one side to the other."""
     _, *middle = obstacle.path[0]
     around = random.uniform(0.0, 2 * np.pi)
     half = 0.36 * EDGE * np.array([np.cos(around), 0.0, np.sin(around)])

@@ -1,4 +1,4 @@
-"""Light in smoke beyond six ways: path-traced references, a scene's own lights, light scattered more than once."""
+"""Light in smoke beyond six-way lightmaps: path tracing, lights from any direction, multiple scattering."""
 
 from wlm._facade import facade
 

@@ -1,8 +1,8 @@
-"""Light of all orders by diffusion: as good as all of it in the middle of thick smoke, and near it elsewhere.
+"""Multiple scattering by diffusion: accurate inside thick smoke, and approximate elsewhere.
 
-Deep in smoke light has been scattered so often that it only spreads, from where there is more to where there is less
-(Stam 1995, "Multiple scattering as a diffusion process"). A grid of few cells holds all of it that there is to see; the
-smoke before it and light that was scattered once stay as fine as they are.
+Deep in smoke light has been scattered so often that it diffuses (Stam 1995, "Multiple scattering as a diffusion
+process"). A coarse grid resolves this light; light that was scattered once, and the extinction along camera rays, keep
+the resolution of the smoke.
 """
 
 import math
@@ -20,15 +20,15 @@ from wlm.smoke.transport.lights import AnyLight, PointLight, in_voxels
 from wlm_kernels.smoke import diffusion
 
 CELLS = 32
-"""Of a grid of diffusion, along the longest edge."""
+"""Cells of the diffusion grid along the longest edge."""
 
 _LEAST_ALBEDO = 0.01
-_AT_ONCE = 3  # albedos
-_FADE = 0.25  # edges of the smoke's box, over which diffusion fades out beside it
+_AT_ONCE = 3  # albedos solved together
+_FADE = 0.25  # distance from the box, in edges of the box, over which diffusion fades out
 
 
 def share_of(light: AnyLight, volume: DensityVolume) -> float:
-    """How much of a light's further orders is diffusion's: all in the smoke's box, and nothing far beside it."""
+    """Returns the weight of diffusion for a light: 1 for a point light in the smoke's box, falling to 0 outside."""
     if not isinstance(light, PointLight):
         return 0.0
     place = in_voxels(light, volume)[0]
@@ -37,7 +37,7 @@ def share_of(light: AnyLight, volume: DensityVolume) -> float:
 
 
 class Spreading:
-    """What diffusion makes of lights, as a march goes to one after the other."""
+    """Diffusion of several lights, whose sources are added during a march."""
 
     def __init__(self, scene: Marching, volume: DensityVolume, lights: Sequence[AnyLight]) -> None:
         """Begins without light.
@@ -45,14 +45,14 @@ class Spreading:
         Args:
             scene: A march through the smoke.
             volume: The smoke.
-            lights: Any number.
+            lights: Any number of lights.
         """
         self._scene, self._volume, self._lights = scene, volume, tuple(lights)
         self._coarse = CoarseSmoke(volume)
         self._source = torch.zeros(len(lights), *self._coarse.extinction.shape, device=volume.device)
 
     def add(self, number: int, depths: Depths) -> None:
-        """Leaves what comes straight from a light to the cells that stop it."""
+        """Adds the direct light that cells stop as the source of a light."""
         light, out = self._lights[number], self._source[number]
         if isinstance(light, PointLight):
             place, _, radius = in_voxels(light, self._volume)
@@ -60,27 +60,25 @@ class Spreading:
         else:
             self._coarse.lit(self._scene, depths, out)
 
-    def seen(self, albedos: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
-        """What a camera sees of it.
-
-        Lights have an irradiance of 4 pi, point lights an intensity of 4 pi.
+    def render(self, albedos: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Computes the light that reaches the camera, for lights of irradiance, or intensity, 4 pi.
 
         Args:
-            albedos: Any number.
+            albedos: Any number of albedos.
 
         Returns:
-            Light that was scattered more than once over the square of its albedo, float32 [2, L, A, H, W]: all of it,
-            and what thin smoke sends; and the opacity of thin smoke, float32 [H, W], as `CoarseSmoke.seen` has it.
+            Light that was scattered more than once, divided by the squared albedo, float32 [2, L, A, H, W]: all of it,
+            and the part from thin smoke; and the opacity of thin smoke, float32 [H, W], see `CoarseSmoke.render`.
         """
         size = (self._scene.view.height, self._scene.view.width)
         made = torch.empty(2, len(self._lights), len(albedos), *size, device=self._source.device)
         thin = torch.zeros(size, device=self._source.device)
         for first in range(0, len(albedos), _AT_ONCE):
-            # Over its square it hardly changes where the albedo is next to nothing.
+            # Divided by the squared albedo, the light hardly depends on albedos near 0.
             some = [max(albedo, _LEAST_ALBEDO) for albedo in albedos[first : first + _AT_ONCE]]
-            seen, thin = self._coarse.seen(self._scene, self._coarse.spread(self._source, some))
+            found, thin = self._coarse.render(self._scene, self._coarse.spread(self._source, some))
             for n, albedo in enumerate(some):
-                torch.div(seen[:, n :: len(some)], albedo, out=made[:, :, first + n])
+                torch.div(found[:, n :: len(some)], albedo, out=made[:, :, first + n])
         for n, light in enumerate(self._lights):
             if isinstance(light, PointLight):
                 made[:, n] /= self._volume.voxel**2
@@ -88,34 +86,34 @@ class Spreading:
 
 
 def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:
-    """What hot smoke scatters to a camera of the light that it gives off, [A, H, W].
+    """Computes the emitted light that hot smoke scatters to a camera, [A, H, W].
 
     Args:
         scene: A march through the smoke.
         volume: The smoke.
-        albedos: One to three.
+        albedos: One to three albedos.
     """
     coarse = CoarseSmoke(volume)
     source = coarse.mean(volume.temperature).mul_(4.0 * math.pi * volume.emission * volume.voxel)
-    # Light that is given off was scattered by nothing yet: `spread` takes an albedo's share of it, as the camera would.
-    return coarse.seen(scene, coarse.spread(source[None], albedos))[0][0]
+    # Emitted light has not been scattered yet: `spread` multiplies it by the albedo.
+    return coarse.render(scene, coarse.spread(source[None], albedos))[0][0]
 
 
 class CoarseSmoke:
-    """Smoke in cells, in which light spreads.
+    """Smoke on the coarse grid of the diffusion.
 
     Attributes:
-        medium: The smoke itself.
-        extinction: float32 tensor [X, Y, Z], per voxel, the mean over each cell.
-        edges: Of a cell, in voxels.
+        medium: The smoke at full resolution.
+        extinction: float32 tensor [X, Y, Z], mean extinction per voxel of each cell.
+        edges: Edges of a cell in voxels.
     """
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
-        """Makes it, inside `wlm.interop.stream`.
+        """Averages the smoke; to be called inside `wlm.interop.stream`.
 
         Args:
             volume: The smoke.
-            cells: As `CELLS`.
+            cells: Cells along the longest edge.
         """
         self.medium = medium_of(volume)
         longest = max(volume.shape)
@@ -124,23 +122,22 @@ class CoarseSmoke:
         self.extinction = self.mean(volume.density).mul_(volume.extinction * volume.voxel)
 
     def mean(self, voxels: torch.Tensor) -> torch.Tensor:
-        """Means over the cells of a grid of the smoke's voxels, float32 [X, Y, Z]."""
+        """Returns means of voxels over the cells, float32 [X, Y, Z]."""
         mean = voxels.float()
         for count in self._counts:
-            # Over one axis, which then is the last: after three the first is the first again.
+            # Each product moves its axis to the end, so that after three the order is restored.
             mean = torch.tensordot(mean, _shares(mean.shape[0], count, mean.device), ([0], [0]))
         return mean.contiguous()
 
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
-        """The fluence of light that was scattered at least once.
+        """Solves for the fluence of light that was scattered at least once.
 
         Args:
-            source: float32 tensor [L, X, Y, Z], what each cell stops of light that comes straight from its source,
-                per volume.
-            albedos: One to three.
+            source: float32 tensor [L, X, Y, Z], direct light that each cell stops, per volume.
+            albedos: One to three albedos.
 
         Returns:
-            float32 tensor [L * A, X, Y, Z], the albedos of each source one after another.
+            float32 tensor [L * A, X, Y, Z], with the albedos of each source adjacent.
         """
         light = torch.empty(len(source) * len(albedos), *self.extinction.shape, device=source.device)
         if not len(light):
@@ -150,16 +147,16 @@ class CoarseSmoke:
         diffusion.spread(self.medium, extinction, source, wp.vec3(*self.edges), three, len(albedos), out)
         return light
 
-    def seen(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What smoke of albedo 1 sends to the camera of a march.
+    def render(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Computes the light that smoke of albedo 1 sends to the camera of a march.
 
         Args:
             scene: The march.
             light: float32 tensor [N, X, Y, Z], fluences.
 
         Returns:
-            float32 [2, N, H, W], all of it and what thin smoke sends, where each place counts by the transparency of a
-            cell of smoke as dense as there; and likewise the opacity of thin smoke, float32 [H, W].
+            float32 [2, N, H, W], all light and the light from thin smoke, where each sample is weighted by the
+            transparency of a cell of smoke of its density; and the opacity of thin smoke, float32 [H, W].
         """
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
@@ -169,22 +166,23 @@ class CoarseSmoke:
         return out, thin
 
     def lit(self, scene: Marching, depths: Depths, out: torch.Tensor) -> None:
-        """What cells stop of the light that comes straight from infinitely far off, of an irradiance of 4 pi.
+        """Computes the direct light of irradiance 4 pi from a light at infinity that cells stop.
 
         Args:
             scene: A march through the smoke.
-            depths: Of the light, by `scene`.
+            depths: Optical depths to the light, from `scene.reach`.
             out: float32 tensor [X, Y, Z], written.
         """
         cell = wp.vec3(*self.edges)
         diffusion.stop(scene.medium, depths, cell, scene.march.step, to_warp(out))
 
     def around(self, scene: Marching, place: Sequence[float], radius: float, out: torch.Tensor) -> None:
-        """Adds what cells stop of the light that comes straight from a point light.
+        """Adds the direct light of a point light that cells stop.
 
         Args:
             scene: A march through the smoke.
-            place, radius: Of the light, in voxels; its irradiance is 4 pi at a distance of one voxel.
+            place, radius: Position and radius of the light in voxels; its irradiance is 4 pi at a distance of one
+                voxel.
             out: float32 tensor [X, Y, Z].
         """
         step = max(0.5, min(self.edges) / 8)
@@ -194,7 +192,7 @@ class CoarseSmoke:
 
 
 def _shares(voxels: int, cells: int, device: torch.device) -> torch.Tensor:
-    """Of each cell's mean along an axis what each voxel has, [voxels, cells]."""
+    """Returns the weight of each voxel in each cell's mean along an axis, [voxels, cells]."""
     low = torch.arange(voxels, device=device)[:, None]
     first = torch.arange(cells, device=device) * (voxels / cells)
     over = torch.minimum(low + 1.0, first + voxels / cells) - torch.maximum(low.float(), first)

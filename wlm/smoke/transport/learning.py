@@ -1,4 +1,6 @@
-"""Smoke, cameras and lights drawn at random, with all light that reaches the camera: what a mix learns from."""
+"""Fit of the weights of `orders` to path-traced light of random smoke, cameras and lights, by least squares.
+
+References may be noisy as long as they have no bias: the least squares solution is that of their mean."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,23 +21,23 @@ from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 
 _ORDERS = 40
-_THIN, _THICK = 5.0, 60.0  # extinction over the box's edge
+_THIN, _THICK = 5.0, 60.0  # range of the optical depth across the box
 _SIZES = (40, 48, 56, 64)
 _THINNEST, _THICKEST = 2.0, 100.0
 _ALL_SIZES = (24, 32, 48, 64, 96)
 _PIXELS = (32, 48, 64, 96)
-_SMALL, _HAZY = 0.4, 0.4  # chances of smoke that fills a part of its box, and of smoke in other smoke
+_SMALL, _HAZY = 0.4, 0.4  # probabilities of smoke that fills a part of its box, and of smoke in haze
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One volume from one side under some lights.
+    """A view of a volume under several lights.
 
     Attributes:
         volume: The smoke.
         camera: Orthographic.
-        lights: Directional, of irradiance 4 pi.
-        light: float32 tensor [L, A, H, W], light of all orders of each light, at each of `ALBEDOS`; with noise.
+        lights: Directional lights of irradiance 4 pi.
+        light: float32 tensor [L, A, H, W], path-traced light of all orders for each light and each of `ALBEDOS`.
     """
 
     volume: DensityVolume
@@ -47,13 +49,13 @@ class Sample:
 def draw_view(
     seed: int, number: int, *, pixels: int = 64, lights: int = 6, cells: int | None = None
 ) -> tuple[DensityVolume, Camera, tuple]:
-    """Draws smoke, a camera and lights; each is of the seed and the number alone.
+    """Draws random smoke, a camera and lights, which depend only on the seed and the number.
 
     Args:
         seed, number: At least 0.
         pixels: H and W.
-        lights: How many.
-        cells: Voxels along an edge; None: drawn, 40 to 64.
+        lights: Number of lights.
+        cells: Voxels along an edge; None: random, 40 to 64.
     """
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THIN), np.log(_THICK))))
@@ -65,8 +67,8 @@ def draw_view(
 
 
 def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolume, Camera, tuple]:
-    """Draws a view to learn from, of smoke of more kinds than `draw_view`'s, thinner and thicker, in cells coarse and
-    fine: plumes and billows, dense ones in haze, small ones in a large box; arguments as there."""
+    """Draws a view for the fit, with more kinds of smoke than `draw_view`: thin and thick, coarse and fine, plumes and
+    billows, also in haze or in a large box; arguments as there."""
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THINNEST), np.log(_THICKEST))))
     n, pixels = int(random.choice(_ALL_SIZES)), int(random.choice(_PIXELS))
@@ -83,7 +85,7 @@ def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolu
 
 
 def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
-    """Density [n, n, n] of a random kind."""
+    """Returns density [n, n, n] of a random kind."""
     seed = int(random.integers(2**31))
     made = make_billows(n, seed=seed) if random.random() < 0.5 else make_plume(n, seed=seed, hot=False)
     return made.density
@@ -92,7 +94,7 @@ def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
 def _seen(
     volume: DensityVolume, random: np.random.Generator, pixels: int, lights: int
 ) -> tuple[DensityVolume, Camera, tuple]:
-    """The smoke turned, from a random side under random lights."""
+    """Returns the smoke rotated at random, with a random camera and lights."""
     density = volume.density.permute(tuple(int(i) for i in random.permutation(3)))
     density = density.flip([axis for axis in range(3) if random.random() < 0.5]).contiguous()
     volume = replace(volume, density=density)
@@ -108,14 +110,14 @@ def make_sample(
 
     Args:
         seed, number, pixels, lights: As for `draw_view`.
-        samples: Paths a pixel.
+        samples: Paths per pixel.
         device: "cpu" or "cuda:N".
     """
     return traced(draw_view(seed, number, pixels=pixels, lights=lights), samples=samples, seed=number, device=device)
 
 
 def traced(view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu") -> Sample:
-    """A view of `draw_view` with its light; arguments as for `make_sample`."""
+    """Traces a view of `draw_view`; arguments as for `make_sample`."""
     volume, camera, lamps = view
     volume = replace(volume, density=volume.density.to(device))
     grey = trace(volume, camera, lamps, samples=samples, orders=_ORDERS, seed=seed).planes[..., 0]
@@ -125,28 +127,28 @@ def traced(view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int
 
 
 FAINT = 0.03
-"""Light below which an error counts the same."""
+"""Light below which errors have the same weight."""
 
 _RIDGE = 1e-5
-_RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end that aren't known, and the least range
-_CLEAR = 1e-3  # opacity below which there is nothing to be learned: light is bounded by it
-_CURVE = 1.16  # twice the power of light that sRGB's slope falls with
+_RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end outside the range, and the least range
+_CLEAR = 1e-3  # opacity below which pixels are ignored
+_CURVE = 1.16  # exponent of the light in the weight, from the slope of sRGB's curve
 
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """One light of a sample: what is known, and all its light at each of `ALBEDOS`, [A, H, W]."""
+    """One light of a sample: the inputs, and its light of all orders at each of `ALBEDOS`, [A, H, W]."""
 
     inputs: Inputs
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """R, light scattered more than once over the albedo's square, [A, H, W]."""
+        """Returns R, light scattered more than once over the squared albedo, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 
     def weights(self) -> torch.Tensor:
-        """Of square errors of R, such that they are about those of pictures in sRGB, [A, H, W]."""
+        """Returns weights of squared errors of R that approximate errors in sRGB, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         seen = self.inputs.transparency < 1.0 - _CLEAR
         near = F.avg_pool2d(self.light[None], 3, 1, 1, count_include_pad=False)[0]
@@ -154,7 +156,7 @@ class Lesson:
 
 
 def make_lessons(sample: Sample) -> list[Lesson]:
-    """The lights of a sample, marched and spread."""
+    """Computes the inputs of each light of a sample."""
     volume = sample.volume
     with stream(device_name(volume.device)):
         _, inputs = make_inputs(volume, sample.camera, sample.lights, ALBEDOS, orders_march(volume))
@@ -162,12 +164,12 @@ def make_lessons(sample: Sample) -> list[Lesson]:
 
 
 def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) -> OrdersModel:
-    """Fits the mix.
+    """Fits the weights.
 
     Args:
-        lessons: At least one.
-        pixels: Of each lesson that are used, drawn at random.
-        seed: Of these.
+        lessons: At least one lesson.
+        pixels: Number of random pixels per lesson.
+        seed: Seed of these pixels.
     """
     device, size = lessons[0].light.device, FEATURES * MIXES
     depths = torch.tensor([float(lesson.inputs.depth) for lesson in lessons], dtype=torch.float64)
@@ -182,7 +184,7 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
         chosen = torch.randperm(features.shape[2], generator=random)[:pixels].to(device)
         features = features[..., chosen]
         target, weights = (part.flatten(1)[:, chosen].double() for part in (lesson.multiple(), lesson.weights()))
-        # All of a lesson's pixels have one mix: its square times that of the features is the whole's.
+        # All pixels of a lesson have the same polynomial terms, so that the normal matrix is a product.
         mix = model.mixes(lesson.inputs)[0].double()
         weighed = features * weights[:, None]
         squares = weighed @ features.transpose(1, 2)
@@ -203,12 +205,12 @@ def learn(
     device: str = "cpu",
     report: Callable[[int], None] | None = None,
 ) -> OrdersModel:
-    """Draws smoke, traces its light and fits the mix to it: what comes with wlm has learned from 2000.
+    """Draws smoke, traces its light and fits the weights; those that ship with wlm are from 2000 views.
 
     Args:
-        views: How many, of four lights each.
-        samples: Paths a pixel.
-        seed: Of the views and their paths.
+        views: Number of views, with four lights each.
+        samples: Paths per pixel.
+        seed: Seed of the views and their paths.
         device: "cpu" or "cuda:N".
         report: Called with the number of each view.
     """
@@ -221,6 +223,6 @@ def learn(
 
 
 def psnr(light: torch.Tensor, reference: torch.Tensor) -> float:
-    """Of pictures in sRGB with a peak of 1, dB."""
+    """Returns the PSNR in sRGB with a peak of 1, in dB."""
     error = (to_srgb(light) - to_srgb(reference)).double().square().mean()
     return -10.0 * math.log10(max(float(error), 1e-12))

@@ -1,8 +1,8 @@
-"""Smoke under its actual lights: one march to each light's own direction or point, instead of six ways weighed.
+"""Smoke under lights from any direction and point lights: one march per light, instead of weighted lightmaps.
 
-Six lightmaps, weighed, are 30% off for lights between their axes. The march that they are made by, with its lattice
-turned towards a light, costs as much for this light and the opposite one as for two of the six, and has the error of
-its step alone. `wlm.smoke.transport.orders` makes light of all orders from such planes.
+Six weighted lightmaps have an error of 30% for lights between the axes. The same march with its lattice turned towards
+a light costs as much for this light and the opposite light as for two of the six, and has only the error of its step.
+`wlm.smoke.transport.orders` computes light of all orders from such planes.
 """
 
 import math
@@ -24,7 +24,7 @@ from wlm_kernels.smoke import depth_lattice, march_lights
 from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March
 
-_CLOSE, _FINEST = 0.1, 0.25  # optical depth between nodes, and voxels
+_CLOSE, _FINEST = 0.1, 0.25  # optical depth per step, and least step in voxels
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +33,16 @@ class LitSmoke:
 
     Attributes:
         lights: The lights.
-        planes: float32 tensor [L, H, W], light scattered once: of an irradiance of 4 pi, of a point light an intensity
-            of 4 pi.
-        opposite: As the planes, under a light from the opposite direction; of a point light 0.
+        planes: float32 tensor [L, H, W], light scattered once, of a light of irradiance 4 pi or a point light of
+            intensity 4 pi.
+        opposite: As the planes, under a light from the opposite direction; 0 for a point light.
         transparency: float32 tensor [H, W].
-        emission: float32 tensor [H, W], or None: it is cold.
+        emission: float32 tensor [H, W]; None: the smoke is cold.
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0: none.
         camera: The view.
-        march: What it was made by.
-        thrown: float32 tensor [H, W, 3], light that its own fire throws on it and that it scatters to the camera, grey
-            but for the smoke's albedo; None: it is cold, or light is scattered once alone.
+        march: Settings of the march.
+        thrown: float32 tensor [H, W, 3], emitted light that the smoke scatters to the camera, grey except for the
+            albedo; None: the smoke is cold, or only light scattered once is computed.
     """
 
     lights: tuple[AnyLight, ...]
@@ -62,18 +62,18 @@ class LitSmoke:
         background: torch.Tensor | Sequence[float] | None = None,
         ramp: Ramp | None = None,
     ) -> torch.Tensor:
-        """The light scattered once, of all lights in their colours, and the smoke's own.
+        """Returns the picture with light scattered once of all lights, and emission.
 
         Args:
-            albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
-            background: Linear light behind the smoke, [H, W, 3] or one colour; None: the smoke's light alone.
-            ramp: Colour of the emission; None: grey, as it is.
+            albedo: R, G, B, share of light that survives a scattering, 0 to 1.
+            background: Linear light behind the smoke, [H, W, 3] or one colour; None: only the smoke's light.
+            ramp: Colour of the emission; None: grey.
 
         Returns:
             float32 [H, W, 3].
 
         Raises:
-            ValueError: Not an albedo, or a light's visibility has another shape.
+            ValueError: The albedo is wrong, or a light's visibility has another shape.
         """
         planes = torch.stack([float(value) * self.planes for value in checked_albedo(albedo)], -1)
         return self.compose(planes, background=background, ramp=ramp)
@@ -85,7 +85,7 @@ class LitSmoke:
         background: torch.Tensor | Sequence[float] | None = None,
         ramp: Ramp | None = None,
     ) -> torch.Tensor:
-        """Puts light of each light, [L, H, W, 3], the emission and a background into one picture, as `shade` does."""
+        """Combines images [L, H, W, 3] of each light, the emission and a background into one picture, as `shade`."""
         image = torch.zeros((*self.transparency.shape, 3), dtype=torch.float32, device=planes.device)
         for light, plane in zip(self.lights, planes, strict=True):
             colour = light.irradiance if isinstance(light, Light) else light.intensity
@@ -99,7 +99,7 @@ class LitSmoke:
             glow = self.emission[..., None] if ramp is None else ramp(self.emission)
             image += glow
             if self.thrown is not None:
-                # In the mean colour of the fire that is seen.
+                # In the mean colour of the visible fire.
                 whole = self.emission.sum().clamp(min=1e-12)
                 image += self.thrown * (1.0 if ramp is None else glow.sum((0, 1)) / whole)
         if background is None:
@@ -110,15 +110,15 @@ class LitSmoke:
 
 
 def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np.ndarray) -> torch.Tensor:
-    """Adds planes [H, W, 3] times a colour, without a copy to the device, which would wait for it."""
+    """Adds planes [H, W, 3] times a colour, without a copy to the device, which would wait for the device."""
     for channel, value in enumerate(colour):
         image[..., channel].add_(planes[..., channel], alpha=float(value))
     return image
 
 
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """A march whose light is within 0.5% of the whole: in steps of a voxel, or of a tenth of optical depth where
-    the smoke is densest, but for a quarter of a voxel at least.
+    """Returns a march with an error of about 0.5%: in steps of a voxel or of a tenth of optical depth in the densest
+    smoke, but at least a quarter of a voxel.
 
     Args:
         volume: The smoke.
@@ -136,21 +136,21 @@ def light_smoke(
     *,
     shadow: float = 1.0,
 ) -> LitSmoke:
-    """Marches through smoke to each of its lights.
+    """Computes single scattering by a march to each light.
 
     Args:
         volume: The smoke.
-        camera: Any, outside the smoke or inside.
-        lights: Any number.
-        march: Its steps, the distance between the lattice's nodes, its phase function. None: `fine_march`.
-        shadow: Extinction on the ways to the lights over that along the camera's rays; 1 is smoke as it is, less an
-            octave of light that was scattered more often.
+        camera: Any camera, outside the smoke or inside.
+        lights: Any number of lights.
+        march: Settings of the march; None: `fine_march`.
+        shadow: Extinction on the ways to the lights relative to that along the camera's rays; 1 is physical, less
+            approximates an octave of multiple scattering.
 
     Returns:
         The light on the smoke's device.
 
     Raises:
-        ValueError: A light without direction, or of a colour that isn't one.
+        ValueError: A light has no direction, or its colour is wrong.
     """
     march = fine_march(volume) if march is None else march
     with marching(volume, camera, march, shadow) as scene:
@@ -158,12 +158,12 @@ def light_smoke(
 
 
 Depths = tuple[depth_lattice.Lattice, wp.array]
-"""Optical depths to a light and to the opposite one, at the nodes of a lattice."""
+"""A lattice, and optical depths at its nodes to a light and to the opposite light."""
 
 
 @dataclass(frozen=True, eq=False)
 class Marching:
-    """A march through one volume from one side, for any number of lights: the map of its bricks is made once."""
+    """A march through one volume from one view, for any number of lights; bricks are found once."""
 
     medium: Medium
     view: View
@@ -179,7 +179,7 @@ class Marching:
         march_lights.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
     def unlit(self) -> torch.Tensor:
-        """Transparency, emission and depth, [3, H, W]."""
+        """Returns transparency, emission and depth, [3, H, W]."""
         size = (len(march_lights.PLANES), self.view.height, self.view.width)
         out = torch.empty(size, device=wp.device_to_torch(self.medium.density.device))
         march_lights.unlit(self.medium, self.view, self.march, to_warp(out))
@@ -188,7 +188,7 @@ class Marching:
 
 @contextmanager
 def marching(volume: DensityVolume, camera: Camera, march: March, shadow: float = 1.0) -> Iterator[Marching]:
-    """Opens a march, on the smoke's device; arguments as for `light_smoke`."""
+    """Prepares a march on the smoke's device; arguments as for `light_smoke`."""
     with stream(device_name(volume.device)):
         yield Marching(medium_of(volume).in_bricks(), camera.view(volume), march, shadow)
 
@@ -200,12 +200,12 @@ def light_in(
     lights: Sequence[AnyLight],
     visit: Callable[[int, Depths], None] | None = None,
 ) -> LitSmoke:
-    """As `light_smoke`, in a march that has been opened.
+    """Runs `light_smoke` in a prepared march.
 
     Args:
         scene: The march.
         volume, camera, lights: As for `light_smoke`.
-        visit: Called with each light's number and the depths to it, which aren't kept.
+        visit: Called with the index of each light and its depths, which are not kept.
     """
     planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     for n, light in enumerate(lights):

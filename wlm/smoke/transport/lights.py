@@ -1,4 +1,4 @@
-"""Lights beside the directional ones of `wlm.smoke.shading`: points, and an environment, checked."""
+"""Point lights and environments, in addition to the directional lights of `wlm.smoke.shading`."""
 
 import math
 from collections.abc import Sequence
@@ -10,19 +10,19 @@ from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import unit
 from wlm.smoke.shading import Light
 
-_PARTS = 64  # rows of a map, at least, whose texels are shared out to lights
-_BRIGHTEST = 1e12  # of which float32 holds products with any phase function
+_PARTS = 64  # least number of rows of a map that is distributed to lights
+_BRIGHTEST = 1e12  # its products with any phase function are within float32
 
 
 @dataclass(frozen=True)
 class PointLight:
-    """A light at a point, inside the smoke or out of it.
+    """A point light, inside the smoke or outside.
 
     Attributes:
-        position: In the world.
+        position: Position in the world.
         intensity: R, G, B per solid angle; the irradiance at a distance r is intensity / r^2.
-        radius: In the world's unit; at smaller distances the irradiance is as at this one. 0: no such bound, and no
-            bound on the noise of a path tracer with the light inside the smoke.
+        radius: Distance in the world's unit within which the irradiance is constant. 0: unbounded irradiance, with
+            which a path tracer has unbounded noise if the light is inside the smoke.
     """
 
     position: tuple[float, float, float]
@@ -38,16 +38,16 @@ class PointLight:
 
 
 AnyLight = Light | PointLight
-"""A light that smoke is lit by: infinitely far off, or at a point."""
+"""A light at infinity or a point light."""
 
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Light from all around, a map of texels of one radiance each.
+    """Light from all directions, a map of texels of constant radiance.
 
     Attributes:
         radiance: [rows, columns, 3], linear, not negative. Row 0 is around the world's +y; column 0 begins at +x, and
-            columns go on towards +z.
+            columns proceed towards +z.
     """
 
     radiance: np.ndarray
@@ -61,19 +61,19 @@ class Environment:
 
     @staticmethod
     def even(colour: Sequence[float] = (1.0, 1.0, 1.0)) -> "Environment":
-        """The same radiance from everywhere."""
+        """Returns an environment of constant radiance."""
         return Environment(np.asarray(colour, np.float64).reshape(1, 1, 3))
 
     def lights(self, count: int = 12) -> tuple[Light, ...]:
-        """Directional lights in its place, spread evenly, each with the light of the directions nearest to its own.
+        """Returns evenly spread directional lights that approximate it; each has the light of the nearest directions.
 
         Args:
-            count: An even number of at least 2.
+            count: Number of lights, even and at least 2.
         """
         ways = half_sphere(count // 2)
         ways = np.concatenate([ways, -ways])
         values = np.asarray(self.radiance, np.float64)
-        # Texels in parts, such that none has more than one light's directions and a little.
+        # Texels are divided, so that each belongs to the directions of about one light.
         down, along = (-(-least // n) for least, n in zip((_PARTS, 2 * _PARTS), values.shape, strict=False))
         values = values.repeat(down, 0).repeat(along, 1)
         rows, columns = values.shape[:2]
@@ -87,7 +87,7 @@ class Environment:
         return tuple(Light(tuple(map(float, way)), tuple(map(float, e))) for way, e in zip(ways, sums, strict=True))
 
     def chances(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Running sums of the chances of rows [R] and of columns within their rows [R, C], and the mean's integral."""
+        """Returns cumulative probabilities of rows [R], of columns within rows [R, C], and the integral of the mean."""
         mean = np.asarray(self.radiance, np.float64).mean(-1)
         edges = np.cos(np.pi * np.arange(len(mean) + 1) / len(mean))
         solid = (edges[:-1] - edges[1:]) * 2.0 * np.pi / mean.shape[1]
@@ -101,7 +101,7 @@ class Environment:
 
 
 def half_sphere(count: int) -> np.ndarray:
-    """Directions on one half of the sphere that are evenly spread with their opposites, float64 [count, 3]."""
+    """Returns directions on a half sphere that are evenly spread together with their opposites, float64 [count, 3]."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
     across = np.sqrt(1.0 - height**2)
@@ -109,10 +109,10 @@ def half_sphere(count: int) -> np.ndarray:
 
 
 def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
-    """Three numbers that aren't negative, float64 [3].
+    """Returns three non-negative numbers, float64 [3].
 
     Raises:
-        ValueError: They aren't.
+        ValueError: They are something else.
     """
     values = np.asarray(colour, np.float64)
     if values.shape != (3,) or not ((values >= 0) & (values <= _BRIGHTEST)).all():
@@ -121,10 +121,10 @@ def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
 
 
 def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
-    """Three numbers of 0 to 1, float64 [3].
+    """Returns three numbers of 0 to 1, float64 [3].
 
     Raises:
-        ValueError: They aren't.
+        ValueError: They are something else.
     """
     colour = checked_colour("albedo", albedo)
     if not (colour <= 1).all():
@@ -133,12 +133,12 @@ def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
 
 
 def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """A light in a volume's voxels: direction or position, irradiance over 4 pi, and a point light's radius, or None.
+    """Returns a light in a volume's voxels: direction or position, irradiance over 4 pi, and a point light's radius.
 
-    The irradiance of a point light is that at a distance of one voxel.
+    The irradiance of a point light is given at a distance of one voxel; the radius of a light at infinity is None.
 
     Raises:
-        ValueError: A direction without length, or a colour that isn't one.
+        ValueError: A direction has no length, or a colour is wrong.
     """
     if isinstance(light, Light):
         return unit(light.toward), checked_colour("irradiance", light.irradiance) / (4.0 * math.pi), None

@@ -1,8 +1,7 @@
-"""Six-way lightmaps that are nearest to lights from anywhere, rather than exact for lights along the six axes.
+"""Six-way lightmaps with the least error for lights from any direction, instead of no error along the six axes.
 
-Shaders weigh six lightmaps by the squares of a light's direction. Whatever they hold, that is wrong between the axes;
-but where it is wrong can be chosen: least squares over lights from all round makes the error of a random light as small
-as six maps can, at the price of the axes' own.
+Shaders weight six lightmaps by the squares of a light's direction, which has an error between the axes. A least squares
+fit over lights from all directions minimises the error for a random light, at the cost of an error along the axes.
 """
 
 import numpy as np
@@ -18,7 +17,7 @@ from wlm.smoke.transport.lights import half_sphere
 from wlm.smoke.transport.orders import orders_march, scatter
 from wlm_kernels.smoke.settings import March
 
-_ROUNDS = 100  # of the descent to maps that aren't negative: one is then within 1e-4 of the least squares
+_ROUNDS = 100  # iterations of the non-negative descent, after which it is within 1e-4 of the optimum
 
 
 def bake_sphere(
@@ -29,21 +28,21 @@ def bake_sphere(
     march: March | None = None,
     albedo: float | None = None,
 ) -> SixWay:
-    """Makes the lightmaps whose pictures, weighed by squares, are nearest to those of lights spread over the sphere.
+    """Computes the lightmaps with the least squared error over lights spread over the sphere.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
-        lights: Directions that they are fitted to, an even number of at least 12.
-        march: To each light; None: in steps of a voxel, without jitter, for light of all orders `orders_march`.
-        albedo: None: light scattered once, of albedo 1, as in all lightmaps. A number of 0 to 1: light of all orders at
-            this albedo, which `scatter` predicts.
+        lights: Number of directions of the fit, even and at least 12.
+        march: March to each light; None: in steps of a voxel without jitter, or `orders_march` for light of all orders.
+        albedo: None: light scattered once, of albedo 1, as in other lightmaps. A number of 0 to 1: light of all orders
+            at this albedo, predicted by `scatter`.
 
     Returns:
-        The lightmaps on the smoke's device, none below 0, with transparency, depth and the emission of hot smoke.
+        The lightmaps on the smoke's device, not negative, with transparency, depth and the emission of hot smoke.
 
     Raises:
-        ValueError: The camera is in perspective, or another argument isn't as it should be.
+        ValueError: The camera is in perspective, or the number of lights or the albedo is wrong.
     """
     if camera.perspective:
         raise ValueError("camera: expected an orthographic one for six-way lightmaps")
@@ -68,12 +67,12 @@ def bake_sphere(
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
-    """Planes [L, H, W] weighed by [L, 6], [6, H, W]."""
+    """Returns the sums [6, H, W] of planes [L, H, W] weighted by [L, 6]."""
     return torch.einsum("lp,lhw->phw", weigh, planes)
 
 
 def _not_negative(gram: torch.Tensor, sums: torch.Tensor) -> torch.Tensor:
-    """The least squares of normal equations [6, 6] and [6, H, W] among maps of at least 0, by accelerated descent."""
+    """Solves non-negative least squares from normal equations [6, 6] and [6, H, W] by accelerated descent."""
     step = 1.0 / float(torch.linalg.eigvalsh(gram.double())[-1])
     right = sums.flatten(1)
     maps = torch.linalg.solve(gram, right).clamp(min=0.0)

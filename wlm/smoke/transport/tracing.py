@@ -1,6 +1,6 @@
-"""Path-traced pictures of smoke: light of every order of scattering, one light's apart from another's.
+"""Path-traced pictures of smoke: light of every order of scattering, separately for each light.
 
-The truth that other methods are measured by: without bias, with noise, and with an estimate of this noise.
+This is the reference for other methods: it has no bias, and noise with an estimate of its size.
 """
 
 import math
@@ -22,11 +22,11 @@ from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import View
 
 HIGHEST = 100_000
-"""Scatterings after which a path ends whatever is left of its light."""
+"""Number of scatterings after which a path always ends."""
 
-_PARTS = 16  # that samples are divided into, whose spread tells the noise
-_BYTES = 2**31  # at most, and a fourth of the memory, of the planes of the parts that are traced at once
-_DENSEST = 1e4  # optical depth of a voxel: of more, paths would hardly end
+_PARTS = 16  # parts of the samples, whose spread gives the noise
+_BYTES = 2**31  # largest memory of the parts that are traced at once; also at most a quarter of the free memory
+_DENSEST = 1e4  # largest optical depth of a voxel; in denser smoke paths would take far too long
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,15 +34,15 @@ class Transport:
     """Light that smoke sends to a camera; H x W pixels, S sources, linear.
 
     Attributes:
-        planes: float32 tensor [S, orders + 2, H, W, 3]: of each source the light that was never scattered, scattered
-            once, twice and so on, and last all that was scattered more than `orders` times.
-        sources: The lights by number, "light 1" and so on, "environment" and "emission".
-        noise: float32 tensor [S, H, W, 3], the standard error of each source's sum over its planes.
-        total_noise: float32 tensor [H, W, 3], the standard error of `total`; sources share their paths, so that it is
-            more than the root of the sum of the squares of theirs.
+        planes: float32 tensor [S, orders + 2, H, W, 3]: for each source the light that was scattered 0, 1, ... `orders`
+            times, and last the light that was scattered more often.
+        sources: Names of the sources: "light 1" and so on, "environment" and "emission".
+        noise: float32 tensor [S, H, W, 3], standard error of each source's sum over its planes.
+        total_noise: float32 tensor [H, W, 3], standard error of `total`; since sources share paths, it exceeds the root
+            of the sum of squares of `noise`.
         albedo: R, G, B.
         camera: The view.
-        samples: Paths a pixel.
+        samples: Paths per pixel.
     """
 
     planes: torch.Tensor
@@ -55,40 +55,40 @@ class Transport:
 
     @property
     def orders(self) -> int:
-        """Orders of scattering that have planes of their own."""
+        """Number of orders of scattering with separate planes."""
         return self.planes.shape[1] - 2
 
     @property
     def total(self) -> torch.Tensor:
-        """All light of all sources, [H, W, 3]."""
+        """Sum of all light of all sources, [H, W, 3]."""
         return self.planes.sum((0, 1))
 
     @property
     def error(self) -> float:
-        """Root of the mean square of the standard error of `total`, over that of `total`; 0 of a black picture."""
+        """Root mean square of the standard error of `total`, relative to `total`; 0 for a black picture."""
         power = float(self.total.double().square().mean())
         return math.sqrt(float(self.total_noise.double().square().mean()) / power) if power > 0 else 0.0
 
     def up_to(self, order: int) -> torch.Tensor:
-        """Light scattered at most so often, of each source, [S, H, W, 3].
+        """Returns the light that was scattered at most `order` times, for each source, [S, H, W, 3].
 
         Raises:
-            ValueError: The order isn't among those kept apart.
+            ValueError: The order has no separate plane.
         """
         if not 0 <= order <= self.orders:
             raise ValueError(f"order: expected 0 to {self.orders}, got {order}")
         return self.planes[:, : order + 1].sum(1)
 
     def with_albedo(self, albedo: Sequence[float]) -> "Transport":
-        """The same paths at another albedo: an order n counts for the n-th power of the ratio.
+        """Returns the result of the same paths at another albedo: order n is scaled by the n-th power of the ratio.
 
-        What was scattered more than `orders` times is left out, and the noise is scaled as the sum is.
+        Light that was scattered more than `orders` times is omitted, and the noise is scaled like the sum.
 
         Args:
             albedo: R, G, B, 0 to 1.
 
         Raises:
-            ValueError: Not an albedo; or one of 0 was traced.
+            ValueError: The albedo is wrong, or paths were traced with an albedo of 0.
         """
         wanted = checked_albedo(albedo)
         if min(self.albedo) <= 0.0:
@@ -124,25 +124,25 @@ def trace(
     """Traces paths from the camera through the smoke.
 
     Args:
-        volume: The smoke; where it is hot its emission is a light as well, seen and scattered.
-        camera: Any, outside the smoke or inside. Paths go through pixel centres, as those of a march.
-        lights: Any number. Their `visibility` isn't used.
-        environment: Light from all around, seen behind the smoke too.
-        albedo: R, G, B, the share of light that a scattering leaves, 0 to 1.
-        g: Mean cosine of the Henyey-Greenstein phase function, within -1 and 1.
-        samples: Paths a pixel, at least 1. Of one path the noise isn't known: it is infinite.
-        orders: Orders of scattering that get planes of their own.
+        volume: The smoke; emission of hot smoke is a light source too.
+        camera: Any camera, outside the smoke or inside. Paths go through pixel centres, like rays of a march.
+        lights: Any number of lights; their `visibility` is not used.
+        environment: Light from all directions, also visible behind the smoke.
+        albedo: R, G, B, share of light that survives a scattering, 0 to 1.
+        g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
+        samples: Paths per pixel, at least 1. The noise of a single path is unknown and given as infinite.
+        orders: Number of orders of scattering with separate planes.
         highest: Scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
-        seed: A whole number of at least 0. Results depend on it alone, on one kind of device.
-        progress: Called from time to time.
+        seed: An integer of at least 0, on which alone results depend, on one kind of device.
+        progress: Called during the work.
 
     Returns:
         The light on the smoke's device.
 
     Raises:
         ValueError: A setting is out of its range.
-        WlmError: The smoke is so dense that paths would hardly end, or the planes don't fit into the memory.
+        WlmError: The smoke is too dense, or the planes do not fit into the memory.
     """
     if not -1 < g < 1:
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
@@ -200,8 +200,8 @@ def trace(
 
 
 def _require(planes: int, sources: int, view: View, parts: int, at_once: int, device: str) -> None:
-    """Checks that what is made of an image fits into the memory before a path is traced."""
-    # The parts that are traced, their sum, what is picked of it and added up of that; the means and their spread.
+    """Checks that the planes fit into the memory before a path is traced."""
+    # The traced parts, their sum, the selected planes and their sums; the means and their spread.
     needed = 12 * view.height * view.width * (planes * (at_once + 3) + 3 * sources * parts)
     free = free_memory(wp.get_device(device))
     if needed > free:
@@ -212,7 +212,7 @@ def _require(planes: int, sources: int, view: View, parts: int, at_once: int, de
 
 
 def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
-    """Standard errors [...] of the sum over parts [P, ...]."""
+    """Returns standard errors [...] of the sum over parts [P, ...]."""
     parts = len(means)
     if parts == 1:
         return torch.full_like(means[0], math.inf)

@@ -3,7 +3,7 @@
 //     import * as THREE from 'three';
 //     import { loadScene } from './scene.js';
 //     const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
-//     light.apply(gltf.scene);  // of scene.glb, by GLTFLoader
+//     light.apply(gltf.scene);  // of mesh.glb, by GLTFLoader
 //     light.setState(1.5);      // half-way from the second of `light.info.states` to the third
 //
 // three.js divides what a lightMap gives by pi.
@@ -53,7 +53,7 @@ export async function loadScene(url, THREE) {
     setState(number) {
       state.value = number;
     },
-    // The light on all that reads it, of scene.glb as GLTFLoader gives it: it keeps what nodes have to say.
+    // The light on all that reads it, of mesh.glb as GLTFLoader gives it: it keeps what nodes have to say.
     apply(root) {
       const visit = (each, object) => {
         const own = each.userData.wlm ?? object;

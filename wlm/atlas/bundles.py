@@ -1,0 +1,140 @@
+"""An atlas model as a GPU holds it: the lookup texture, the colour textures, mips, the shader and the mesh."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from wlm.atlas.decode import Decoder
+from wlm.atlas.model import BLOCKS, TEXELS, AtlasModel, tail_codec, tail_shapes
+from wlm.atlas.shader import EXACT, glsl
+from wlm.atlas.stored import mesh_file
+from wlm.bundle import Bundle, Texture
+from wlm.errors import WlmError
+from wlm.formats.dds import MOST_SIDE
+from wlm.formats.shared_exponent import pack_rgb9e5
+
+MESH_FILE = "mesh.glb"
+
+_FORMATS = {
+    "half": "R16G16B16A16_FLOAT",
+    "rgb9e5": "R9G9B9E5_SHAREDEXP",
+    "bc6h": "BC6H_UF16",
+    "astc": "ASTC_4x4_SFLOAT_BLOCK",
+}
+_ONE_ABOUT = (
+    "Light of a mesh from its compressed lightmap: call wlm_atlas of the shader with UV set uv_set of mesh.glb. "
+    "method is tiles (lut holds a rectangle of colour for each tile), cascade (lut holds coordinates of colour) or "
+    "plain (colour alone). cr is 1 less the bits of the textures over the lightmap's at 48 per texel."
+)
+_SHARED_ABOUT = (
+    "Light of a scene from its compressed lightmaps: call wlm_object of the shader with the UVs of set uv_set, the "
+    "scale_offset and sheet of the object, and the number of a state, which may lie between two states. objects are "
+    "the nodes of mesh.glb that read a sheet; extras.wlm of a node says the same. layer_heights are rows of a layer of "
+    "the texture arrays. cr is 1 less the bits of textures and tables over the lightmaps' at 48 per texel."
+)
+
+
+def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
+    """Makes the textures, shader and mesh of a model.
+
+    Args:
+        model: The model.
+        device: "cpu" or "cuda:N", where the reference is decoded.
+
+    Returns:
+        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, `tail`, and with shared
+        tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first
+        sheet's in the first state.
+
+    Raises:
+        WlmError: A texture has more texels along a side than GPUs take, there is no such device, or the stored
+            triangles are damaged.
+    """
+    shared = model.method == "shared"
+    textures = {"colour": _colour(model, layered=shared)}
+    if model.lut.size:
+        textures["lut"] = _lookup(model)
+    if model.colour == "mixed":
+        layers = len(model.blocks) if shared else 0
+        textures["blocks"] = _texture(model.blocks, BLOCKS, model.block_texels, layers)
+    if shared:
+        sheets, factors = sheet_texels(model), np.pad(model.factor.astype("<f4"), ((0, 0), (0, 0), (0, 1)))
+        textures["sheets"] = Texture.from_texels(sheets, "R16G16B16A16_UINT")
+        textures["factors"] = Texture.from_texels(factors, "R32G32B32A32_FLOAT")
+    if len(model.tail):
+        (rows, columns), *rest = tail_shapes(*model.sheets[0].size)
+        textures["tail"] = Texture(model.tail, _FORMATS[tail_codec(model.colour)], columns, rows, mips=len(rest))
+    for name, texture in textures.items():
+        side = max(texture.width, texture.height)
+        if side > MOST_SIDE:
+            raise WlmError(f"{model.name}: {name}: expected at most {MOST_SIDE} texels along a side, found {side}")
+    glb, uv_set = mesh_file(model)
+    return Bundle(
+        system=model.SYSTEM,
+        name=model.name,
+        shader=glsl(model),
+        document=_document(model, textures, uv_set),
+        textures=textures,
+        reference={"lightmap": Decoder(model, device).lightmap()},
+        files={MESH_FILE: glb},
+        exact="" if shared else EXACT,
+        model=model,
+    )
+
+
+def sheet_texels(model: AtlasModel) -> np.ndarray:
+    """The texture `sheets`, uint16 [rows, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
+    table = model.table()
+    texels = np.zeros((len(table), 2, 4), "<u2")
+    texels[:, 0] = table[:, [1, 0, 3, 2]]
+    texels[:, 1, :3] = table[:, [5, 4, 6]]
+    return texels
+
+
+def _colour(model: AtlasModel, layered: bool) -> Texture:
+    """T_p; with "mixed" its texture of single texels."""
+    layers = len(model.texels) if layered else 0
+    format = TEXELS if model.colour == "mixed" else model.colour
+    if format == "half":
+        # DXGI has no half floats of three channels.
+        whole = np.concatenate([model.texels.astype("<f2"), np.ones((*model.texels.shape[:3], 1), "<f2")], 3)
+        return _texture(whole, format, model.texels, layers)
+    if format == TEXELS:
+        return _texture(pack_rgb9e5(model.texels).astype("<u4"), format, model.texels, layers)
+    return _texture(model.blocks, format, model.texels, layers)
+
+
+def _texture(data: np.ndarray, format: str, texels: np.ndarray, layers: int) -> Texture:
+    """A colour texture, with the decoded texels of blocks."""
+    rows, columns = texels.shape[1:3]
+    image = (texels if layers else texels[0]).astype(np.float32) if format in ("bc6h", "astc") else None
+    return Texture(data, _FORMATS[format], columns, rows, layers, image=image)
+
+
+def _lookup(model: AtlasModel) -> Texture:
+    """T_c: whole numbers for tiles, else coordinates."""
+    numbers = model.lut.shape[2]
+    format = "R16G16B16A16_UINT" if numbers == 4 else "R16G16_UNORM" if model.method == "cascade" else "R16G16_UINT"
+    return Texture.from_texels(np.ascontiguousarray(model.lut, "<u2"), format)
+
+
+def _document(model: AtlasModel, textures: dict[str, Texture], uv_set: int) -> dict[str, Any]:
+    document = {
+        "about": _SHARED_ABOUT if model.method == "shared" else _ONE_ABOUT,
+        "source": model.source,
+        "method": model.method,
+        "colour": model.colour,
+        "states": list(model.states),
+        "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
+        "objects": [
+            {"node": each.node, "label": each.label, "sheet": each.sheet, "scale_offset": list(each.scale_offset)}
+            for each in model.stored.objects
+        ],
+        "uv_set": uv_set,
+        "tile": model.profile.tile,
+        "cr": model.compression_ratio,
+        "gpu_bytes": math.ceil(model.bits / 8),
+    }
+    layered = {name: texture.height for name, texture in textures.items() if texture.layers}
+    return document | ({"layer_heights": layered} if layered else {})

@@ -1,0 +1,302 @@
+"""Lists of a scene's lightmaps: the files of each sheet, and the node that reads each part of a sheet.
+
+A JSON file:
+
+    {
+     "states": ["noon", "night"],
+     "sheets": [{"files": ["wall_noon.exr", "wall_night.exr"]}, ...],
+     "objects": [{"node": "Wall", "sheet": 0, "scale_offset": [0.5, 0.5, 0, 0]}, ...],
+     "convention": "gltf"
+    }
+
+A sheet is one layout of charts and has a file for each state. `name`, `encoding`, `flip` and `mask` of a sheet are as
+for `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
+UV * (scale x, y) + (offset x, y). Without `objects` every sheet goes to the mesh that it fits (`matching`).
+`convention` states how the rectangles are written:
+
+    gltf     v runs down, as in glTF.
+    unity    v runs up: `lightmapIndex` and `lightmapScaleOffset` (x, y, z, w) of a `Renderer` may be written
+             unchanged, in place of `sheet` and `scale_offset`. The glTF file's v is 1 - Unity's, as its exporters
+             write it.
+    godot    `path`, `slice_index` and `uv_scale` (x, y, width, height) of the users of `LightmapGIData`, v down; the
+             last name of the path is the node's.
+
+Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stack of slices or of directional layers has
+to be cut first); a `set.json` of `wlm lightmap`, which is one sheet with a state for each time; and a folder, which
+stands for its `set.json` or else for each picture of light in it, a sheet of one state for the mesh that it fits.
+
+Without a list the materials' own lightmaps are read, `MOZ_lightmap`: each texture is a sheet, `KHR_texture_transform`
+gives the rectangle, `intensity` is a factor, and PNGs are sRGB, as the writers of that extension store them.
+"""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from wlm.config import check_settings
+from wlm.errors import WlmError
+from wlm.formats.gltf import GltfDocument
+from wlm.formats.godot import GodotUser, read_users
+from wlm.formats.light import SUFFIXES
+from wlm.formats.limits import INDEX_BYTES
+from wlm.formats.reading import named_file, read_json_file
+
+_Four = Annotated[list[float], Field(min_length=4, max_length=4)]
+_MOZ, _TRANSFORM = "MOZ_lightmap", "KHR_texture_transform"
+_SET_FILE = "set.json"
+
+
+class SheetFiles(BaseModel):
+    """The files of a sheet; the module says what the fields mean."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    files: Annotated[list[str], Field(min_length=1)]
+    name: str | None = None
+    encoding: str | None = None
+    flip: bool = False
+    mask: str | None = None
+    intensity: float = Field(1.0, ge=0.0)
+
+
+class ObjectPlace(BaseModel):
+    """The rectangle of a sheet that a node reads, v down: UV times the first two numbers, plus the last two."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    node: str
+    sheet: int = Field(ge=0)
+    scale_offset: _Four = [1.0, 1.0, 0.0, 0.0]
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    states: list[str] | None = None
+    sheets: Annotated[list[SheetFiles], Field(min_length=1)]
+    objects: list[ObjectPlace] | None = None
+    convention: Literal["gltf", "unity", "godot"] = "gltf"
+    uv_set: int | None = Field(None, ge=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Listing:
+    """A list of lightmaps, from any of the module's sources.
+
+    Attributes:
+        path: The file that names the lightmaps.
+        states: Names of the states; each sheet has a file for each.
+        sheets: The files.
+        objects: Nodes and their rectangles; None: every sheet goes to the mesh that it fits.
+        uv_set: n of `TEXCOORD_n`; None: 1 where there is one, else 0.
+        direct: Whether the names of files are paths that the caller gave, and not names in a file.
+    """
+
+    path: str
+    states: tuple[str, ...]
+    sheets: tuple[SheetFiles, ...]
+    objects: tuple[ObjectPlace, ...] | None = None
+    uv_set: int | None = None
+    direct: bool = False
+
+    def file(self, name: str, trust: bool) -> Path:
+        """The path of a file of the list.
+
+        Raises:
+            WlmError: It lies outside the list's folder, and the list isn't trusted.
+        """
+        if self.direct:
+            return Path(name)
+        return named_file(self.path, name, f"{self.path}: {name}", trust)
+
+
+def is_listing(path: str | os.PathLike[str] | None) -> bool:
+    """Whether a path is a list of lightmaps rather than one lightmap. None stands for the materials' own."""
+    return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
+
+
+def lone_lightmap(
+    path: str | os.PathLike[str],
+    name: str,
+    mask: str | os.PathLike[str] | None = None,
+    encoding: str | None = None,
+    flip: bool = False,
+) -> Listing:
+    """Makes the list of one lightmap that the caller names; the arguments are as for `wlm.atlas.load`."""
+    mask = None if mask is None else os.fspath(mask)
+    files = SheetFiles(files=[os.fspath(path)], name=name, encoding=encoding, flip=flip, mask=mask)
+    return Listing(os.fspath(path), ("light",), (files,), direct=True)
+
+
+def read_listing(path: str | os.PathLike[str]) -> Listing:
+    """Reads the JSON file, or lists a folder.
+
+    Raises:
+        WlmError: One line that names the file and the field; or no picture of light is in the folder.
+    """
+    if os.path.isdir(path):
+        folder = Path(path).resolve()
+        if not (folder / _SET_FILE).is_file():
+            return _from_folder(str(path), folder)
+        path = Path(path) / _SET_FILE
+    if os.fspath(path).lower().endswith(".lmbake"):
+        return _from_bake(str(path))
+    content = read_json_file(path, "the list of lightmaps", INDEX_BYTES)
+    if not isinstance(content, dict):
+        raise WlmError(f"{path}: expected an object with sheets, found other JSON")
+    if "lightmaps" in content and "sheets" not in content:
+        return _from_set(str(path), content)
+    convention = content.get("convention", "gltf")
+    if isinstance(content.get("objects"), list) and convention in ("unity", "godot"):
+        objects = [_object(each, convention, f"{path}: objects[{i}]") for i, each in enumerate(content["objects"])]
+        content = content | {"objects": objects}
+    checked = check_settings(_Content, content, f"{path}: ")
+    counts = {len(sheet.files) for sheet in checked.sheets}
+    states = checked.states or [str(i) for i in range(len(checked.sheets[0].files))]
+    if counts != {len(states)}:
+        raise WlmError(f"{path}: sheets: expected {len(states)} files each, one a state, found {sorted(counts)}")
+    for i, each in enumerate(checked.objects or ()):
+        if each.sheet >= len(checked.sheets):
+            raise WlmError(f"{path}: objects[{i}].sheet: expected below {len(checked.sheets)}, found {each.sheet}")
+    objects = None if checked.objects is None else tuple(checked.objects)
+    return Listing(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set)
+
+
+def material_lightmaps(document: GltfDocument) -> Listing | None:
+    """Lists the lightmaps that the materials of a glTF file name; None: no material names one.
+
+    Raises:
+        WlmError: A texture is malformed, of another UV set than the others', or within the file: not beside it.
+    """
+    sheets: dict[tuple[int, float], SheetFiles] = {}
+    objects, sets = [], set()
+    order: list[tuple[int, float]] = []
+    for number, node in enumerate(document.content.get("nodes", [])):
+        if "mesh" not in node:
+            continue
+        found = set()
+        for primitive in document.item("meshes", node["mesh"])["primitives"]:
+            if primitive.get("material") is None:
+                continue
+            info = document.item("materials", primitive["material"]).get("extensions", {}).get(_MOZ)
+            if info is None:
+                continue
+            key = info["index"], float(info.get("intensity", 1.0))
+            if key not in sheets:
+                sheets[key] = _texture(document, *key)
+                order.append(key)
+            transform = info.get("extensions", {}).get(_TRANSFORM, {})
+            if transform.get("rotation"):
+                raise WlmError(f"{document.path}: nodes[{number}]: {_MOZ}: a rotated rectangle can't be read")
+            sets.add(transform.get("texCoord", info.get("texCoord", 0)))
+            scale, offset = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
+            found.add((order.index(key), *map(float, (*scale, *offset))))
+        if len(found) > 1:
+            raise WlmError(f"{document.path}: nodes[{number}]: expected one lightmap for all of its materials")
+        for sheet, *rectangle in found:
+            objects.append(ObjectPlace(node=str(number), sheet=sheet, scale_offset=rectangle))
+    if not sheets:
+        return None
+    if len(sets) > 1:
+        raise WlmError(f"{document.path}: {_MOZ}: expected one texCoord for all lightmaps, found {sorted(sets)}")
+    return Listing(document.path, ("light",), tuple(sheets[key] for key in order), tuple(objects), sets.pop())
+
+
+def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFiles:
+    where = f"{document.path}: textures[{number}]"
+    texture = document.item("textures", number)
+    source = texture.get("extensions", {}).get("KHR_texture_basisu", {}).get("source", texture.get("source"))
+    image = document.item("images", source)
+    if "uri" not in image or str(image["uri"]).startswith("data:"):
+        raise WlmError(f"{where}: expected a lightmap in a file beside it, found one inside: write it to a file first")
+    uri = str(image["uri"])
+    encoding = "srgb" if uri.lower().endswith(".png") else None
+    return SheetFiles(files=[uri], name=image.get("name"), encoding=encoding, intensity=intensity)
+
+
+def _object(entry: Any, convention: str, where: str) -> Any:
+    """Turns an object in an engine's convention into one of ours; anything else stays, and is refused later."""
+    if not isinstance(entry, dict):
+        return entry
+    entry = dict(entry)
+    if convention == "godot":
+        if "path" in entry:
+            entry["node"] = str(entry.pop("path")).rsplit("/", 1)[-1]
+        if "slice_index" in entry:
+            entry["sheet"] = entry.pop("slice_index")
+        if "uv_scale" in entry:
+            x, y, width, height = _numbers(entry.pop("uv_scale"), f"{where}.uv_scale", ("x", "y", "width", "height"))
+            entry["scale_offset"] = [width, height, x, y]
+        return entry
+    if "lightmapIndex" in entry:
+        entry["sheet"] = entry.pop("lightmapIndex")
+    name = "lightmapScaleOffset" if "lightmapScaleOffset" in entry else "scale_offset"
+    if name in entry:
+        sx, sy, x, y = _numbers(entry.pop(name), f"{where}.{name}", ("x", "y", "z", "w"))
+        entry["scale_offset"] = [sx, sy, x, 1.0 - sy - y]  # of 1 - v
+    return entry
+
+
+def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
+    if isinstance(value, dict) and set(keys) <= set(value):
+        value = [value[key] for key in keys]
+    if not (
+        isinstance(value, list)
+        and len(value) == 4
+        and all(isinstance(each, int | float) and not isinstance(each, bool) for each in value)
+    ):
+        raise WlmError(f"{where}: expected 4 numbers, found {json.dumps(value)[:60]}")
+    return [float(each) for each in value]
+
+
+def _from_bake(path: str) -> Listing:
+    """Reads Godot's bake: one texture of one slice, and the rectangles of its users."""
+    bake = read_users(path)
+    slices = {user.slice for user in bake.users}
+    if len(bake.textures) != 1 or bake.directional or slices != {0}:
+        raise WlmError(
+            f"{path}: expected one texture of one slice without directions, found {len(bake.textures)} and "
+            f"{len(slices)} slices{' with directions' if bake.directional else ''}: cut the stack, and list the "
+            "parts in JSON"
+        )
+    sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
+    objects = tuple(_godot_place(user) for user in bake.users)
+    return Listing(path, ("light",), (sheet,), objects, None)
+
+
+def _godot_place(user: GodotUser) -> ObjectPlace:
+    x, y, width, height = user.rectangle
+    return ObjectPlace(node=user.node.rsplit("/", 1)[-1], sheet=0, scale_offset=[width, height, x, y])
+
+
+def _from_folder(where: str, folder: Path) -> Listing:
+    """Lists every picture of light in a folder."""
+    try:
+        names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
+    except OSError as error:
+        raise WlmError(f"{where}: cannot read: {error.strerror or error}") from error
+    sheets = [
+        SheetFiles(files=[f"{folder.name}/{name}"], name=name) for name in names if name.lower().endswith(SUFFIXES)
+    ]
+    if not sheets:
+        raise WlmError(f"{where}: expected lightmaps ({', '.join(SUFFIXES)}), found none")
+    return Listing(str(folder), ("light",), tuple(sheets), None, None)
+
+
+def _from_set(path: str, content: dict[str, Any]) -> Listing:
+    """Reads a `set.json`, which is one sheet."""
+    entries = content["lightmaps"]
+    fields = ("time_hours", "file")
+    entries = entries if isinstance(entries, list) else [None]
+    if not all(isinstance(each, dict) and set(fields) <= set(each) for each in entries):
+        raise WlmError(f"{path}: lightmaps: expected a list of objects with time_hours and file")
+    states = [f"{float(each['time_hours']):g} h" for each in entries if isinstance(each["time_hours"], int | float)]
+    mask, files = content.get("mask"), [each["file"] for each in entries]
+    sheet = check_settings(SheetFiles, {"files": files, "mask": mask}, f"{path}: lightmaps: ")
+    if len(states) != len(files):
+        raise WlmError(f"{path}: lightmaps: expected a number as each time_hours")
+    return Listing(path, tuple(states), (sheet,), None, None)

@@ -1,0 +1,1 @@
+"""The method "shared": the lightmaps of many sheets and states share tiles as sums of components."""

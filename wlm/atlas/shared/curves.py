@@ -1,0 +1,263 @@
+"""The error of each tile of a scene with one, two and more components at each size.
+
+For a tile, a mixture and a size the squared error of all states is that of the mixture plus
+
+    sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
+
+with r_k the error of component k after it is stored: clipped at 0 and rounded, as texels or as blocks. So each
+component has a curve of its own, and the last ones, which have the least energy, may be coarse, of one block each.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from wlm.atlas.colour import stored
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    COLOUR_BITS,
+    FACTOR_BITS,
+    FIRST_BLOCK_CODE,
+    MOST_COARSE,
+    SIDE_BITS,
+    TEXELS,
+    Profile,
+    extent,
+)
+from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
+from wlm.atlas.stages import Stages
+from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
+from wlm.atlas.tiles.layout import Size, allocate
+from wlm.formats.dds import MOST_SIDE
+from wlm.formats.parts import Part
+from wlm.system import Meter
+
+_RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # numbers of components that are tried
+MOST_MIXTURES = 128
+"""Most mixtures of one number of components."""
+
+_FACTOR_SHARE = 0.15  # fraction of the budget that the factors of all mixtures that are tried may take
+# Tiles of which mixtures are found, most numbers of their moments, and texels of each tile for the bounds.
+_SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
+_PAYS = 0.99  # fraction of the error below which more components must come, or no more are tried
+_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16)
+_ROUGH, _MEDIUM = 3, 10  # rounds of conjugate gradients for a curve, and for one of blocks
+_AT_ONCE = 1024  # tiles
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTiles:
+    """The tiles of all sheets and levels that have a weight.
+
+    Attributes:
+        texels: float32 [T, B + 1, B + 1, M, 3], light over the states' units.
+        weight: float32 [T, P], weights of the tiles' points; all add up to 1.
+        plane: int [T], the sheet or level of each tile, ascending.
+        index: int64 [T], its number there, row by row.
+        size: B.
+        device: The device on which tiles are fitted.
+    """
+
+    texels: torch.Tensor
+    weight: torch.Tensor
+    plane: np.ndarray
+    index: np.ndarray
+    size: int
+    device: str
+
+    def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
+        """The texels of some tiles and the weights of their points, on the device."""
+        return self.texels[at].to(self.device), self.weight[at].to(self.device)
+
+    def points(self, texels: torch.Tensor) -> torch.Tensor:
+        """Computes light at the points of tiles, [T, N, 3, P], from texels [T, B + 1, B + 1, N, 3]."""
+        return tile_light(texels.flatten(3)).unflatten(1, (-1, 3))
+
+    def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
+        """Computes the texels of components, [T, B + 1, B + 1, K, 3], from those of the states."""
+        parts = torch.einsum("tmkc,tyxmc->tyxkc", mixtures.factor[number], texels)
+        return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A size and a number of components that a tile may have.
+
+    Attributes:
+        size: Size of the components that aren't coarse.
+        count: Number of components.
+        coarse: Number of coarse components, the last ones, which have one block each.
+    """
+
+    size: Size
+    count: int
+    coarse: int
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Texels along x and y of all components."""
+        return tuple(extent(np.array([self.size.nx, self.size.ny]), np.array(self.count), self.coarse).tolist())
+
+    @property
+    def bits(self) -> float:
+        """Bits of all components."""
+        return float(math.prod(self.extent) * COLOUR_BITS[self.size.format])
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """The errors of all tiles with one number of components.
+
+    Attributes:
+        mixtures: The mixtures.
+        number: int [T], the mixture of each tile.
+        choices: The sizes of the components.
+        error: float64 [choices, T], mean over the states.
+        left: An estimate of the whole error if tiles may have up to this number of components.
+    """
+
+    mixtures: Mixtures
+    number: np.ndarray
+    choices: list[Choice]
+    error: np.ndarray
+    left: float
+
+    @property
+    def rank(self) -> int:
+        """Number of components."""
+        return self.mixtures.factor.shape[2]
+
+
+def sizes_of(profile: Profile) -> list[Size]:
+    """Lists the sizes of a component."""
+    mixed = profile.colour == "mixed"
+    most = profile.tile + 1
+    sides = [side for side in _SIDES if side <= (min(most, FIRST_BLOCK_CODE) if mixed else most)]
+    whole = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE) if mixed else ()
+    sizes = [Size(nx, ny, TEXELS) for ny in sides for nx in sides]
+    return sizes + [Size(nx, ny, BLOCKS, True) for ny in whole for nx in whole]
+
+
+def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
+    """Lists the choices for a number of components: all of one size, or of blocks with the last ones coarse."""
+    few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
+    return [
+        Choice(size, count, coarse)
+        for size in sizes
+        for coarse in (0, *(few if size.second and size.nx * size.ny > BLOCK_SIDE**2 else ()))
+    ]
+
+
+def candidates(
+    tiles: SceneTiles, sizes: list[Size], bits: float, seed: int, stages: Stages, batch: int
+) -> list[Candidate]:
+    """Computes the error of every tile with one component, two and so on, up to the number that pays.
+
+    Args:
+        tiles: T of them.
+        sizes: The sizes of a component.
+        bits: Bits of all tiles and factors.
+        seed: Seed of the samples and mixtures.
+        stages: Reports progress; its checkpoint keeps each number of components as one finished batch.
+        batch: Number of the first of these batches.
+    """
+    count, states = tiles.texels.shape[0], tiles.texels.shape[3]
+    most = min(states, _RANKS[-1])
+    ranks = [*(rank for rank in _RANKS if rank < most), most]
+    many = int(min(_FACTOR_SHARE * bits / (states * FACTOR_BITS), MOST_SIDE) / sum(rank + 1 for rank in ranks))
+    random = np.random.default_rng(seed)
+    samples = min(count, _SAMPLES, _MOMENTS // (3 * states**2))
+    few = np.sort(random.choice(count, max(samples, 1), replace=False))
+    moment = []
+    for at in np.array_split(few, -(-len(few) // _AT_ONCE)):
+        texels, weight = tiles.light(at)
+        moment.append(moments(tiles.points(texels), weight).cpu().numpy())
+    row, column = random.integers(0, tiles.size + 1, (2, _SAMPLE_TEXELS))
+    moment, bounds = np.concatenate(moment), tiles.texels[few][:, row, column].numpy()
+    meter, tried, before, eager = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf, np.arange(count)
+    for done, rank in enumerate(ranks):
+        # As many components as states represent any tile; mixtures then differ in the energy of the first components.
+        like = ranks[done - 1] if rank == states and done else rank
+        mixtures = find_mixtures(moment, bounds, rank, min(max(many, 1), MOST_MIXTURES), seed, like)
+        choices, number = choices_of(rank, sizes), np.zeros(count, int)
+        # A tile that isn't tried gains nothing.
+        error = np.repeat(tried[0].error.max(0)[None], len(choices), 0) if tried else np.zeros((len(choices), count))
+        parts = {"number": Part(np.int64, (len(eager),), least=0, most=len(mixtures.factor) - 1)}
+        parts["error"] = Part(np.float64, (len(choices), len(eager)), least=0.0)
+        kept = None if stages.checkpoint is None else stages.checkpoint.finished(batch + done, parts)
+        if kept is None:
+            found = _curves(tiles, eager, mixtures, sizes, choices, meter, done * count)
+            kept = dict(zip(("number", "error"), found, strict=True))
+            if stages.checkpoint is not None:
+                stages.checkpoint.add_finished(batch + done, kept)
+        number[eager], error[:, eager] = kept["number"], kept["error"]
+        tried.append(Candidate(mixtures, number, choices, error, 0.0))
+        left, chosen = _left(tried, bits)
+        tried[-1] = replace(tried[-1], left=left)
+        # A tile that takes fewer components than it may have won't take more, unless more represent it exactly.
+        eager = np.arange(count) if ranks[done + 1 : done + 2] == [states] else np.flatnonzero(chosen == done)
+        if left > _PAYS * before or not len(eager):
+            break
+        before = left
+    return tried
+
+
+def _curves(
+    tiles: SceneTiles,
+    members: np.ndarray,
+    mixtures: Mixtures,
+    sizes: list[Size],
+    choices: list[Choice],
+    meter: Meter,
+    done: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Computes `number` and `error` of a `Candidate` for some tiles."""
+    device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
+    mixtures = mixtures.to(device)
+    factor, offset = mixtures.factor, mixtures.offset
+    number, error = np.zeros(len(members), np.int64), np.zeros((len(choices), len(members)))
+    block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
+    place = {size: i for i, size in enumerate(sizes)}
+    step = max(1, _AT_ONCE * 8 // rank)
+    for at in range(0, len(members), step):
+        if meter.due(done + at):
+            meter.report(done + at)
+        part = slice(at, at + step)
+        texels, weight = tiles.light(members[part])
+        light = tiles.points(texels)
+        chosen = mixtures.nearest(moments(light, weight))
+        components = tiles.points(tiles.components(texels, mixtures, chosen))
+        rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
+        lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
+        whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
+        piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+        # The error of each component alone.
+        alone = torch.empty(
+            (len(sizes), len(chosen), rank), dtype=torch.float64, device=device
+        )  # error of each component
+        for i, size in enumerate(sizes):
+            samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
+            held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
+            alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
+        for i, choice in enumerate(choices):
+            whole = rank - choice.coarse
+            left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
+            error[i, part] = (left + lost).cpu().numpy()
+        number[part] = chosen.cpu().numpy()
+    return number, error
+
+
+def costs(tried: list[Candidate]) -> np.ndarray:
+    """Bits of each choice of each candidate."""
+    return np.array([choice.bits for each in tried for choice in each.choices])
+
+
+def _left(tried: list[Candidate], bits: float) -> tuple[float, np.ndarray]:
+    """Estimates the whole error; and gives the number of the candidate that each tile takes, int [T]."""
+    error = np.concatenate([each.error for each in tried])
+    chosen = allocate(error, costs(tried), bits, 0.0)
+    of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])
+    return float(error[chosen, np.arange(len(chosen))].sum()), of[chosen]

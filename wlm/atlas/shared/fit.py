@@ -1,0 +1,173 @@
+"""From the lightmaps of several sheets and states to one model: mixtures of the states, tiles of all sheets, and one
+allocation.
+
+The states' light is divided by how much it varies, so that each counts by its PSNR (`weights`). Tiles are dealt to
+mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), is
+weighted by the error of the views that show it (`balance`), and numbers and sizes are allocated to the tiles of all
+sheets at once (`allocation`): one more bit gains as much in every object.
+
+States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. So the same is
+done with separate tiles for each state, and the better of the two is kept (`sharing`). A scene so is no worse than its
+parts.
+"""
+
+import numpy as np
+import torch
+
+from wlm.atlas.colour import encode
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    TEXELS,
+    AtlasModel,
+    Profile,
+    SheetPlace,
+    coarse_place,
+    extent,
+    pack_tiles,
+)
+from wlm.atlas.shared.allocation import Allocated
+from wlm.atlas.shared.curves import Candidate, SceneTiles
+from wlm.atlas.shared.sharing import Layout, fitted, planes_of
+from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
+from wlm.atlas.stages import Stages
+from wlm.atlas.tiles.fit import Tiles, solved
+from wlm.atlas.tiles.layout import Size, texels_of
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+
+_AT_ONCE = 1024  # tiles
+_BRIGHT = 1024.0  # a component's largest texel after scaling: RGB9E5 has as many octaves below it as above
+
+
+def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
+    """Compresses all lightmaps of a scene into one lookup texture and one or two colour textures.
+
+    Args:
+        scene: The scene.
+        profile: `budget`, `colour`, `tile`, `views` and `mips`.
+        seed: Seed of the random views and mixtures.
+        stages: Reports and times the stages.
+
+    Returns:
+        The model; its report has the numbers of tiles, samples and components of each sheet, and the error for each
+        number of components that was tried.
+
+    Raises:
+        WlmError: The budget is less than the smallest model takes.
+    """
+    device = stages.device
+    with stages("weights"):
+        peak = peaks_of(scene)
+        varies = variation(scene, peak, device)
+        weights = scene_weights(scene, varies, profile, seed, device)
+        unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
+        planes = planes_of(scene, weights, profile.mips, device)
+    kept = fitted(scene, planes, unit, varies, profile, seed, stages)
+    planes, layout, tiles, tried, given = kept.planes, kept.layout, kept.tiles, kept.tried, kept.given
+    stride = len(planes) // kept.states
+    with stages("solve"):
+        textures, scale = _textures(tiles, tried, given)
+    lut = np.ascontiguousarray(_lookup(tiles, layout, given)[..., : kept.numbers])
+    rows = [
+        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
+        for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
+    ]
+    sheets = len(scene.sheets)
+    counts, samples, many = (
+        np.bincount(tiles.plane % stride, each, stride)[:sheets]
+        for each in (None, extent(given.size, given.count, given.coarse).prod(1), given.count)
+    )
+    report = {
+        "components": {str(each): int((given.count == each).sum()) for each in np.unique(given.count).tolist()},
+        "mixtures": len(np.unique(given.component)),
+        "tiles": counts.astype(int).tolist(),
+        "samples": samples.astype(int).tolist(),
+        "components by sheet": (many / np.maximum(counts, 1)).round(2).tolist(),
+        "pages": len(textures["texels"]),
+        "separate": kept.states > 1,
+        "expected gain of separate tiles": kept.gain,
+        "tiles of blocks": int(given.second.sum()),
+        "coarse components": int(given.coarse.sum()),
+        "error by components": {str(each.rank): each.left for each in tried},
+        "units": unit.tolist(),
+    }
+    # With separate tiles all states have the factors of one, times their units.
+    factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
+    return AtlasModel(
+        name=scene.name,
+        source=scene.source,
+        profile=profile,
+        method="shared",
+        colour="mixed" if "blocks" in textures else TEXELS,
+        states=scene.states,
+        sheets=tuple(rows[:sheets]),
+        lut=lut,
+        factor=np.ascontiguousarray(factor),
+        levels=tuple(rows[sheets:stride]),
+        later=tuple(rows[stride:]),
+        report=report,
+        **textures,
+    )
+
+
+def _of_texels(weight: np.ndarray) -> np.ndarray:
+    """Sums the weights of quarters [2 H, 2 W] to those of texels [H, W]."""
+    return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
+
+
+def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Solves for the samples of all components and composes the colour textures.
+
+    Returns:
+        `texels` and, if there is a second texture, `blocks` and `block_texels` of the model; and the factor by which
+        each component was multiplied, float64 [C, 3].
+    """
+    light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
+    owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
+    largest = np.zeros((len(given.factors), 3), np.float32)
+    for rank, each in enumerate(tried):
+        members = np.flatnonzero(given.rank == rank)
+        for part in np.array_split(members, -(-len(members) // _AT_ONCE)) if len(members) else ():
+            texels, weight = tiles.light(part)
+            mixtures, mixture = each.mixtures.to(tiles.device), torch.from_numpy(each.number[part]).to(tiles.device)
+            components = tiles.points(tiles.components(texels, mixtures, mixture))
+            kinds = np.column_stack([given.size[part], given.second[part]])
+            sides, chosen = np.unique(kinds, axis=0, return_inverse=True)
+            sizes = [Size(nx, ny, BLOCKS if second else TEXELS, bool(second)) for nx, ny, second in sides.tolist()]
+            block, sizes = len(sizes), [*sizes, Size(BLOCK_SIDE, BLOCK_SIDE, BLOCKS, True)]
+            whole = each.rank - given.coarse[part]
+            for k in range(each.rank):
+                piece = Tiles(mixture, components[:, k].contiguous(), weight, tiles.size)
+                number = np.where(k < whole, chosen.ravel(), block)
+                for at, values, weights in solved(piece, sizes, number):
+                    at, (ny, nx) = part[at], values.shape[1:3]
+                    texture, whole_of = int(given.second[at[0]]), each.rank - given.coarse[at]
+                    aside = coarse_place(given.size[at], whole_of, np.maximum(k - whole_of, 0))
+                    aside = np.where((k < whole_of)[:, None], given.size[at] * [k, 0], aside)
+                    row, column = texels_of(given.first[at] + aside, nx, ny)
+                    number = given.component[at] + 1 + k
+                    place = given.page[at, None, None], row, column
+                    light[texture][place], owner[texture][place] = values.cpu().numpy(), number[:, None, None]
+                    share[texture][place] = weights.cpu().numpy()
+                    np.maximum.at(largest, number, values.amax((1, 2)).cpu().numpy())
+    scale = np.divide(_BRIGHT, largest, out=np.ones_like(largest), where=largest > 0)
+    first, second = (texels * scale[number] for texels, number in zip(light, owner, strict=True))
+    textures = {"texels": unpack_rgb9e5(pack_rgb9e5(first)).astype(np.float16)}
+    pages = [encode(page, BLOCKS, weight, tiles.device) for page, weight in zip(second, share[1], strict=True)]
+    if pages:
+        blocks, decoded = (np.stack(each) for each in zip(*pages, strict=True))
+        textures |= {"blocks": blocks, "block_texels": decoded.astype(np.float16)}
+    return textures, scale.astype(np.float64)
+
+
+def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
+    """Composes T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
+    columns = np.array([each[1] for each in layout.grid])[tiles.plane]
+    row = tiles.index // columns + np.array(layout.row)[tiles.plane]
+    column = tiles.index % columns + np.array(layout.column)[tiles.plane]
+    table = np.zeros((*layout.shape, 4), np.uint16)
+    table[row, column] = pack_tiles(
+        given.first, given.size, given.component, given.count, given.page, given.second, given.coarse
+    )
+    return table

@@ -1,0 +1,150 @@
+"""Mixtures: each state of a tile's light is a sum of a few components.
+
+Over the hours the light of a whole room has many dimensions, since each place of the sun lights others; that of one
+tile has few. Tiles are dealt to mixtures, which are subspaces of the states: each subspace has the least error for its
+tiles, and each tile belongs to the subspace with the least error for it (k-plane clustering, Bradley and Mangasarian
+2000, with subspaces for planes).
+
+In a mixture of K components with orthonormal directions v_0 to v_(K-1), light x in the states is close to
+
+    sum_k v_k b_k = sum_k v_k c_k - sum_k v_k o_k,    b_k = v_k x,    c_k = b_k + o_k.
+
+Light isn't negative, so v_0 isn't (Perron), nor is b_0. The other b_k are often negative, and least squares samples
+overshoot. An offset o_k that is larger than most negative values makes every component c_k positive, so that unsigned
+texels can store it, while factors have any sign; a constant for each state subtracts the offsets. As the directions
+are orthonormal, errors of components are independent, and none is amplified.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+_ROUNDS = 12
+_ALIKE = 1e-6  # fraction of the light's energy: smaller differences decide nothing
+_PERCENT = 0.1  # percentile of a component that is its low end; its high end likewise
+_MARGIN, _MARGIN_FIRST = 0.1, 0.02  # margin of o_k: of the component's range; for the first one, of its high end
+
+
+@dataclass(frozen=True, eq=False)
+class Mixtures:
+    """Mixtures of one number of components.
+
+    Attributes:
+        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
+            below 0.
+        offset: float32 [G, K, 3]: the states are `factor` times the components less this.
+        kept: float32 [G, 3 M M], flat projections onto the subspaces: their product with a tile's moments is the energy
+            that they keep; of the first components alone where `find_mixtures` has `like`.
+    """
+
+    factor: torch.Tensor
+    offset: torch.Tensor
+    kept: torch.Tensor
+
+    def to(self, device: str) -> "Mixtures":
+        """The same on a device."""
+        return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
+
+    def factors(self, number: int) -> np.ndarray:
+        """The constant of one mixture, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
+        factor, offset = (each[number].cpu().numpy().astype(np.float64) for each in (self.factor, self.offset))
+        constant = -np.einsum("mkc,kc->mc", factor, offset)
+        return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
+
+    def nearest(self, moment: torch.Tensor) -> torch.Tensor:
+        """Finds the mixture that keeps most of each tile's energy, int64 [T], by `moments`; the first of equal ones."""
+        energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
+        return _first_best(moment.flatten(1) @ self.kept.T, energy)
+
+
+def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Sums the products of the states' light over the points of each tile, float32 [T, 3, M, M].
+
+    Args:
+        light: float32 [T, M, 3, P].
+        weight: float32 [T, P].
+    """
+    part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
+    return part @ part.transpose(2, 3)
+
+
+def find_mixtures(
+    moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
+) -> Mixtures:
+    """Finds the mixtures of some tiles.
+
+    Args:
+        moment: float [T, 3, M, M], `moments`.
+        texels: float [T, N, M, 3], texels of the same tiles, not negative.
+        rank: K, 1 to M.
+        count: Number of mixtures, at least 1; fewer where some would have no tile.
+        seed: Seed of the tiles from which they start.
+        like: Number of components by which tiles are dealt to mixtures; None: K.
+    """
+    random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
+    flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)
+
+    def best_of(kept: np.ndarray) -> np.ndarray:
+        return _first_best(torch.from_numpy(kept), torch.from_numpy(energy)).numpy()
+
+    spaces = [_subspace(moment.sum(0), few)]
+    lost = energy - _kept(flat, spaces)[:, 0]
+    while len(spaces) < min(count, len(moment)):
+        share = lost.clip(min=0.0)
+        if not share.sum() > _ALIKE * energy.sum():
+            break
+        spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], few))
+        lost = np.minimum(lost, energy - _kept(flat, spaces[-1:])[:, 0])
+    for _ in range(_ROUNDS):
+        nearest = best_of(_kept(flat, spaces))
+        spaces = [_subspace(moment[nearest == g].sum(0), few) for g in np.unique(nearest)]
+    kept = [_projection(space) for space in spaces]
+    nearest = best_of(flat @ np.stack(kept).T)
+    if few < rank:
+        # A mixture that lost its tiles in the last round has arbitrary directions.
+        spaces = [_subspace(moment[nearest == g].sum(0), rank) for g, space in enumerate(spaces)]
+    offset = np.stack([_offset(space, texels[nearest == g]) for g, space in enumerate(spaces)])
+    factor = np.stack([space.transpose(1, 2, 0) for space in spaces])
+    parts = factor, offset, np.stack(kept)
+    return Mixtures(*(torch.from_numpy(np.ascontiguousarray(each)).float() for each in parts))
+
+
+def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
+    """Finds the first mixture that keeps about the most energy, int64 [T].
+
+    Rounding must not deal a tile to another mixture than the one whose offsets are made for it.
+
+    Args:
+        kept: [T, G], the energy that each mixture keeps.
+        energy: [T], the energy of each tile.
+    """
+    return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
+
+
+def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
+    """The directions [3, M, K] of most energy; the first has no negative numbers."""
+    space = np.linalg.eigh(moment)[1][:, :, ::-1][:, :, :rank].copy()
+    space[:, :, 0] *= np.where(space[:, :, 0].sum(1) < 0.0, -1.0, 1.0)[:, None]
+    return space
+
+
+def _projection(space: np.ndarray) -> np.ndarray:
+    return np.einsum("cmk,cnk->cmn", space, space).ravel()
+
+
+def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
+    """The energy of each tile that each subspace keeps, [T, G]."""
+    return flat @ np.stack([_projection(each) for each in spaces]).T
+
+
+def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:
+    """The offsets of components, [K, 3], that make them positive."""
+    # With one state the only direction is the light itself, and black stays black.
+    if not len(texels) or space.shape[1] == 1:
+        return np.zeros((space.shape[2], len(space)))
+    parts = np.einsum("nmc,cmk->nkc", texels.reshape(-1, *texels.shape[2:]), space)
+    low, high = np.percentile(parts, [_PERCENT, 100.0 - _PERCENT], axis=0)
+    offset = (_MARGIN * (high - low) - low).clip(min=0.0)
+    offset[0] = _MARGIN_FIRST * high[0].clip(min=0.0)
+    return offset

@@ -1,0 +1,165 @@
+"""Weights of the errors of a scene's sheets and states.
+
+A part of a sheet counts by the pixels of views of the whole scene that show it. Views and states are scored by PSNR, so
+a mean over them is a mean of logarithms: an error counts by its share of the whole error of its view or state. At equal
+bits that whole is in proportion to how much light varies from texel to texel, so views and states weigh by the inverse
+of the variation of their light.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.model import Profile
+from wlm.atlas.views import Points, points_at, scene_views, visible_uv
+from wlm.atlas.weights import RESOLUTION, FineGrid, spread
+from wlm.ops.views import View, Viewpoint
+
+UNSEEN, BORDER = 0.05, 4.0
+"""Weight of texels that no view shows, as a fraction of the mean weight of the scene; and the factor on the weight
+within a texel of a chart's border."""
+
+FLOOR = 1e-8
+"""The squared error, over the squared peak, that is assumed where no light varies."""
+
+_PERCENTILE = 99.9  # percentile of a state's light that is its peak
+
+
+def peaks_of(scene: LightmappedScene) -> np.ndarray:
+    """Takes a high percentile of each state's light in charts, float64 [M], above 0."""
+    light = [sheet.lightmaps[:, sheet.mask].max(axis=2) for sheet in scene.sheets]
+    peak = np.percentile(np.concatenate(light, axis=1), _PERCENTILE, axis=1)
+    # A dark state is exact whatever its peak is.
+    return np.where(peak > 0, peak, float(peak.max()) or 1.0).astype(np.float64)
+
+
+def variation(scene: LightmappedScene, peak: np.ndarray, device: str) -> list[np.ndarray]:
+    """Computes squared second differences of light, along both axes and within charts, mean of the channels.
+
+    Args:
+        scene: The scene.
+        peak: float64 [M], `peaks_of`, by which light is divided.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        For each sheet float32 [M, H, W].
+    """
+    result = []
+    for sheet in scene.sheets:
+        mask = torch.from_numpy(sheet.mask).to(device)
+        frames = (torch.from_numpy(frame).to(device) / float(p) for frame, p in zip(sheet.lightmaps, peak, strict=True))
+        result.append(np.stack([_variation(frame, mask).cpu().numpy() for frame in frames]))
+    return result
+
+
+def _variation(light: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    result = torch.zeros(mask.shape, device=light.device)
+    for values, inside, out in ((light, mask, result), (light.transpose(0, 1), mask.T, result.T)):
+        bend = (values[:-2] - 2.0 * values[1:-1] + values[2:]).square().mean(2)
+        out[1:-1] += bend * (inside[:-2] & inside[1:-1] & inside[2:])
+    return result
+
+
+def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
+    """Computes the divisors of light over its peaks with which it varies as much in each state.
+
+    Args:
+        varies: `variation`.
+        weights: For each sheet [H, W], the weights of its texels.
+
+    Returns:
+        float64 [M], of geometric mean 1.
+    """
+    sums = sum((each * weight).sum((1, 2), dtype=np.float64) for each, weight in zip(varies, weights, strict=True))
+    total = sum(float(weight.sum()) for weight in weights)
+    root = np.sqrt(sums / max(total, 1e-30) + FLOOR)
+    return root / np.exp(np.log(root).mean())
+
+
+def scene_weights(
+    scene: LightmappedScene, varies: Sequence[np.ndarray], profile: Profile, seed: int, device: str
+) -> list[np.ndarray]:
+    """Counts for each quarter of a texel the pixels of random views of the scene that show it.
+
+    An object that is large in the views so gets more weight than one that is small, far away or hidden. A view counts
+    by the inverse of how much the light that it shows varies, and by no more if it shows more pixels.
+
+    Args:
+        scene: The scene.
+        varies: `variation`.
+        profile: `views`.
+        seed: Seed of the views.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        For each sheet float64 [2 H, 2 W], 0 where there is no triangle.
+
+    Raises:
+        WlmError: There is no such device.
+    """
+    grids = [FineGrid(sheet, device) for sheet in scene.sheets]
+    visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
+    # The cells that `spread` uses.
+    used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
+    cells = sum(int(each.sum()) for each in used)
+    mean = sum(float(count[each].sum()) for count, each in zip(visible, used, strict=True)) / max(cells, 1)
+    pairs = zip(grids, visible, strict=True)
+    return [spread(grid, count, UNSEEN, BORDER, mean=mean or 1.0).cpu().numpy() for grid, count in pairs]
+
+
+def _counts(
+    scene: LightmappedScene,
+    grids: Sequence[FineGrid],
+    detail: "Detail",
+    views: Sequence[View | Viewpoint],
+    device: str,
+) -> list[torch.Tensor]:
+    """Fractions of views that show each cell of each sheet, over how much light varies in the view."""
+    sizes = [(grid.height, grid.width) for grid in grids]
+    first = np.cumsum([0, *(height * width for height, width in sizes)])
+    place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
+    count = torch.zeros(int(first[-1]), dtype=torch.float64, device=device)
+    for drawn in visible_uv(scene, views, RESOLUTION, device):
+        points = points_at(scene, *drawn)[1]
+        if not len(points):
+            continue
+        height, width, start = place[points.sheet.long()].T
+        column = torch.minimum((points.uv[:, 0].double() * width).long().clamp(min=0), width - 1)
+        row = torch.minimum((points.uv[:, 1].double() * height).long().clamp(min=0), height - 1)
+        cell, pixels = torch.unique(start + row * width + column, return_counts=True)
+        count[cell] += pixels / (detail.lost(points) * len(points))
+    return [count[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
+
+
+class Detail:
+    """How much the light of a scene varies, on a device.
+
+    Args:
+        scene: The scene.
+        varies: `variation`.
+        device: "cpu" or "cuda:N".
+    """
+
+    def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
+        masks = [sheet.mask for sheet in scene.sheets]
+        scale = scales(varies, masks)
+        even = [np.tensordot(1.0 / scale**2, each, 1).ravel() / len(scale) for each in varies]
+        first = np.cumsum([0, *(mask.size for mask in masks)])
+        place = np.array([(*mask.shape, start) for mask, start in zip(masks, first, strict=False)])
+        self._even, self._place = torch.from_numpy(np.concatenate(even)).to(device), torch.from_numpy(place).to(device)
+
+    def sizes(self, points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows and columns of texels of the sheet at each point, int64 [N]."""
+        return tuple(self._place[points.sheet.long()].T[:2])
+
+    def lost(self, points: Points) -> float:
+        """An estimate of the error of a view that shows the points, above 0: the mean over the states, scaled so that
+        light varies alike in all of them."""
+        height, width, start = self._place[points.sheet.long()].T
+        column, row = (
+            (points.uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)
+            for axis, side in ((0, width), (1, height))
+        )
+        return float(self._even[start + row * width + column].mean()) + FLOOR

@@ -1,0 +1,118 @@
+"""The triangles and masks that a model's file holds beside its textures.
+
+The file holds the whole glTF document of the input, as a `.glb`, so that a copy of it with new UVs keeps materials and
+everything else. `extras.wlm` of a node names the sheet that it reads, its rectangle and the UV set.
+"""
+
+import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wlm.atlas.data import LightmappedScene, Placed, place_objects
+from wlm.atlas.model import AtlasModel
+from wlm.formats.gltf import parse_gltf
+from wlm.formats.gltf_writer import Replacement, encode_glb
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScene:
+    """Triangles and masks of a scene.
+
+    Attributes:
+        glb: The bytes of a `.glb` file.
+        objects: The nodes that read the sheets.
+        uv_set: n of the lightmaps' `TEXCOORD_n`.
+        metres: Whether the unit is known to be the metre.
+        hides: Whether the other nodes hide what is behind them.
+        masks: bool [H, W] for each sheet, true where a texel belongs to a chart.
+    """
+
+    glb: bytes
+    objects: tuple[Placed, ...]
+    uv_set: int
+    metres: bool
+    hides: bool
+    masks: tuple[np.ndarray, ...]
+
+
+def store(scene: LightmappedScene) -> StoredScene:
+    """Encodes the triangles and masks of a scene.
+
+    Raises:
+        WlmError: A part of the document that isn't drawn is malformed.
+    """
+    content = copy.deepcopy(scene.document.content)
+    for each in scene.objects:
+        node = content["nodes"][each.node]
+        extras = node["extras"] if isinstance(node.get("extras"), dict) else {}
+        place = {"sheet": each.sheet, "scale_offset": list(each.scale_offset), "uv_set": scene.uv_set}
+        node["extras"] = extras | {"wlm": place}
+    glb = b"".join(encode_glb(replace(scene.document, content=content)))
+    masks = tuple(sheet.mask for sheet in scene.sheets)
+    return StoredScene(glb, scene.objects, scene.uv_set, scene.metres, len(scene.blocker) > 0, masks)
+
+
+def restore(model: AtlasModel) -> LightmappedScene:
+    """Makes the scene, without lightmaps, that a model was made of.
+
+    Raises:
+        WlmError: The document is damaged, or doesn't have the triangles of the model.
+        ValueError: The model holds no triangles.
+    """
+    stored = model.stored
+    if stored is None:
+        raise ValueError(f"{model.name}: expected a model with the triangles of its scene")
+    document, primitives = parse_gltf(model.name, stored.glb)
+    sheets, blocker = place_objects(model.name, primitives, stored.uv_set, stored.objects, stored.masks)
+    sheets = tuple(replace(sheet, name=place.name) for sheet, place in zip(sheets, model.sheets, strict=True))
+    blocker = blocker if stored.hides else blocker[:0]
+    settings = stored.uv_set, stored.metres, model.source, document
+    return LightmappedScene(model.name, model.states, sheets, stored.objects, blocker, *settings)
+
+
+def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
+    """Makes the mesh that an engine draws: the stored document and, where the model has new UVs, these as one more set.
+
+    Corners of one vertex that have the same new UV stay one vertex; the others become vertices of their own with the
+    same attributes.
+
+    Returns:
+        The bytes of a `.glb` file, and n of the `TEXCOORD_n` under which the model is read.
+
+    Raises:
+        WlmError: As `restore`.
+    """
+    if not len(model.uv):
+        return model.stored.glb, model.stored.uv_set
+    return with_uvs(model.scene, model.uv)
+
+
+def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
+    """Encodes a scene of one sheet with one more UV set, after the last that a primitive of it has.
+
+    Args:
+        scene: The scene.
+        corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
+
+    Returns:
+        The bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
+
+    Raises:
+        ValueError: The shape is wrong, or a UV isn't finite.
+    """
+    (sheet,) = scene.sheets
+    corner_uv = np.asarray(corner_uv, np.float32)
+    if corner_uv.shape != (len(sheet.triangle), 3, 2) or not np.isfinite(corner_uv).all():
+        raise ValueError(f"corner_uv: expected finite numbers [{len(sheet.triangle)}, 3, 2], got {corner_uv.shape}")
+    uv_set = 1 + max(number for part in sheet.parts for number in part.primitive.uv)
+    replacements = []
+    for part in sheet.parts:
+        vertex = part.primitive.triangle.reshape(-1)
+        uv = corner_uv[part.triangle : part.triangle + len(part.primitive.triangle)].reshape(-1, 2) + np.float32(0.0)
+        # Compared by their bits; adding 0 above made -0 into 0.
+        key = np.stack([vertex.astype(np.uint32), *uv.view(np.uint32).T], axis=1)
+        distinct, corner = np.unique(key, axis=0, return_inverse=True)
+        new_uv = np.ascontiguousarray(distinct[:, 1:]).view(np.float32)
+        replacements.append(Replacement(part.primitive, distinct[:, 0].astype(np.int64), corner.reshape(-1, 3), new_uv))
+    return b"".join(encode_glb(scene.document, replacements, uv_set)), uv_set

@@ -1,0 +1,1 @@
+"""The method "tiles": each tile of a lightmap at its own resolution."""

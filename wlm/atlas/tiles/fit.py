@@ -1,0 +1,407 @@
+"""The method "tiles": each tile of the lightmap at its own resolution, with the samples of least squared error.
+
+The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
+B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 it is the lightmap itself.
+Tiles share no sample, so each is a small weighted least squares problem, solved for every size. The error of a tile is
+that of its samples after they are stored. The sizes are then allocated within a budget, `wlm.atlas.tiles.layout`.
+
+This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get samples and evenly lit walls next
+to none, within a triangle too, which that paper names as its limit (section 5.1).
+"""
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from wlm import interop
+from wlm.atlas import colour
+from wlm.atlas.data import LightmappedScene, Sheet
+from wlm.atlas.model import (
+    BLOCKS,
+    LUT_BITS,
+    SOURCE_BITS,
+    TEXELS,
+    AtlasModel,
+    Profile,
+    SheetPlace,
+    tail_bits,
+    tile_counts,
+)
+from wlm.atlas.stages import Stages
+from wlm.atlas.tiles.layout import Layout, Size, composed, layout, sizes_of
+from wlm.atlas.weights import FineGrid, weights
+from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part, check_parts
+from wlm.ops.tensors import on_stream
+from wlm.system import Meter, OnProgress
+from wlm_kernels.atlas import solve as kernels
+
+SUPERSAMPLING = 2
+"""Points per texel and axis at which a tile is fitted."""
+
+_AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles
+_SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # weight of the second texel at a point
+# Rounds of conjugate gradients from the unweighted solution: for curves, for curves of blocks, and for stored samples.
+_ROUGH, _MEDIUM, _FINE = 3, 10, 24
+# Ridge regularisation: a sample that reaches no point with a weight stays near the unweighted solution.
+_RIDGE = 1e-4
+# The fraction of the squared range of one texel that a bit must save: half float's rounding there.
+_LEAST_GAIN = 2.0**-24 / 48
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """The light of the tiles that have a weight.
+
+    Attributes:
+        index: int64 [T], number of the tile in the grid, row by row.
+        light: float [T, 3, m * m], at m x m points of the tile, row by row, (k + 0.5) / m along an axis.
+        weight: float [T, m * m], weight of a point's squared error, 0 or more; over all tiles they add up to 1.
+        size: Texels along a tile.
+    """
+
+    index: torch.Tensor
+    light: torch.Tensor
+    weight: torch.Tensor
+    size: int
+
+
+def fit_tiles(
+    scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
+) -> AtlasModel | None:
+    """Compresses a lightmap to tiles.
+
+    Args:
+        scene: A scene of one sheet and one state.
+        grid: The fine grid of its sheet.
+        profile: `budget`, `colour`, `tile`, `mips` and the settings of `weights`.
+        seed: Seed of the random views.
+        stages: Reports and times the stages.
+
+    Returns:
+        The model; None where not even the smallest tiles and their table fit the budget.
+
+    Raises:
+        WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
+    """
+    (sheet,) = scene.sheets
+    with stages("weights"):
+        tiles = cut(sheet.lightmap, weights(scene, grid, profile, seed), profile.tile, grid.device)
+    height, width = sheet.mask.shape
+    rows, columns = tile_counts(height, width, profile.tile)
+    bits = profile.budget * height * width * SOURCE_BITS
+    if profile.mips:
+        bits -= tail_bits(height, width)
+    room = bits - rows * columns * LUT_BITS
+    sizes = sizes_of(profile)
+    if room < len(tiles.index) * min(size.bits for size in sizes):
+        return None
+    with stages("curves"):
+        error = curves(tiles, sizes, stages.progress, stages.checkpoint)
+    with stages("allocate"):
+        packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(sheet))
+        if packed is None:
+            return None
+    with stages("solve"):
+        samples = solved(tiles, sizes, packed.chosen)
+    with stages("write"):
+        return composed_model(scene, profile, samples, sizes, packed, tiles.index.cpu().numpy(), grid.device)
+
+
+def composed_model(
+    scene: LightmappedScene,
+    profile: Profile,
+    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
+    sizes: list[Size],
+    packed: Layout,
+    index: np.ndarray,
+    device: str,
+) -> AtlasModel:
+    """Makes the model of tiles whose samples are solved for.
+
+    Args:
+        scene: The scene whose lightmap was cut.
+        profile: `colour` and `tile`.
+        samples: `solved`.
+        sizes: The sizes that a tile may have.
+        packed: The tiles' sizes and places.
+        index: int64 [T], `Tiles.index`.
+        device: "cpu" or "cuda:N", where blocks are encoded.
+    """
+    size = scene.sheets[0].mask.shape
+    counts = tile_counts(*size, profile.tile)
+    (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
+    mixed = profile.colour == "mixed"
+    textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], device)
+    if mixed:
+        blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], device)
+        textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
+    textures = {name: texture[None] for name, texture in textures.items()}
+    chosen = [sizes[number] for number in packed.chosen]
+    report = {
+        "tiles": len(index),
+        "of tiles": counts[0] * counts[1],
+        "samples": sum(size.nx * size.ny for size in chosen),
+        "constant tiles": sum(size.nx * size.ny == 1 for size in chosen),
+    }
+    if mixed:
+        report["tiles of blocks"] = sum(size.second for size in chosen)
+    place = SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts)
+    settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, (place,))
+    return AtlasModel(*settings, **textures, lut=lut, report=report)
+
+
+def least_gain(sheet: Sheet) -> float:
+    """The error that a bit must save to be allocated."""
+    return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
+
+
+def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
+    """Cuts a lightmap into tiles.
+
+    Args:
+        image: float [H, W, 3], without gaps.
+        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
+        size: B, texels along a tile.
+        device: "cpu" or "cuda:N".
+
+    Returns:
+        The tiles in which some weight is above 0.
+    """
+    index, share = weighted(torch.as_tensor(weight, device=device), size)
+    columns = tile_counts(*image.shape[:2], size)[1]
+    light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
+    parts = [tile_light(patches(light, each, columns, size)) for each in index.split(_AT_ONCE)]
+    return Tiles(index, torch.cat(parts), share, size)
+
+
+def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Selects the tiles that have a weight.
+
+    Args:
+        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
+        size: B, texels along a tile.
+
+    Returns:
+        `index` and `weight` of `Tiles`.
+    """
+    rows, columns = tile_counts(*(side // 2 for side in weight.shape), size)
+    m = SUPERSAMPLING * size
+    folded = _folded(_folded(weight, rows * m).T, columns * m).T
+    cells = folded.reshape(rows, m, columns, m).transpose(1, 2).reshape(rows * columns, m * m)
+    index = torch.nonzero(cells.any(1))[:, 0]
+    return index, (cells[index] / weight.sum()).float()
+
+
+def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -> torch.Tensor:
+    """Cuts the texels [T, B + 1, B + 1, ...] of tiles out of an image [H, W, ...]; beyond it its last texels repeat."""
+    step = torch.arange(size + 1, device=image.device)
+    row = ((index // columns)[:, None] * size + step).clamp(max=image.shape[0] - 1)
+    column = ((index % columns)[:, None] * size + step).clamp(max=image.shape[1] - 1)
+    return image[row[:, :, None], column[:, None, :]]
+
+
+def tile_light(patch: torch.Tensor) -> torch.Tensor:
+    """Computes the light at the points of tiles, `Tiles.light`, from their texels [T, B + 1, B + 1, 3]."""
+    near, far = patch[:, :-1], patch[:, 1:]
+    down = torch.stack([near + share * (far - near) for share in _SHARES], 2).flatten(1, 2)
+    near, far = down[:, :, :-1], down[:, :, 1:]
+    points = torch.stack([near + share * (far - near) for share in _SHARES], 3).flatten(2, 3)
+    return points.permute(0, 3, 1, 2).flatten(2).contiguous()
+
+
+def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
+    """Folds weights [2 H, N] to the points of tiles along the first axis; weights beyond the outermost texel centres
+    are added to those of the centres."""
+    padded = weight.new_zeros((points, weight.shape[1]))
+    inner = weight[1:-1]
+    padded[: len(inner)] = inner
+    padded[0] += weight[0]
+    padded[max(len(inner), 1) - 1] += weight[-1]
+    return padded
+
+
+def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
+    """Weights of linear interpolation from samples to points along an axis of a tile, float [points, samples]."""
+    place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
+    first = place.floor().clamp(max=max(samples - 2, 0)).long()
+    result = torch.zeros((points, samples), device=device)
+    row = torch.arange(points, device=device)
+    result[row, first] = 1.0 - (place - first)
+    if samples > 1:
+        result[row, first + 1] = place - first
+    return result
+
+
+def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
+    """Solves for the samples of least weighted squared error, at one size for all tiles.
+
+    Conjugate gradients on the normal equations, from the solution with equal weights, for each channel of a tile.
+
+    Args:
+        tiles: T of them.
+        nx, ny: Samples along x and y.
+        rounds: Rounds of conjugate gradients, at most.
+
+    Returns:
+        float [T, ny, nx, 3].
+    """
+    with on_stream(tiles.light.device):
+        grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
+        light, weight = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight))
+        scale = interop.to_warp(1.0 / tiles.weight.mean(1))
+        system = kernels.System()
+        system.own, system.right, system.down, system.cross, system.diagonal = (
+            interop.to_warp(space(nx * ny)) for _ in range(5)
+        )
+        kernels.gather_system(weight, scale, grid, system)
+        start = space(3, nx * ny)
+        kernels.gather(light, grid, interop.to_warp(start))
+        # With equal weights the equations separate into those of the axes.
+        across, down = (_axis(samples, grid.points, str(start.device))[2] for samples in (nx, ny))
+        start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
+        *work, out = (space(3, nx * ny) for _ in range(4))
+        ridge = _RIDGE * grid.points**2 / (nx * ny)
+        arrays = [interop.to_warp(each) for each in (start, *work, out)]
+        # In exact arithmetic as many rounds as samples are enough.
+        rounds = min(rounds, 2 * nx * ny)
+        kernels.solve(light, weight, scale, grid, system, ridge, rounds, arrays[0], arrays[1:4], arrays[4])
+    return out.unflatten(2, (ny, nx)).permute(0, 2, 3, 1)
+
+
+def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
+    """Describes nx x ny samples of tiles for kernels."""
+    grid = kernels.Grid()
+    grid.points, grid.nx, grid.ny = SUPERSAMPLING * tiles.size, nx, ny
+    axes = [_axis(samples, grid.points, str(tiles.light.device)) for samples in (nx, ny)]
+    (grid.first_x, grid.share_x), (grid.first_y, grid.share_y) = (
+        [interop.to_warp(part) for part in axis[:2]] for axis in axes
+    )
+    return grid
+
+
+def _laid_out(values: torch.Tensor) -> torch.Tensor:
+    """Lays out values [T, ...]; on a GPU tiles come last, since its threads read one place of many tiles at once."""
+    if values.device.type == "cpu":
+        return values.contiguous()
+    return values.movedim(0, -1).contiguous().movedim(-1, 0)
+
+
+def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
+    """Allocates float [T, ...] in the layout of `_laid_out`."""
+    count, device = len(tiles.index), tiles.light.device
+    if device.type == "cpu":
+        return torch.empty((count, *shape))
+    return torch.empty((*shape, count), device=device).movedim(-1, 0)
+
+
+@functools.cache
+def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Interpolation along an axis: the sample before each point, the weight of the next one, and the inverse of the
+    interpolation matrix's Gram matrix, which would dominate the time if a GPU computed it each time."""
+    matrix = linear(samples, points)
+    place = (torch.arange(points) + 0.5) / points * (samples - 1)
+    first = place.floor().clamp(max=max(samples - 2, 0))
+    share = place - first
+    inverse = torch.linalg.inv(matrix.double().T @ matrix.double())
+    return first.int().to(device), share.float().to(device), inverse.float().to(device)
+
+
+def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
+    """Weighted squared error of each tile, mean of the channels, float64 [T]; the sum is the mean squared error.
+
+    Args:
+        tiles: T of them.
+        samples: float [T, ny, nx, 3].
+    """
+    result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
+    flat = samples.permute(0, 3, 1, 2).flatten(2)
+    with on_stream(samples.device):
+        light, weight, stored = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight, flat))
+        grid = _grid(tiles, samples.shape[2], samples.shape[1])
+        kernels.errors(light, weight, grid, stored, interop.to_warp(result))
+    return result.mean(1)
+
+
+def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
+    """The weight of each sample's squared error, float [T, ny, nx]."""
+    points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
+    down, across = (linear(count, points, device).square() for count in (ny, nx))
+    return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
+
+
+def curves(
+    tiles: Tiles,
+    sizes: list[Size],
+    progress: OnProgress | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> np.ndarray:
+    """Computes the error of every tile at every size, float64 [sizes, T].
+
+    Args:
+        tiles: T of them.
+        sizes: The sizes; an error is that of the samples after the size's format has stored them.
+        progress: Called with the sizes done.
+        checkpoint: Keeps the errors of the sizes done, as batch 0.
+    """
+    result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
+    begin = 0
+
+    def load(state: dict[str, np.ndarray]) -> None:
+        nonlocal begin
+        done = check_parts(state, {"error": Part(np.float64, (None, len(tiles.index)), least=0.0)})["error"]
+        begin = min(len(done), len(sizes))
+        result[:begin] = done[:begin]
+
+    if checkpoint is not None:
+        checkpoint.restore(0, load)
+    pieces = list(_pieces(tiles))
+    for i, size in enumerate(sizes[begin:], begin):
+        if meter.due(i):
+            try:
+                meter.report(i)
+            except KeyboardInterrupt:
+                if checkpoint is not None:
+                    checkpoint.save_running(0, {"error": result[:i]})
+                raise
+        rounds = _ROUGH if size.step == 1 else _MEDIUM
+        for part, piece in pieces:
+            samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
+            weight = sample_weights(piece, size.nx, size.ny)
+            result[i, part] = errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy()
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save_running(0, {"error": result[: i + 1]})
+    return result
+
+
+def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:
+    """Solves for the samples of every tile at its own size.
+
+    Args:
+        tiles: T of them.
+        sizes: The sizes.
+        chosen: int [T], the number of each tile's size.
+
+    Returns:
+        All tiles, in groups of one size: their numbers, int [n], and on the tiles' device samples, float32 [n, ny, nx,
+        3], not negative, and the weights of the samples' squared errors [n, ny, nx].
+    """
+    result = []
+    for number in np.unique(chosen).tolist():
+        size, members = sizes[number], np.flatnonzero(chosen == number)
+        rows = torch.from_numpy(members).to(tiles.index.device)
+        group = Tiles(tiles.index[rows], tiles.light[rows], tiles.weight[rows], tiles.size)
+        for part, piece in _pieces(group):
+            values = solve(piece, size.nx, size.ny).clamp(min=0.0)
+            result.append((members[part], values, sample_weights(piece, size.nx, size.ny)))
+    return result
+
+
+def _pieces(tiles: Tiles) -> Iterator[tuple[slice, Tiles]]:
+    step = _AT_ONCE if tiles.light.device.type == "cpu" else _AT_ONCE_CUDA
+    for first in range(0, len(tiles.index), step):
+        part = slice(first, first + step)
+        yield part, Tiles(tiles.index[part], _laid_out(tiles.light[part]), _laid_out(tiles.weight[part]), tiles.size)

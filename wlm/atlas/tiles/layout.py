@@ -1,0 +1,312 @@
+"""Sizes of tiles: the sizes that a tile may have, the one that it gets within a budget of bits, and its place.
+
+Each tile has a curve of error against bits. At the optimum one more bit gains as much in every tile. That gain, a
+Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each with its own
+texture: blocks for light that they follow well, single texels for other light and for tiles of few samples.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from wlm.atlas.model import (
+    BLOCK_SIDE,
+    BLOCKS,
+    COLOUR_BITS,
+    FIRST_BLOCK_CODE,
+    MOST_SIZE,
+    SIDE_BITS,
+    TEXELS,
+    Profile,
+    first_block_code,
+    pack_entries,
+)
+from wlm.errors import WlmError
+from wlm.formats.exr import HALF_MAX
+
+_BISECTIONS, _CLOSE = 60, 1e-6
+_TILES_AT_ONCE = 1 << 16
+_WIDTHS = np.linspace(0.7, 1.5, 17)  # widths of T_p that are tried, over the square root of its number of samples
+# Sides in texels for "mixed": above 6 every other one is enough.
+_MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+
+
+@dataclass(frozen=True)
+class Size:
+    """A size that a tile may have.
+
+    Attributes:
+        nx, ny: Samples along x and y.
+        format: Their format, a key of `COLOUR_BITS`.
+        second: Whether they are in the second texture of "mixed".
+    """
+
+    nx: int
+    ny: int
+    format: str
+    second: bool = False
+
+    @property
+    def bits(self) -> int:
+        """Bits on a GPU."""
+        return self.nx * self.ny * COLOUR_BITS[self.format]
+
+    @property
+    def step(self) -> int:
+        """The number of which its sides are multiples."""
+        return BLOCK_SIDE if self.format in ("bc6h", "astc") else 1
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The sizes of all tiles and their places.
+
+    Attributes:
+        chosen: int [T], numbers of sizes.
+        first: int64 [T, 2], x and y of each tile's first texel.
+        shapes: Rows and columns of T_p, and of the second texture of "mixed".
+    """
+
+    chosen: np.ndarray
+    first: np.ndarray
+    shapes: tuple[tuple[int, int], ...]
+
+
+def sizes_of(profile: Profile) -> list[Size]:
+    """Lists the sizes that a tile may have; blocks are whole, so that no block has two tiles."""
+    most = profile.tile + 1
+
+    def of_blocks(format: str, second: bool) -> list[Size]:
+        sides = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE)
+        return [Size(nx, ny, format, second) for ny in sides for nx in sides]
+
+    if profile.colour in ("bc6h", "astc"):
+        return of_blocks(profile.colour, False)
+    if profile.colour != "mixed":
+        sides = range(1, most + 1)
+        return [Size(nx, ny, profile.colour) for ny in sides for nx in sides]
+    sides = [side for side in _MIXED_SIDES if side <= min(most, FIRST_BLOCK_CODE)]
+    return [Size(nx, ny, TEXELS) for ny in sides for nx in sides] + of_blocks(BLOCKS, True)
+
+
+def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
+    """Allocates sizes whose rectangles fit in textures of a given number of bits, and places them.
+
+    Args:
+        error: float64 [sizes, T], `curves`, on any device.
+        sizes: The sizes.
+        room: Most bits of T_p.
+        least: Error that a bit must save to be allocated.
+
+    Returns:
+        The layout; None where not even the smallest sizes fit.
+
+    Raises:
+        WlmError: A texture has more texels along a side than an entry of T_c can name.
+    """
+    cost = np.array([size.bits for size in sizes], np.float64)
+    sides = np.array([(size.nx, size.ny) for size in sizes])
+    second = np.array([size.second for size in sizes])
+    textures = [next(size for size in sizes if size.second == each) for each in sorted(set(second.tolist()))]
+    budget, fewest = room, error.shape[1] * cost.min()
+    while True:
+        chosen = allocate(error, cost, budget, least)
+        counts, widths, shapes, bits = np.bincount(chosen, minlength=len(sizes)), [], [], 0
+        for texture in textures:
+            members = (second == texture.second) & (counts > 0)
+            width, shape = _narrowest(_Kinds.of(sides[members], counts[members]), texture.step)
+            widths.append(width)
+            shapes.append(shape)
+            most = MOST_SIZE * texture.step
+            if max(shape) > most:
+                raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
+            bits += math.prod(shape) * COLOUR_BITS[texture.format]
+        if bits <= room:
+            first = np.zeros((len(chosen), 2), np.int64)
+            for texture, width in zip(textures, widths, strict=True):
+                members = np.flatnonzero(second[chosen] == texture.second)
+                first[members] = place(sides[chosen[members]], width)[0]
+            return Layout(chosen, first, tuple(shapes))
+        total = cost[chosen].sum()
+        if total <= fewest:
+            return None
+        # The area lost between shelves is about the same next time.
+        budget = min(budget, total) * min(0.999 * room / bits, 0.99)
+
+
+def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
+    """Finds the width of shelves with the smallest texture; and gives the texture's rows and columns."""
+    if not len(kinds.size):
+        return step, (step, step)
+    total = float(kinds.size.prod(1) @ kinds.count)
+    best = None
+    for share in _WIDTHS:
+        width = max(int(kinds.size[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
+        runs, height = kinds.shelves(width)
+        # No shelf may reach as far as the width allows.
+        widest = max(run.widest for run in runs)
+        if best is None or widest * height < best[0]:
+            best = widest * height, width, (height, widest)
+    return best[1:]
+
+
+def composed(
+    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
+    sizes: list[Size],
+    layout: Layout,
+    index: np.ndarray,
+    counts: tuple[int, int],
+    device: str,
+) -> tuple[list[tuple[torch.Tensor, torch.Tensor]], np.ndarray]:
+    """Composes T_p and T_c.
+
+    Args:
+        samples: Groups of tiles of one size: their rows in `layout`, int [n], and on the device float32 [n, ny, nx, 3]
+            and the weights of their squared errors [n, ny, nx].
+        sizes: The sizes.
+        layout: Sizes and places of the tiles.
+        index: int64 [T], the tiles' numbers in the grid.
+        counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
+        device: "cpu" or "cuda:N": a large texture takes seconds to pass through the host.
+
+    Returns:
+        For each texture, on the device, the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
+    """
+    textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
+    for members, values, weight in samples:
+        size = sizes[layout.chosen[members[0]]]
+        at = tuple(torch.from_numpy(each).to(device) for each in texels_of(layout.first[members], size.nx, size.ny))
+        texels, weights = textures[size.second]
+        texels[at], weights[at] = values, weight
+    total = counts[0] * counts[1]
+    mixed = any(size.second for size in sizes)
+    code = first_block_code("mixed" if mixed else sizes[0].format, layout.shapes[0])
+    first, side, blocks = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
+    if not code:
+        side[:], blocks[:] = BLOCK_SIDE, True
+    first[index] = layout.first
+    side[index] = np.array([(size.nx, size.ny) for size in sizes])[layout.chosen]
+    if mixed:
+        blocks[index] = np.array([size.second for size in sizes])[layout.chosen]
+    lut = pack_entries(first, side, blocks, code).reshape(*counts, 2)
+    return [(texels.clamp_(max=HALF_MAX), weights) for texels, weights in textures], lut
+
+
+def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [n, ny, 1] and columns [n, 1, nx] of the texels of rectangles with first texels (x, y) [n, 2]."""
+    row = first[:, 1, None, None] + np.arange(ny)[:, None]
+    return row, first[:, 0, None, None] + np.arange(nx)
+
+
+def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
+    """Chooses the size of each tile for the least total error within a budget.
+
+    Args:
+        error: float64 [sizes, T].
+        cost: [sizes], bits of each size.
+        budget: Bits of all tiles.
+        least: Error that a bit must save to be allocated.
+
+    Returns:
+        int [T], numbers of sizes. All tiles have the cheapest size where even that is over the budget.
+    """
+    error = torch.as_tensor(error)
+    bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
+
+    def best(gain: float) -> torch.Tensor:
+        parts = [(each + gain * bits[:, None]).argmin(0) for each in error.split(_TILES_AT_ONCE, 1)]
+        return torch.cat(parts)
+
+    chosen = best(least)
+    if float(bits[chosen].sum()) <= budget:
+        return chosen.cpu().numpy()
+    low, high = least, max(least, float(error.max()) + 1e-30)  # at the high end no bit pays
+    for _ in range(_BISECTIONS):
+        middle = math.sqrt(low * high) if low > 0 else high * 1e-6
+        if float(bits[best(middle)].sum()) > budget:
+            low = middle
+        else:
+            high = middle
+        if high <= low * (1.0 + _CLOSE):
+            break
+    return best(high).cpu().numpy()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The places of the rectangles of one size: some beside those of another size, the rest on shelves of their own.
+
+    Attributes:
+        beside: Number of rectangles beside others, from (x, y) on.
+        x, y: Place of the first of these.
+        each: Number of rectangles on each of the further shelves.
+        below: y of the first of those shelves.
+        widest: Right end of the rightmost rectangle.
+    """
+
+    beside: int
+    x: int
+    y: int
+    each: int
+    below: int
+    widest: int
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """The sizes of rectangles, the highest first and then the widest, and the number of rectangles of each."""
+
+    size: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
+        """Sorts sizes, int [K, 2], all different, with their counts."""
+        order = np.lexsort((-size[:, 0], -size[:, 1]))
+        return cls(size[order], count[order])
+
+    def shelves(self, width: int) -> tuple[list[_Run], int]:
+        """Places each size on shelves of a width; gives the places and the height of all shelves."""
+        runs, x, y, height = [], 0, 0, 0
+        for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
+            each = width // w
+            beside = min((width - x) // w, count) if height else 0
+            run = _Run(
+                beside, x, y, each, y + height, max(x + w * beside if beside else 0, w * min(each, count - beside))
+            )
+            runs.append(run)
+            x += w * beside
+            if rest := count - beside:
+                y, height = run.below + h * ((rest - 1) // each), h
+                x = w * ((rest - 1) % each + 1)
+        return runs, y + height
+
+
+def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """Packs rectangles on shelves of one width, the highest first; each shelf is as high as its first rectangle.
+
+    Args:
+        sizes: int [R, 2], width and height of each.
+        width: Width of the shelves, at least that of the widest rectangle.
+
+    Returns:
+        int64 [R, 2], x and y of each; and the height of all shelves.
+    """
+    first = np.zeros((len(sizes), 2), np.int64)
+    if not len(sizes):
+        return first, 0
+    order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
+    ordered = sizes[order]
+    starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1)))
+    kinds = _Kinds(ordered[starts], np.diff(np.append(starts, len(sizes))))
+    runs, height = kinds.shelves(width)
+    for run, (w, h), members in zip(runs, kinds.size.tolist(), np.split(order, starts[1:]), strict=True):
+        beside, below = members[: run.beside], members[run.beside :]
+        first[beside, 0] = run.x + w * np.arange(len(beside))
+        first[beside, 1] = run.y
+        shelf, column = np.divmod(np.arange(len(below)), run.each)
+        first[below, 0] = w * column
+        first[below, 1] = run.below + h * shelf
+    return first, height

@@ -1,0 +1,99 @@
+"""Meshes in formats other than glTF, read with trimesh: OBJ, PLY, STL and OFF.
+
+trimesh is given the bytes of the file alone, so that a material can't name another file. It accepts some damaged files
+without a word, so its result is checked: numbers are finite and triangles name vertices that exist. Polygons are cut
+into triangles. Normals, colours and materials are left out. The v of these formats points up; here it points down, as
+in glTF.
+"""
+
+import io
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wlm.errors import WlmError, one_line
+from wlm.formats.limits import MODEL_BYTES
+from wlm.formats.reading import read_file
+
+SUFFIXES = (".obj", ".ply", ".stl", ".off")
+"""Endings of the names of files that are read here."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshArrays:
+    """The triangles of a file.
+
+    Attributes:
+        position: float64 [V, 3].
+        uv: float64 [V, 2], u right, v down; None where the file or some of its meshes have no UVs.
+        triangle: int32 [F, 3], in the order of the file; may be empty.
+    """
+
+    position: np.ndarray
+    uv: np.ndarray | None
+    triangle: np.ndarray
+
+
+def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
+    """Reads all triangles of a file as one mesh.
+
+    Args:
+        path: A file whose name ends in one of `SUFFIXES`.
+
+    Raises:
+        WlmError: The file is missing, too large or malformed, a position or UV is NaN or infinite, or a triangle names
+            a vertex that is not there.
+    """
+    import trimesh
+
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise WlmError(f"{path}: expected a mesh ({', '.join(SUFFIXES)}), found {suffix or 'a name without an ending'}")
+    data = read_file(path, MODEL_BYTES, f"the {suffix[1:].upper()} file")
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
+            meshes = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh)]
+        parts = [_checked(each) for each in meshes]
+    except Exception as error:  # trimesh's readers raise whatever NumPy does on damaged text
+        raise WlmError(
+            f"{path}: malformed {suffix[1:].upper()}: {one_line(error, 90) or type(error).__name__}"
+        ) from error
+    if not parts:
+        return MeshArrays(np.empty((0, 3)), None, np.empty((0, 3), np.int32))
+    first = np.cumsum([0, *(len(position) for position, _, _ in parts)])
+    has_uv = all(uv is not None for _, uv, _ in parts)
+    return MeshArrays(
+        np.concatenate([position for position, _, _ in parts]),
+        np.concatenate([uv for _, uv, _ in parts]) if has_uv else None,
+        np.concatenate([triangle + start for (_, _, triangle), start in zip(parts, first, strict=False)]).astype(
+            np.int32
+        ),
+    )
+
+
+def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Positions, UVs or None, and triangles of a mesh.
+
+    Raises:
+        ValueError: A number is not finite, or a triangle names a vertex that is not there.
+    """
+    position, triangle = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    uv = getattr(mesh.visual, "uv", None)
+    if uv is not None and len(uv):
+        uv = np.asarray(uv, np.float64)[:, :2]
+        if uv.shape != (len(position), 2):
+            raise ValueError(f"expected a UV for each of {len(position)} vertices, found {uv.shape}")
+        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], 1)
+    else:
+        uv = None
+    for name, values in (("positions", position), ("UVs", uv)):
+        if values is not None and not np.isfinite(values).all():
+            raise ValueError(f"expected finite {name}, found NaN or infinity")
+    if triangle.size and not 0 <= triangle.min() <= triangle.max() < len(position):
+        raise ValueError(f"expected vertices 0 to {len(position) - 1} in triangles")
+    return position, uv, triangle.reshape(-1, 3)
