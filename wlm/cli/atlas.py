@@ -219,7 +219,7 @@ def export(
 
 def info(file: ModelFile, as_json: AsJson = False) -> None:
     """Show what a file of mesh lightmaps contains."""
-    models.describe(file, None, as_json, _facts)
+    models.describe(file, "atlas", None, as_json, _facts)
 
 
 def _facts(model: "AtlasModel") -> dict[str, Any]:

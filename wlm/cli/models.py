@@ -93,11 +93,14 @@ def export(
     show_files(output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given))
 
 
-def describe(file: Path, device: str | None, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]) -> Any:
+def describe(
+    file: Path, system: str, device: str | None, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]
+) -> Any:
     """Shows what a file contains: its settings, its sizes, and the facts of its system.
 
     Args:
         file, as_json: Values of the options.
+        system: Name of the system that must have written the file.
         device: Device whose memory is shown; None for none.
         facts: Returns the facts of a model as JSON values by name.
 
@@ -108,7 +111,7 @@ def describe(file: Path, device: str | None, as_json: bool, facts: Callable[[Any
     from wlm.formats.artifact import read_artifact
     from wlm.system import load
 
-    artifact, model = read_artifact(file), load(file)
+    artifact, model = read_artifact(file, system), load(file, system)
     shown = {"name": model.name, "system": artifact.system, **facts(model), "source": model.source}
     shown["bytes_on_disk"] = artifact.file_bytes
     if device is not None:
