@@ -60,8 +60,6 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "half_way_psnr": Figure("half-way", "dB", ".2f"),
         "coarse_psnr": Figure("coarse march", "dB", ".2f"),
         "network_psnr": Figure("network", "dB", ".2f"),
-        "right_psnr": Figure("right", "dB", ".2f"),
-        "left_psnr": Figure("left", "dB", ".2f"),
         "opacity_psnr": Figure("opacity", "dB", ".2f"),
         "emission_psnr": Figure("emission", "dB", ".2f"),
         "seen": Figure("seen", "dB", ".2f"),  # these as in `wlm.lightmap.seen`
@@ -151,8 +149,6 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "static_tiles": Figure("static tiles", form=_WHOLE),
         "dynamic_tiles": Figure("dynamic tiles", form=_WHOLE),
         "frames_tiles": Figure("tiles of frames", form=_WHOLE),
-        "video_tiles": Figure("tiles of video", form=_WHOLE),
-        "levels_tiles": Figure("tiles of levels", form=_WHOLE),
         "tiles_timed": Figure("tiles timed", form=_WHOLE),
         "lightmaps": Figure("lightmaps", form=_WHOLE),
         "resolution": Figure("resolution", "pixels", _WHOLE),

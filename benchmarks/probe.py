@@ -67,8 +67,6 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     # The paper's own rival: clusters of places, nothing but half floats.
     "CPCA in halves": ("clustered_pca", (None,)),
     "global PCA": ("global_pca", WEIGHT_BITS),
-    "block PCA": ("block_pca", WEIGHT_BITS),
-    "window PCA": ("window_pca", WEIGHT_BITS),
     "clustered PCA": ("clustered_pca", WEIGHT_BITS),
     "CPCA by signal": ("clustered_pca_signal", WEIGHT_BITS),
     "moving basis": ("moving_basis", WEIGHT_BITS),

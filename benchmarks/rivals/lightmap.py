@@ -49,14 +49,6 @@ class Method:
         return f"{self.title} {self.option}".strip()
 
 
-_AV1_QUALITIES = (50, 65, 75, 85, 92, 97)
-
-
-def _av1(title: str, quality: int, ranges: str) -> Method:
-    encode = functools.partial(encode_av1, quality=quality, ranges=ranges)
-    return Method(title, f"{quality}", encode, alone=False, random_access=False)
-
-
 RIVALS: dict[str, Method] = {
     "bc6h": Method("BC6H", "", encode_bc6h),
     "bc7": Method("BC7", "", encode_bc7),
@@ -84,8 +76,12 @@ RIVALS: dict[str, Method] = {
         f"ntc-{name}": Method("NTC", name, functools.partial(encode_ntc, latents=name), alone=False, fitted=True)
         for name in LADDER
     },
-    **{f"av1-{quality}": _av1("AV1", quality, "day") for quality in _AV1_QUALITIES},
-    **{f"av1-{quality}-hour": _av1("AV1 by hour", quality, "hour") for quality in _AV1_QUALITIES},
+    **{
+        f"av1-{quality}": Method(
+            "AV1", f"{quality}", functools.partial(encode_av1, quality=quality), alone=False, random_access=False
+        )
+        for quality in (50, 65, 75, 85, 92, 97)
+    },
 }
 """All methods by name."""
 

@@ -25,22 +25,17 @@ WHITE = (1 << BITS) - 1
 
 _MIDDLE = 1 << BITS - 1  # stands for a difference of 0
 _SPEED = 3  # 0 (slowest) to 10
-_RANGES = ("day", "hour")
 _IDENTITY = 0  # matrix coefficients, ITU-T H.273: green, blue and red are Y, U and V
 _FROM_PLANES, _TO_PLANES = [2, 0, 1], [1, 2, 0]
 
 
-def encode_av1(
-    frames: np.ndarray, mask: np.ndarray, quality: int = 80, ranges: str = "day", speed: int = _SPEED
-) -> Rival:
+def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80, speed: int = _SPEED) -> Rival:
     """Encodes all lightmaps of a set as one AV1 sequence.
 
     Args:
         frames: [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
         quality: 0 to 100.
-        ranges: The range that the levels of a tile are relative to: over the `day`, or at each `hour`. The first is
-            better if hours are alike, the second if they differ much.
         speed: Speed of libaom, 0 (slowest, best) to 10.
 
     Returns:
@@ -51,14 +46,11 @@ def encode_av1(
     """
     if not 0 <= quality <= 100:
         raise WlmError(f"av1: expected a quality from 0 to 100, got {quality}")
-    if ranges not in _RANGES:
-        raise WlmError(f"av1: unknown ranges {ranges!r}, expected one of {', '.join(_RANGES)}")
     if not 0 <= speed <= 10:
         raise WlmError(f"av1: expected a speed from 0 to 10, got {speed}")
     # Each texel that must be right costs bits here: a ring of one is enough for a bilinear read.
     codes, seen = to_codes(prepare(frames, mask)), seen_texels(mask, ring=1)
-    span = TileRanges.over_times if ranges == "day" else TileRanges.of
-    tiles = span(codes, seen, by_channel=False)  # grey stays grey
+    tiles = TileRanges.over_times(codes, seen, by_channel=False)  # grey stays grey
     levels = fill_smoothly(tiles.levels(codes), seen)
 
     def encode() -> bytes:
@@ -68,7 +60,7 @@ def encode_av1(
         return tiles.radiance(decode_levels(stream, levels.shape) / np.float32(WHITE))
 
     return measure(
-        f"av1-{quality}" + ("-hour" if ranges == "hour" else ""),
+        f"av1-{quality}",
         encode,
         decode,
         bytes=lambda data: _stream_bytes(data) + len(tiles.tobytes()),

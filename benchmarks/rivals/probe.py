@@ -41,55 +41,7 @@ _ROUNDS = 10
 def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
     """Principal components of all probes, which are one part (GPCA)."""
     position, values = _checked(position, values, components, bits)
-    return _pca("global_pca", "part", position, values, components, bits, lambda: (probe_pca.whole(position), ()))
-
-
-def block_pca(
-    position: np.ndarray, values: np.ndarray, components: int, blocks: int, *, bits: int | None = None
-) -> Rival:
-    """Principal components of each cube of a regular grid (BPCA, Nishino et al. 2005).
-
-    Args:
-        position, values, components, bits: See the module.
-        blocks: The most cubes that hold a probe, at least 1. They have one size, so a few fewer come out.
-    """
-    position, values = _checked(position, values, components, bits)
-    _in_range("blocks", blocks, 1)
-
-    def divide() -> tuple[probe_pca.Partition, Sequence[np.ndarray]]:
-        return probe_pca.by_blocks(position, blocks)[0], ()
-
-    return _pca("block_pca", "blocks", position, values, components, bits, divide)
-
-
-def window_pca(
-    position: np.ndarray,
-    values: np.ndarray,
-    components: int,
-    blocks: int,
-    *,
-    overlap: float = 1.0,
-    bits: int | None = None,
-) -> Rival:
-    """Block PCA with the basis of a block and its surroundings (WBPCA, Nishino et al. 2005).
-
-    Neighbouring blocks then have similar bases and smaller seams, at the cost of a larger error; each probe is coded
-    once, in the basis of the block that it lies in.
-
-    Args:
-        position, values, components, bits: See the module.
-        blocks: As `block_pca`.
-        overlap: How far the window reaches over its block on all sides, in sides of a block, at least 0.
-    """
-    position, values = _checked(position, values, components, bits)
-    _in_range("blocks", blocks, 1)
-    _in_range("overlap", overlap, 0)
-
-    def divide() -> tuple[probe_pca.Partition, list[np.ndarray]]:
-        partition, side = probe_pca.by_blocks(position, blocks)
-        return partition, probe_pca.windows(position, partition, side, overlap)
-
-    return _pca("window_pca", f"blocks, overlap {overlap:g}", position, values, components, bits, divide)
+    return _pca("global_pca", "part", position, values, components, bits, lambda: probe_pca.whole(position))
 
 
 def clustered_pca(
@@ -118,7 +70,7 @@ def clustered_pca(
         name, divide = "clustered_pca_signal", lambda: probe_pca.by_signal(values, clusters, components, seed)
     else:
         name, divide = "clustered_pca", lambda: probe_pca.by_place(position, clusters, seed)
-    return _pca(name, "clusters", position, values, components, bits, lambda: (divide(), ()))
+    return _pca(name, "clusters", position, values, components, bits, divide)
 
 
 def moving_basis(
@@ -331,8 +283,6 @@ def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequ
 
 RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Rival | None]] = {
     "global_pca": functools.partial(_pca_at, probe_pca.WHOLE, global_pca),
-    "block_pca": functools.partial(_pca_at, probe_pca.BLOCKS, block_pca),
-    "window_pca": functools.partial(_pca_at, probe_pca.BLOCKS, window_pca),
     "clustered_pca": functools.partial(_pca_at, probe_pca.PLACE, clustered_pca),
     "clustered_pca_signal": functools.partial(_pca_at, probe_pca.SIGNAL, functools.partial(clustered_pca, signal=True)),
     "moving_basis": _moving_at,
@@ -348,15 +298,11 @@ def _pca(
     values: np.ndarray,
     components: int,
     bits: int | None,
-    divide: Callable[[], tuple[probe_pca.Partition, Sequence[np.ndarray]]],
+    divide: Callable[[], probe_pca.Partition],
 ) -> Rival:
-    def encode() -> bytes:
-        partition, members = divide()
-        return probe_pca.encode(values, partition, components, bits, members)
-
     return measure(
         name,
-        encode,
+        lambda: probe_pca.encode(values, divide(), components, bits),
         lambda payload: probe_pca.decode(payload, position),
         option=lambda payload: f"K={components}, {probe_pca.part_count(payload)} {parts}, {_weights(bits)}",
     )

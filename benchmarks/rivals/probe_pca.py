@@ -8,7 +8,7 @@ little-endian:
 part                  content
 ====================  =====================================================================================
 header                kind of the partition, bits of a weight (0: half float), D, K, parts C, scale (float32)
-partition             nothing (one part); the cubes' side (float64); the centres (uint16 [C, 3] over the box);
+partition             nothing (one part); the centres (uint16 [C, 3] over the box);
                       or each probe's part in ceil(log2 C) bits
 means, bases          float16 [C, D] and [C, K, D], in units of the scale
 lowest, highest       float16 [C, K, 2], only with weights in bits
@@ -32,7 +32,7 @@ from wlm.formats.bits import pack_bits, unpack_bits
 HEADER = struct.Struct("<BBHHIf")
 HALF_MAX = 65504.0
 # How a decoder finds the parts.
-WHOLE, BLOCKS, PLACE, SIGNAL = range(4)
+WHOLE, PLACE, SIGNAL = range(3)
 _CENTRE_LEVELS = 65535
 # Cells along the longest side of the box, at most: three such numbers fit into one 64-bit key.
 MAX_CELLS = 1 << 20
@@ -69,52 +69,6 @@ class Partition:
 def whole(position: np.ndarray) -> Partition:
     """All probes as one part."""
     return Partition(WHOLE, np.zeros(len(position), np.int64), 1, b"")
-
-
-def by_blocks(position: np.ndarray, blocks: int) -> tuple[Partition, float]:
-    """Cubes of one size from the lowest corner of the probes' box; those that hold no probe do not count.
-
-    Args:
-        position: float64 [N, 3].
-        blocks: The most cubes, at least 1. Halving a side splits cubes, so a little fewer may come out; no more
-            than there are distinct positions.
-
-    Returns:
-        The partition, and the cubes' side in the unit of the positions.
-    """
-    extent = extent_of(position)
-    # The count falls as the side grows, not strictly so: what counts is the smallest side seen that is allowed.
-    side, low, high = extent * 1.01, 0.0, np.log2(MAX_CELLS)
-    for _ in range(24):
-        middle = 0.5 * (low + high)
-        tried = extent * 1.01 / 2.0**middle
-        if len(np.unique(_cubes(position, tried))) <= blocks:
-            side, low = tried, middle
-        else:
-            high = middle
-    label, count = compact(_cubes(position, side))
-    return Partition(BLOCKS, label, count, struct.pack("<d", side)), side
-
-
-def windows(position: np.ndarray, partition: Partition, side: float, overlap: float) -> list[np.ndarray]:
-    """The probes in each cube of `by_blocks` widened on all sides.
-
-    Args:
-        position: float64 [N, 3].
-        partition: Of `by_blocks`.
-        side: Of the cubes.
-        overlap: How far a window reaches over its cube, in sides; 1 takes in the 26 cubes around it.
-
-    Returns:
-        For each part the indices of its window, its own probes among them.
-    """
-    low = position.min(0)
-    first = [probes[0] for probes in partition.members]
-    centre = low + (np.floor((position[first] - low) / side) + 0.5) * side
-    # The slack keeps a probe on a cube's face in that cube's window.
-    radius = side * (0.5 + overlap) * (1.0 + 1e-9)
-    windows = cKDTree(position).query_ball_point(centre, radius, p=np.inf, return_sorted=True)
-    return [np.asarray(window, np.int64) for window in windows]
 
 
 def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
@@ -195,9 +149,7 @@ def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components:
     return mean, basis
 
 
-def encode(
-    values: np.ndarray, partition: Partition, components: int, bits: int | None, members: Sequence[np.ndarray] = ()
-) -> bytes:
+def encode(values: np.ndarray, partition: Partition, components: int, bits: int | None) -> bytes:
     """Fits and packs.
 
     Args:
@@ -205,14 +157,13 @@ def encode(
         partition: Of the N probes.
         components: K, 1 to D.
         bits: Of a weight, 1 to 16, over the range of each part and component; None for half floats.
-        members: The probes that each part's subspace is fitted to, where those are not its own.
 
     Returns:
         The layout of this module.
     """
     scale = scale_of(values)
     values = values / scale
-    mean, basis = fit_subspaces(values, members or partition.members, components)
+    mean, basis = fit_subspaces(values, partition.members, components)
     mean, basis = mean.astype("<f2"), basis.astype("<f2")
     # Weights for the subspace as it is read back: the rounding of means and bases is no error of its own then.
     inverse = np.linalg.pinv(basis.astype(np.float64))
@@ -334,7 +285,6 @@ def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
 
 _PARTITION_BYTES = {
     WHOLE: lambda probes, count: 0,
-    BLOCKS: lambda probes, count: 8,
     PLACE: lambda probes, count: 6 * count,
     SIGNAL: lambda probes, count: -(-probes * _index_bits(count) // 8),
 }
@@ -343,8 +293,6 @@ _PARTITION_BYTES = {
 def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) -> np.ndarray:
     if kind == WHOLE:
         return np.zeros(len(position), np.int64)
-    if kind == BLOCKS:
-        return compact(_cubes(position, struct.unpack("<d", data)[0]))[0]
     if kind == PLACE:
         return _nearest(position, np.frombuffer(data, "<u2").reshape(count, 3))
     return _read_numbers(data, len(position), _index_bits(count))
@@ -369,11 +317,6 @@ def cell_keys(cell: np.ndarray) -> np.ndarray:
     """One int64 for each cell [..., 3] of a grid, whose three numbers are whole, 0 to MAX_CELLS."""
     x, y, z = np.moveaxis(cell.astype(np.int64), -1, 0)
     return (x << 42) | (y << 21) | z
-
-
-def _cubes(position: np.ndarray, side: float) -> np.ndarray:
-    """The cube that each probe lies in, int64 [N]."""
-    return cell_keys(np.floor((position - position.min(0)) / side))
 
 
 def _members(label: np.ndarray, count: int) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ PROFILES = [
     Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
 ]
 PCA = {"room": "27 components", "hall": "27 components"}
-RIVALS = ["CPCA in halves", "global PCA", "block PCA", "window PCA", "clustered PCA", "CPCA by signal", "moving basis"]
+RIVALS = ["CPCA in halves", "global PCA", "clustered PCA", "CPCA by signal", "moving basis"]
 
 
 def room(seed: int, name: str):

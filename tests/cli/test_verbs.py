@@ -189,7 +189,7 @@ def test_every_help_is_written_in_sentences(every_command):
     for path, command in every_command.items():
         texts = [inspect.cleandoc(command.help or ""), *(each.help for each in command.params if each.help is not None)]
         for text in texts:
-            assert text and text.rstrip().endswith("."), (path, text)
+            assert re.match(r"\w|[\"`]", text) and text.rstrip().endswith("."), (path, text)
             assert not FRAGMENT.match(text) and "so many" not in text and "but for" not in text, (path, text)
 
 

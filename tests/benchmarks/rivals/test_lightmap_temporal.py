@@ -16,7 +16,7 @@ from wlm.metrics import psnr_from_mse
 from wlm.texels import fill_smoothly
 
 # One of each kind; the rest differ in a number.
-KINDS = ("pca-bc4-4", "pca-0.04", "av1-85", "av1-85-hour")
+KINDS = ("pca-bc4-4", "pca-0.04", "av1-85")
 
 
 def day(height=72, width=140, hours=5, seed=0) -> np.ndarray:
@@ -133,13 +133,6 @@ def test_better_video_is_larger():
     assert encode_av1(still, mask, 100).bytes < 1.2 * encode_av1(still[:1], mask, 100).bytes
 
 
-def test_a_range_by_hour_saves_a_dark_hour():
-    frames, mask = day(hours=2), np.ones((72, 140), bool)
-    frames[1] *= 1e-4
-    dark = [psnr(frames[1], encode_av1(frames, mask, 85, ranges).decoded[1]) for ranges in ("day", "hour")]
-    assert dark[1] > dark[0] + 5.0
-
-
 def test_bc4_is_decoded_as_another_decoder_does(monkeypatch):
     calls = []
     original = imagecodecs.bcn_decode
@@ -176,7 +169,6 @@ def test_settings_are_checked():
         (lambda: encode_pca(frames, mask, 0.0), "step above 0, got 0"),
         (lambda: encode_pca(frames, mask, np.nan), "step above 0, got nan"),
         (lambda: encode_av1(frames, mask, 101), "quality from 0 to 100, got 101"),
-        (lambda: encode_av1(frames, mask, ranges="week"), "'week', expected one of day, hour"),
         (lambda: encode_av1(frames, mask, speed=11), "speed from 0 to 10, got 11"),
         (lambda: encode_av1(frames[..., :2], mask), r"lightmaps \[..., H, W, 3\]"),
         (lambda: encode_pca(frames, mask[:4]), "mask"),

@@ -1,4 +1,4 @@
-"""Baselines of probe compression: known answers, sizes, hard cases, and the search at a size."""
+"""Rivals of probe compression: known answers, sizes, hard cases, and the search at a size."""
 
 import functools
 
@@ -10,12 +10,10 @@ from benchmarks.rivals import probe_mbd, probe_pca
 from benchmarks.rivals.probe import (
     RIVALS,
     at_bytes,
-    block_pca,
     clustered_pca,
     global_pca,
     moving_basis,
     unreal_packing,
-    window_pca,
 )
 from wlm.errors import WlmError
 from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
@@ -25,13 +23,11 @@ SIGNAL = functools.partial(clustered_pca, signal=True)
 # Each as (positions, values, components, parts, bits=...).
 METHODS = {
     "global_pca": lambda position, values, components, parts, **more: global_pca(position, values, components, **more),
-    "block_pca": block_pca,
-    "window_pca": window_pca,
     "clustered_pca": clustered_pca,
     "clustered_pca_signal": SIGNAL,
     "moving_basis": moving_basis,
 }
-# A grid of 3 cells has more corners than 8 blocks; every other method gets 8 parts.
+# The moving basis gets a grid of 3 cells, which has more than 8 corners; every other method gets 8 parts.
 PARTS = {"moving_basis": 3}
 
 
@@ -63,7 +59,7 @@ def test_all_components_reproduce_the_values(name, width):
     assert result.encode_seconds > 0.0 and result.decode_seconds > 0.0
 
 
-@pytest.mark.parametrize("name", ["global_pca", "block_pca", "window_pca"])
+@pytest.mark.parametrize("name", ["global_pca", "clustered_pca"])
 def test_weights_make_up_for_rounded_means_and_bases(name):
     position, values = _probes()
     result = _make(name, position, values, 12, bits=16)
@@ -99,9 +95,6 @@ def test_sizes_by_hand():
     n, d, k = 101, 12, 3
     assert global_pca(position, values, k).bytes == 14 + (k + 1) * d * 2 + n * k * 2
     assert global_pca(position, values, k, bits=5).bytes == 14 + (k + 1) * d * 2 + k * 4 + -(-n * k * 5 // 8)
-    blocks = probe_pca.by_blocks(position, 8)[0].count
-    assert block_pca(position, values, k, 8).bytes == 14 + 8 + blocks * (k + 1) * d * 2 + n * k * 2
-    assert window_pca(position, values, k, 8).bytes == block_pca(position, values, k, 8).bytes
     # A centre is 6 bytes; an index of one of 8 is 3 bits a probe.
     assert clustered_pca(position, values, k, 8).bytes == 14 + 8 * (6 + (k + 1) * d * 2) + n * k * 2
     assert SIGNAL(position, values, k, 8).bytes == 14 + -(-n * 3 // 8) + 8 * (k + 1) * d * 2 + n * k * 2
@@ -122,7 +115,7 @@ def test_grid_corners_by_hand():
 def test_bytes_and_positions_are_all_that_decoding_needs(bits):
     position, values = _probes()
     wide = values.astype(np.float64)
-    cut = [probe_pca.whole(position), probe_pca.by_blocks(position, 9)[0], probe_pca.by_place(position, 9, 1)]
+    cut = [probe_pca.whole(position), probe_pca.by_place(position, 9, 1)]
     for partition in (*cut, probe_pca.by_signal(wide, 9, 2, 1)):
         payload = probe_pca.encode(wide, partition, 2, bits)
         assert len(payload) == probe_pca.payload_bytes(partition.kind, 400, 12, 2, partition.count, bits)
@@ -130,7 +123,7 @@ def test_bytes_and_positions_are_all_that_decoding_needs(bits):
         decoded = probe_pca.decode(bytes(bytearray(payload)), position.copy())
         assert _error(values, decoded) <= _error(values, global_pca(position, values, 2, bits=4).decoded)
         # A probe's values depend on its place and weights, so other positions must not decode to the same.
-        if partition.kind in (probe_pca.BLOCKS, probe_pca.PLACE):
+        if partition.kind == probe_pca.PLACE:
             elsewhere = probe_pca.decode(payload, position[:, ::-1])
             assert _error(values, elsewhere) > 2 * _error(values, decoded)
         for wrong in (payload[:-1], payload + b"\0", payload[:5], b"", b"\xff" * 20):
@@ -153,35 +146,6 @@ def test_weights_keep_the_ends_of_each_range():
     np.testing.assert_allclose(read[4], weight[4], atol=8.0 / 15 / 2)
     wild = probe_pca.read_weights(probe_pca.write_weights(weight * 1e6, part, 2, None), part, 2, 2, None)
     assert np.isfinite(wild).all() and wild.max() == 65504.0
-
-
-def test_blocks_are_cubes_of_one_size():
-    position, _ = _probes(count=3000)
-    for most in (1, 2, 7, 40, 300):
-        partition, side = probe_pca.by_blocks(position, most)
-        assert 0.6 * most <= partition.count <= most
-        for probes in partition.members:
-            assert (np.ptp(position[probes], axis=0) <= side).all()
-    assert probe_pca.by_blocks(position, 3000)[0].count > 2000
-
-
-def test_windows_hold_the_cube_and_what_lies_around():
-    position, values = _probes()
-    partition, side = probe_pca.by_blocks(position, 20)
-    windows = probe_pca.windows(position, partition, side, 0.25)
-    corner = position.min(0) + np.floor((position - position.min(0)) / side) * side
-    for probes, near in zip(partition.members, windows, strict=True):
-        low = corner[probes[0]] - 0.25 * side
-        inside = ((position >= low) & (position <= low + 1.5 * side)).all(1)
-        np.testing.assert_array_equal(near, np.flatnonzero(inside))
-        assert set(probes) <= set(near)
-    errors = [_error(values, window_pca(position, values, 2, 20, overlap=o).decoded) for o in (0, 0.25, 1, 100)]
-    np.testing.assert_array_equal(
-        window_pca(position, values, 2, 20, overlap=0).decoded, block_pca(position, values, 2, 20).decoded
-    )
-    assert errors == sorted(errors)
-    # A window over everything is global PCA, to the rounding.
-    assert errors[-1] == pytest.approx(_error(values, global_pca(position, values, 2).decoded), rel=1e-3)
 
 
 def test_clusters_by_place_are_nearest_centres():
@@ -314,7 +278,7 @@ def test_settings_that_cannot_be(name):
         with pytest.raises(ValueError, match="bits"):
             METHODS[name](position, values, 1, 2, bits=wrong)
     if name != "global_pca":
-        with pytest.raises(ValueError, match="blocks|clusters|grid"):
+        with pytest.raises(ValueError, match="clusters|grid"):
             METHODS[name](position, values, 1, 0)
     for place, light in ((position[:, :2], values), (position[1:], values), (position, values[:, :, None])):
         with pytest.raises(ValueError, match="positions"):
@@ -332,9 +296,6 @@ def test_settings_that_cannot_be(name):
 
 def test_other_settings_that_cannot_be():
     position, values = _probes(count=20)
-    for overlap in (-0.5, np.nan, np.inf):
-        with pytest.raises(ValueError, match="overlap"):
-            window_pca(position, values, 1, 2, overlap=overlap)
     with pytest.raises(ValueError, match="iterations"):
         moving_basis(position, values, 1, 2, -1)
     with pytest.raises(ValueError, match="grid"):
@@ -434,13 +395,13 @@ def test_at_bytes_finds_the_best_of_all_settings():
         result
         for bits in (8, None)
         for k in range(1, 13)
-        for blocks in range(1, 60, 4)
-        if (result := block_pca(position, values, k, blocks, bits=bits)).bytes <= budget
+        for clusters in range(1, 60, 4)
+        if (result := clustered_pca(position, values, k, clusters, bits=bits)).bytes <= budget
     ]
     best = min(_error(values, result.decoded) for result in tried)
-    found = at_bytes("block_pca", position, values, budget, (8, None))
+    found = at_bytes("clustered_pca", position, values, budget, (8, None))
     assert _error(values, found.decoded) <= best * 1.1
-    half = at_bytes("block_pca", position, values, budget, (None,))
+    half = at_bytes("clustered_pca", position, values, budget, (None,))
     assert "half floats" in half.option and _error(values, half.decoded) >= _error(values, found.decoded)
 
 
