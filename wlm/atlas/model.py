@@ -93,7 +93,7 @@ class Profile(Settings):
     method: Literal["tiles", "cascade"] = "tiles"
     """Method, tiles or cascade. Several sheets or states always share tiles."""
     colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"] = "half"
-    """Format of the colour texture T_p; for tiles also mixed, with RGB9E5 and BC6H textures of which each tile uses one.
+    """Format of the colour texture T_p; for tiles also mixed, an RGB9E5 and a BC6H texture of which each tile uses one.
     Shared tiles are rgb9e5 or mixed."""
     budget: float | None = Field(None, gt=0.0, le=2.0)
     """For tiles: bits of the textures as a fraction of those of all lightmaps at 48 bits per texel. It is 1 - CR of

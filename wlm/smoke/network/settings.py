@@ -115,9 +115,9 @@ class DatasetSettings(BaseModel):
     kept_empty: _Share = 0.05
     """Share of almost empty frames that are kept."""
     validation_sequences: int = Field(4, ge=1, le=1000)
-    """Size and seed of the validation set, which selects the best network."""
+    """Number of sequences of the validation set, which selects the best network."""
     validation_seed: int = Field(2026, ge=0)
-    """Size and seed of the validation set, which selects the best network."""
+    """Seed of the validation set."""
     test_seed: int = Field(2027, ge=0)
     """Seed of a test set of the same size, which takes no part in model selection."""
 
