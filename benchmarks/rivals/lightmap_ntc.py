@@ -17,6 +17,7 @@ weighted half-way to what PSNR measures, as ours are, and the ring round charts 
 what these choices are worth. It needs torch alone; a GPU fits it in minutes, a CPU in hours.
 """
 
+import itertools
 import lzma
 import math
 from collections.abc import Iterator
@@ -232,7 +233,7 @@ class _Fit:
         self._latents = [0.25 + 0.5 * self._rand(rows * columns, count) for (rows, columns), count in grids]
         widths = (sizes.inputs, _HIDDEN, _HIDDEN, self._levels.shape[1])
         self._network = []
-        for inputs, outputs in zip(widths, widths[1:], strict=False):
+        for inputs, outputs in itertools.pairwise(widths):
             first = (2.0 * self._rand(inputs, outputs) - 1.0) / math.sqrt(inputs)
             self._network += [first, torch.zeros(outputs, device=device)]
         # It begins at each hour's mean.

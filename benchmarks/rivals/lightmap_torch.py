@@ -6,6 +6,7 @@ the levels that a file would hold, but it writes none. Its feature maps can be o
 paper's ablations (section 11) are made.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -126,7 +127,7 @@ class PlainFit:
         self._uvt = blocks(f.slices, f.uvt) if f.uvt else ()
         self._planes = [map_(f.channels, f.rows, f.columns) for _ in range(2 * (f.channels > 0))]
         widths = (f.inputs, profile.hidden, profile.hidden, 3)
-        self._layers = [layer(*pair) for pair in zip(widths, widths[1:], strict=False)]
+        self._layers = [layer(*pair) for pair in itertools.pairwise(widths)]
         self._fixed: list[torch.Tensor] | None = None
         maps = [*self._uv, *self._uvt, *self._planes]
         net = [value for pair in self._layers for value in pair]

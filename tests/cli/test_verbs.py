@@ -103,17 +103,19 @@ def test_the_first_argument_is_found_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("set", "out.wlm"):
         (tmp_path / name).touch()
-    value = {"-o", "--mask"}
+    options = {"-o": True, "--mask": True, "--resume": False}
     for words, first in (
         (["set", "-o", "out.wlm"], "set"),
         (["-o", "out.wlm", "set"], "set"),
         (["--resume", "set"], "set"),
         (["--steps", "500", "-o", "out.wlm", "set"], "set"),
         (["--mask", "set", "out.wlm"], "out.wlm"),
-        (["absent", "-o", "x"], "absent"),
+        (["absent", "set"], "absent"),
+        (["--resume", "absent"], "absent"),
+        (["--mips", "set", "-o", "out.wlm"], "set"),
         (["--help"], None),
     ):
-        assert first_argument(words, value) == first, words
+        assert first_argument(words, options) == first, words
 
 
 def test_the_file_chooses_the_system(tmp_path):
