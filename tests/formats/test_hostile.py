@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import os
 import struct
@@ -141,8 +142,8 @@ def test_a_name_stays_in_its_folder(tmp_path):
 # YAML.
 
 LETTERS = "abcdefghi"
-BOMB = "".join(f"- &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip(LETTERS, LETTERS[1:], strict=False))
-MERGES = "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in zip(LETTERS, LETTERS[1:], strict=False))
+BOMB = "".join(f"- &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in itertools.pairwise(LETTERS))
+MERGES = "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in itertools.pairwise(LETTERS))
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ Key = Annotated[str | None, typer.Option(help="Array of a probe file that has se
 
 
 def output_option(metavar: str, help_text: str) -> Any:
-    """Makes the option `--output` or `-o`, for `Annotated[Path, output_option(...)]`."""
+    """Makes the option `--output` (`-o`) for an annotated path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)
 
 
