@@ -43,13 +43,14 @@ def stub(package: str, places: Mapping[str, str]) -> str:
     Args:
         package, places: Arguments of `facade`.
     """
-    lines = []
-    for name, module in sorted(places.items(), key=lambda item: (item[1], item[0])):
-        module = module.removesuffix(f".{name}") if module == f"{package}.{name}" else module
-        lines.append(f"from {module} import {name} as {name}")
+    modules = {
+        name: place.removesuffix(f".{name}") if place == f"{package}.{name}" else place
+        for name, place in places.items()
+    }
+    names = sorted(places, key=lambda name: (modules[name], name))
+    lines = [f"from {modules[name]} import {name} as {name}" for name in names]
     version = ["", "__version__: str"] if package == "wlm" else []
-    head = ["# Written by python -m wlm._facade from `_PLACES` of the package.", "# ruff: noqa: I001"]
-    return "\n".join([*head, *lines, *version, ""])
+    return "\n".join(["# Written by python -m wlm._facade from `_PLACES` of the package.", *lines, *version, ""])
 
 
 def packages(root: Path) -> dict[Path, str]:

@@ -1,5 +1,4 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
 from wlm.atlas.data import LightmappedScene as LightmappedScene
 from wlm.atlas.data import Sheet as Sheet
 from wlm.atlas.data import from_arrays as from_arrays

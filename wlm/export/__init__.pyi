@@ -1,5 +1,4 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
 from wlm.export.engines.kit import ENGINES as ENGINES
 from wlm.export.page.pages import make_page as make_page
 from wlm.export.page.pages import write_page as write_page

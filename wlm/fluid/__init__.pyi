@@ -1,5 +1,4 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
 from wlm.fluid.faces import FACES as FACES
 from wlm.fluid.lattice import Domain as Domain
 from wlm.fluid.lattice import Lattice as Lattice

@@ -1,12 +1,11 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
+from wlm.ops import plain as plain
 from wlm.ops.blocks import bc7_blocks as bc7_blocks
 from wlm.ops.blocks import bc7_map as bc7_map
 from wlm.ops.blocks import bc7_texels as bc7_texels
 from wlm.ops.gaussians import gaussian_sum as gaussian_sum
 from wlm.ops.marching import march as march
 from wlm.ops.networks import mlp as mlp
-from wlm.ops import plain as plain
 from wlm.ops.raster import Raster as Raster
 from wlm.ops.raster import interpolate as interpolate
 from wlm.ops.raster import rasterize as rasterize

@@ -1,5 +1,4 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
 from wlm.probe.data import ProbeSet as ProbeSet
 from wlm.probe.data import from_arrays as from_arrays
 from wlm.probe.data import load as load

@@ -1,5 +1,4 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
-# ruff: noqa: I001
 from wlm.smoke.transport.lighting import LitSmoke as LitSmoke
 from wlm.smoke.transport.lighting import fine_march as fine_march
 from wlm.smoke.transport.lighting import light_smoke as light_smoke
