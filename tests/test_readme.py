@@ -31,7 +31,7 @@ def few_steps(monkeypatch) -> None:
 
     def short(self, values, prefix=""):
         settings = override(self, values, prefix)
-        few = {"steps": 12, "samples": 128, "ratio": 0.02, "views": 0}
+        few = {"steps": 12, "samples": 128, "ratio": 0.02, "views": 1}
         known = {name: value for name, value in few.items() if name in type(settings).model_fields}
         return override(settings, known)
 
