@@ -96,7 +96,7 @@ def knot_charts(columns: int, rows: int) -> list[Chart]:
     other = np.cross(along, side)
     angle = np.linspace(0, 2 * np.pi, rows + 1)[:, None, None]
     tube = size * line + radius * (np.cos(angle) * side + np.sin(angle) * other)  # [rows + 1, N + 1, 3]
-    tube = [*np.concatenate([tube[:-1], tube[:1]]), x, y, z]
+    tube = np.concatenate([tube[:-1], tube[:1]]) + [x, y, z]
     tube[:, -1] = tube[:, 0]
     length = size * np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / KNOT_CHARTS
     pieces = (tube[:, i * columns : (i + 1) * columns + 1] for i in range(KNOT_CHARTS))

@@ -110,7 +110,7 @@ def _standing(mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: flo
     root, share = np.sqrt(random.random((_CANDIDATES, 1))), random.random((_CANDIDATES, 1))
     a, b, c = (corner[floor, k] for k in range(3))
     place = (1.0 - root) * a + root * ((1.0 - share) * b + share * c)
-    eye = [*place, 0.0, height, 0.0]
+    eye = place + [0.0, height, 0.0]
     # Headroom: down from the eyes the floor is the first thing, and what is met going up is above them.
     y = 1.0 - (2.0 * np.arange(_RAYS) + 1.0) / _RAYS
     azimuth, radius = np.arange(_RAYS) * _GOLDEN_ANGLE, np.sqrt(1.0 - y * y)
