@@ -75,7 +75,9 @@ def _no_gpu(device: str, has_cuda: bool) -> str:
         return "Dr.Jit finds no CUDA"
     # In a process of its own, which Mitsuba may end where OptiX is missing or too old.
     try:
-        trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE)
+        trial = subprocess.run(
+            [sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE, check=False
+        )
     except subprocess.TimeoutExpired:
         return f"a first image took more than {_PATIENCE:g} s"
     except OSError as error:

@@ -24,8 +24,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
 import torch
+from scipy import sparse
 
 from benchmarks.rivals.atlas_share import budget_bits, read_blocks
 from benchmarks.rivals.rival import Rival

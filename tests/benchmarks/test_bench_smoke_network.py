@@ -7,9 +7,9 @@ import pytest
 import torch
 from builders.bench_rows import by_option, check_command, check_outputs
 
-import benchmarks.path_tracer as path_tracer
 import benchmarks.smoke_network as bench
 import benchmarks.smoke_network_rivals as rivals
+from benchmarks import path_tracer
 from benchmarks.path_tracer import PathTracer, denoise
 from benchmarks.smoke_network import PANELS, plotted, run, run_rows
 from benchmarks.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score

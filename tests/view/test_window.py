@@ -1,5 +1,6 @@
 """The window: every kind of file has a picture that follows its controls, and what has none is said in one line."""
 
+import itertools
 import re
 import sys
 
@@ -456,7 +457,7 @@ def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
         for number in range(4):
             movie.seek(number)
             frames.append(np.asarray(movie.convert("RGB")).astype(int))
-    assert all(np.abs(one - two).max() > 12 for one, two in zip(frames, frames[1:], strict=False))
+    assert all(np.abs(one - two).max() > 12 for one, two in itertools.pairwise(frames))
     with pytest.raises(WlmError, match="ends in .gif or .webp, found .mp4"):
         window.movie(tmp_path / "day.mp4")
 

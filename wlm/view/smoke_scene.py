@@ -117,7 +117,7 @@ class _SixWayScene(Scene):
     frames: Sequence[SixWay]
 
     def __post_init__(self) -> None:
-        self._brightness = _WHITE / max(max(float(frame.lightmaps.max()) for frame in self.frames), 1e-12)
+        self._brightness = _WHITE / max(1e-12, *(float(frame.lightmaps.max()) for frame in self.frames))
 
     def draw(self, canvas: Canvas, state: State) -> None:
         frame, display = self._frame(state), state.display(self._brightness)
