@@ -297,7 +297,7 @@ def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, coun
     near = np.flatnonzero(large[piece])
     joined = piece.copy()
     joined[~large[piece]] = piece[near[cKDTree(middle[near]).query(middle[~large[piece]])[1]]]
-    numbers, result = np.unique(joined, return_inverse=True)
+    _numbers, result = np.unique(joined, return_inverse=True)
     order = np.argsort(-np.bincount(result, counts), kind="stable")
     return np.argsort(order)[result.reshape(-1)]
 

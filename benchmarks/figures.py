@@ -44,7 +44,6 @@ _TABLES: dict[str, dict[str, Figure]] = {
     "Size and error": {
         "bytes": Figure("size", "bytes", _WHOLE),
         "bpp": Figure("size", "bpp", ".3f"),  # bits for each texel and time, or for each probe
-        "gpu_bytes": Figure("on a GPU", "bytes", _WHOLE),
         "disk_bytes": Figure("on disk", "bytes", _WHOLE),
         "disk_bpp": Figure("on disk", "bpp", ".3f"),
         "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade

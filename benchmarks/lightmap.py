@@ -20,7 +20,7 @@ those of views in a full run.
 
 A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
 alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
-memory, `disk_bytes` and `disk_bpp` after lossless compression; what has no random access has the latter alone.
+memory, `disk_bytes` and `disk_bpp` after lossless compression; methods without random access only have the latter.
 """
 
 import functools
@@ -67,7 +67,7 @@ QUICK_PROFILES = ("L", "M", "M-paper")
 """Profiles of a quick run."""
 
 PANELS = (Panel("decode_ms"), Panel("bpp"), Panel("disk_bpp"))
-"""What a plot of the rows shows: quality against time and size."""
+"""Panels of a plot of the rows: quality against time and size."""
 
 # A quick fit is worth this many steps of one tile, however many tiles there are: under a minute on two CPU cores.
 _QUICK_TILE_STEPS = 8_000
@@ -170,7 +170,7 @@ def run_rows(
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
-    """Indices of the three hours, or of three times spread evenly."""
+    """Returns the indices of the three hours, or of three times spread evenly."""
     if np.isin(_QUICK_HOURS, times).all():
         return np.searchsorted(times, _QUICK_HOURS)
     return np.unique(np.linspace(0, len(times) - 1, 3).round().astype(int))
@@ -181,14 +181,14 @@ def _hours(times: Sequence[float]) -> str:
 
 
 def _repeated(model: SheetModel, count: int) -> SheetModel:
-    """The model of a map that holds the tiles of this one several times over."""
+    """Returns a model with the tiles of this one several times over."""
     arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     width, height = TILE * len(model.kind), TILE * count
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
 
 
 def _load_ms(model: SheetModel) -> float | None:
-    """The median time to unpack one tile of the file on the CPU, milliseconds; None without a packed tile."""
+    """Returns the median time to unpack one tile of the file on the CPU, milliseconds; None without a packed tile."""
     numbers = np.flatnonzero(tile_sizes(model)).tolist()
     if not numbers:
         return None
@@ -238,7 +238,7 @@ class _LightmapBench(Bench):
         return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """What a profile costs and yields; and its decode, to be timed."""
+        """Returns the row of a profile, and its decode, which is timed later."""
         self.note(f"{fit.option}: scoring")
         model = fit.model.light
         decoder = SheetDecoder(model, self.device)
@@ -266,7 +266,7 @@ class _LightmapBench(Bench):
         return row, self._decode(self._decoders(model, "fast", None))
 
     def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """What a renderer samples of a profile: one texture of the map, with mips."""
+        """Returns the row of the texture that a renderer samples, with mips, and its decode."""
         self.note(f"{fit.option}: texture")
         decoder = MapDecoder(fit.model.light, self.device)
 
@@ -285,7 +285,7 @@ class _LightmapBench(Bench):
         return row, self.replay(decoder.decode)
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
-        """One way to decode a profile to 8 bits."""
+        """Returns the row of one way to decode a profile to 8 bits, and the decode."""
         self.note(f"{fit.option}: {path} decode with {gelu} GELU")
         model = fit.model.light
         decoders = self._decoders(model, path, gelu)
@@ -311,7 +311,7 @@ class _LightmapBench(Bench):
         return row, self._decode(self._decoders(timed, path, gelu))
 
     def rival_row(self, name: str) -> Row:
-        """A rival on the same lightmaps."""
+        """Returns the row of a rival on the same lightmaps."""
         method = RIVALS[name]
         self.note(method.label)
         try:
@@ -335,7 +335,7 @@ class _LightmapBench(Bench):
         return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
 
     def fit_row(self, fit: Fit) -> Row:
-        """The speed of a fit."""
+        """Returns the row of the speed of a fit."""
         profile = fit.model.profile
         return self.row(
             "fit",
@@ -349,7 +349,7 @@ class _LightmapBench(Bench):
         )
 
     def plain_rows(self, fit: Fit) -> list[Row]:
-        """Some steps of the same fit in plain torch; none where no tile is dynamic."""
+        """Returns the row of some steps of the same fit in plain torch; no row if no tile is dynamic."""
         # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
         plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
         profile = fit.model.profile.model_copy(update=plain)
@@ -393,13 +393,13 @@ class _LightmapBench(Bench):
         decode: Callable[[float], np.ndarray] | None = None,
         views: int = VIEWS,
     ) -> dict[str, float]:
-        """The figures of lightmaps at the chosen times and, with a decoder of any time, of how they are seen."""
+        """Computes the figures of lightmaps at the chosen times, with a decoder also those of `view_scores`."""
         tally = None if decode is None else self._tally(name, decode, views)
         pairs = zip(self.chosen.tolist(), frames, strict=True)
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
 
     def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
-        """The scores of `wlm.lightmap.view_scores`, to be filled."""
+        """Makes the collector of the scores of `wlm.lightmap.view_scores`."""
         whole = len(self.chosen) == len(self.lightmaps.times)
         seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
         for warning in warnings:
@@ -416,7 +416,7 @@ class _LightmapBench(Bench):
         return scores
 
     def _figures(self, frames: Sequence[FrameMetrics], tally: Tally | None) -> dict[str, float]:
-        """PSNR, SSIM and FLIP, at how many times, and how the lightmaps are seen."""
+        """Returns PSNR, SSIM and FLIP, the number of times, and the figures of `view_scores`."""
         summary = summarise(frames)
         figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
         if tally is None:
@@ -427,7 +427,7 @@ class _LightmapBench(Bench):
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
     def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
-        """Decoders of the tiles with maps; a constant tile needs no launch."""
+        """Makes decoders of the tiles with maps; a constant tile needs no launch."""
         decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
@@ -451,7 +451,7 @@ class _LightmapBench(Bench):
     def _tiles_8bit(
         self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float, compare: bool
     ) -> tuple[np.ndarray, float]:
-        """Radiance of all tiles through 8 bits, and the largest error of a byte over 255 if it is to be compared."""
+        """Returns the radiance of all tiles through 8 bits, and the largest error of a byte / 255 if `compare`."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))
         worst = 0.0
         for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():

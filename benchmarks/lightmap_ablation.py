@@ -98,7 +98,7 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Fits the variants of a profile, whose own sizes of maps don't count, to a set; the rest as for `run`."""
+    """Fits the variants of a profile, without the sizes of its maps, to a set; other arguments as for `run`."""
     names = _check(only)
     bench = _AblationBench(lightmaps, profile, device, progress)
     rows = []
@@ -135,7 +135,7 @@ class _AblationBench(Bench):
         self._held = assemble(tiles, targets.number, self._grid)[..., 0]
 
     def variant_row(self, name: str) -> Row:
-        """What feature maps are worth."""
+        """Returns the row of a variant of the feature maps."""
         axis = TimeAxis(self._lightmaps.times, self._lightmaps.period, self._profile.time_axis)
         try:
             fit = PlainFit(self._profile, axis, self._targets, VARIANTS[name], seed=_SEED, device=self.device)
@@ -151,7 +151,7 @@ class _AblationBench(Bench):
         return self._row(name, "in plain torch", fit.tile_bytes * len(tiles), frames, seconds)
 
     def kernels_row(self) -> Row:
-        """The profile as it is shipped."""
+        """Returns the row of the profile as shipped."""
         profile, tiles = self._profile, sorted(self._targets.number.tolist())
         compress(self._set, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
         start = time.perf_counter()

@@ -212,9 +212,8 @@ class ProbeBench(Bench):
             probes=report.live,
             gaussians=model.content.count,
             dropped=model.content.dropped,
-            gpu_bytes=model.content.nbytes,
             irradiance_psnr=report.irradiance_psnr,
-            **_size_and_psnr(report),
+            **_size_and_psnr(report, model.content.nbytes),
             **errors,
         )
         return row, self.replay(lambda: decoder.run(points))
@@ -234,8 +233,7 @@ class ProbeBench(Bench):
             encode_seconds=fit.seconds,
             probes=report.live,
             irradiance_psnr=report.irradiance_psnr,
-            gpu_bytes=fit.model.content.nbytes,
-            **_size_and_psnr(report),
+            **_size_and_psnr(report, fit.model.content.nbytes),
         )
         return row, self.replay(reader.run)
 
@@ -248,7 +246,7 @@ class ProbeBench(Bench):
             "held out",
             fit.option,
             "PSNR at every fifth probe of a file of the others; beside it that of the uncompressed others",
-            bytes=held.bytes,
+            disk_bytes=held.bytes,
             probes=held.probes,
             psnr=held.psnr,
             nearest_psnr=held.nearest,
@@ -361,7 +359,7 @@ class ProbeBench(Bench):
             f"{rival.option}; on the CPU",
             encode_seconds=rival.encode_seconds,
             decode_ms=1e3 * rival.decode_seconds if self.device == "cpu" else None,
-            **_size_and_psnr(report),
+            **_size_and_psnr(report, report.bytes),
         )
 
     def _decode(
@@ -383,9 +381,10 @@ class ProbeBench(Bench):
         return 0 if self.probes.live.all() else len(zstd.compress(np.packbits(~self.probes.live).tobytes()))
 
 
-def _size_and_psnr(report: Report) -> dict[str, float]:
-    names = {"bytes": "bytes", "bpp": "bits_per_probe", "share_of_float32": "ratio", "psnr": "psnr"}
-    return {name: getattr(report, attribute) for name, attribute in names.items()}
+def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:
+    """Sizes on a GPU, where a rival's is that of its payload, on a disk, and the error."""
+    sizes = {"bytes": gpu_bytes, "bpp": 8 * gpu_bytes / report.probes, "disk_bytes": report.bytes}
+    return sizes | {"share_of_float32": gpu_bytes / (4 * report.probes * report.outputs), "psnr": report.psnr}
 
 
 def _in_given_order(points: Points) -> None:

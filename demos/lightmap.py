@@ -75,7 +75,7 @@ def run(out: Path, device: str) -> dict[str, float]:
 
 
 def _half_bytes(lightmaps: LightmapSet) -> int:
-    """Bytes of the input as half-float RGB."""
+    """Returns the bytes of the input as half-float RGB."""
     return lightmaps.light.frames.size * 2
 
 

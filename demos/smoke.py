@@ -10,6 +10,7 @@ PNGs and a contact sheet, the plume a flip book too.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -93,7 +94,7 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
     write_sequence(out / f"{name}_frames", drawn)
     rows = {"lit": drawn} | {key: [each[key] for each in maps] for key in maps[0]}
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):g} s" for number in frames.numbers])
-    if not all(later > earlier > 0 for earlier, later in zip(amounts, amounts[1:], strict=False)):
+    if not all(later > earlier > 0 for earlier, later in itertools.pairwise(amounts)):
         raise WlmError(f"demo: {name}: expected smoke that only grows, got {amounts}")
     if not LEAST_COVERAGE <= coverage[-1] <= MOST_COVERAGE:
         raise WlmError(f"demo: {name}: expected {LEAST_COVERAGE} to {MOST_COVERAGE} covered, got {coverage[-1]:.3g}")

@@ -13,7 +13,8 @@ FLOORS = (
     GROUND.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
-    ["wlm.bake", "wlm.export", "wlm.inspection", "wlm.view"],
+    ["wlm.inspection"],
+    ["wlm.bake", "wlm.export", "wlm.view"],
     ["wlm.cli"],
     ["wlm.__main__"],
     ["benchmarks"],
@@ -23,7 +24,7 @@ FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 def room_of(module: str) -> str:
     """`wlm.probe` of `wlm.probe.fit`; the kernels and the benchmarks are one room each."""
-    root = module.split(".")[0]
+    root = module.split(".", maxsplit=1)[0]
     return root if root != "wlm" else ".".join(module.split(".")[:2])
 
 

@@ -1,4 +1,4 @@
-"""README: its size, its links, and every code block of it, run as written in a folder of its own."""
+"""README: its size, its links, and all of its snippets and commands, run as written in a temporary folder."""
 
 import re
 import shlex
@@ -13,25 +13,25 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PYTHON = re.findall(r"```python\n(.*?)```", README, re.S)
 COMMANDS = re.findall(r"^    (wlm .*?)(?: +#.*)?$", README, re.M)
-SLOW = ("wlm smoke simulate", "wlm smoke predict")  # which reads what simulate wrote
+SLOW = ("wlm smoke simulate", "wlm smoke predict")  # predict reads the output of simulate
 MOST_BYTES = 7168
 
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch) -> None:
-    """The current folder is one where the repository's demos are, and all that is written goes elsewhere."""
+    """Changes to a temporary folder with a link to the repository's demos."""
     (tmp_path / "demos").symlink_to(ROOT / "demos")
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
 def few_steps(monkeypatch) -> None:
-    """Fits of a moment, by whatever words they are asked for."""
+    """Shortens every fit to some steps."""
     override = Settings.override
 
     def short(self, values, prefix=""):
         settings = override(self, values, prefix)
-        few = {"steps": 12, "samples": 128, "ratio": 0.02, "views": 0}
+        few = {"steps": 12, "samples": 128, "ratio": 0.02, "views": 1}
         known = {name: value for name, value in few.items() if name in type(settings).model_fields}
         return override(settings, known)
 

@@ -10,13 +10,13 @@ _ESCAPES[ord("\t")] = " "
 
 
 def printable(text: str) -> str:
-    """Escapes what a terminal would obey, and halves of characters: names come from files, and files from strangers.
+    r"""Escapes what a terminal would obey, and halves of characters: names come from files, and files from strangers.
 
     Args:
         text: One line.
 
     Returns:
-        The text with `\\x1b` in place of an escape character, for example.
+        The text with `\x1b` in place of an escape character, for example.
     """
     return text.translate(_ESCAPES).encode("utf-8", "backslashreplace").decode()
 

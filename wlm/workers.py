@@ -182,7 +182,7 @@ class Processes(Workers):
         command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         try:
-            errors = tempfile.TemporaryFile()
+            errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed with its process)
             process = subprocess.Popen(command, stderr=errors, env=environment, **pipes, **group)
         except OSError as error:
             raise WlmError(f"workers: cannot start process {number}: {error.strerror or error}") from error

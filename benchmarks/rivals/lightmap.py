@@ -45,7 +45,7 @@ class Method:
 
     @property
     def label(self) -> str:
-        """Title and option."""
+        """Returns title and option."""
         return f"{self.title} {self.option}".strip()
 
 
@@ -92,7 +92,7 @@ _FEW_FITTED = ("ntc-medium",)
 
 
 def usual(device: str, quick: bool = False) -> tuple[str, ...]:
-    """The methods of a run that names none: on a CPU without those that are fitted, which takes hours there.
+    """Returns the default methods of a run: on a CPU without fitted ones, which take hours there.
 
     Args:
         device: "cpu", "cuda" or "cuda:N".
@@ -103,7 +103,7 @@ def usual(device: str, quick: bool = False) -> tuple[str, ...]:
 
 
 def check_rival(name: str) -> None:
-    """Raises a `WlmError` where `RIVALS` has no method of this name."""
+    """Raises a `WlmError` if `RIVALS` has no method of this name."""
     if name not in RIVALS:
         raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
 
@@ -116,7 +116,7 @@ def encode_set(
     *,
     device: str = "cpu",
 ) -> tuple[Rival, list[_Scored]]:
-    """Puts a set through a method.
+    """Encodes and decodes a set with a method.
 
     Args:
         name: A key of `RIVALS`.

@@ -33,7 +33,7 @@ _ASTC_PROFILES = ("best", "ldr", "hdr")
 
 
 def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss: float = 0.0) -> Rival:
-    """BC6H, unsigned, 8 bits a texel, with Intel's ISPC texture compressor.
+    """Encodes as BC6H, unsigned, 8 bits a texel, with Intel's ISPC texture compressor.
 
     Args:
         frame, mask: The lightmap.
@@ -66,7 +66,7 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss
 
 
 def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss: float = 0.0) -> Rival:
-    """BC7 with gamma 2.2 and the range of each tile; 8 bits a texel and 12 bytes a tile.
+    """Encodes as BC7 with gamma 2.2 and the range of each tile; 8 bits a texel and 12 bytes a tile.
 
     Args:
         frame, mask: The lightmap.
@@ -106,7 +106,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, profile: str = "slow", loss:
 def encode_astc(
     frame: np.ndarray, mask: np.ndarray, block: int = 12, quality: float = ASTC_THOROUGH, profile: str = "best"
 ) -> Rival:
-    """ASTC in square blocks of 16 bytes, with astcenc: from 8 bits a texel at 4x4 to 0.89 at 12x12.
+    """Encodes as ASTC in square blocks of 16 bytes, with astcenc: from 8 bits a texel at 4x4 to 0.89 at 12x12.
 
     LDR holds levels with gamma 2.2 and the range of each tile, as BC7 does, but reads them at 16 bits; HDR holds the
     radiance. A tile's range may change within a block where the block's side divides no tile, which costs less than
@@ -135,7 +135,7 @@ def encode_astc(
 
 
 def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
-    """Three bytes a texel with gamma 2.2 and the range of each tile: about BC7's upper bound."""
+    """Encodes as three bytes a texel with gamma 2.2 and the range of each tile: about BC7's upper bound."""
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, 1)
     rival = measure(
@@ -184,7 +184,7 @@ def _with_loss(name: str, loss: float) -> str:
 
 
 def _weight(mask: np.ndarray) -> np.ndarray:
-    """What a squared error counts, float32 [H, W, 3] padded to blocks: some bilinear reads reach the ring."""
+    """Returns the weight of squared errors, float32 [H, W, 3] padded to blocks: some bilinear reads reach the ring."""
     valid = np.asarray(mask).astype(bool)
     weight = np.where(valid, 1.0, np.where(seen_texels(valid, ring=1), _RING_WEIGHT, 0.0)).astype(np.float32)
     height, width = valid.shape
@@ -193,7 +193,7 @@ def _weight(mask: np.ndarray) -> np.ndarray:
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:
-    """Levels [H, W, 3] of a lightmap for blocks of this side, and the ranges that they are relative to."""
+    """Returns levels [H, W, 3] of a lightmap for blocks of this side, and the ranges that they are relative to."""
     codes, seen = to_codes(image), seen_texels(mask)
     ranges = TileRanges.of(codes, seen)
     return clear_unseen(ranges.levels(codes), seen, block), ranges
@@ -210,7 +210,7 @@ def _pad(image: np.ndarray) -> np.ndarray:
 
 
 def _cropped(rival: Rival, image: np.ndarray) -> Rival:
-    """Without the padding of blocks."""
+    """Removes the padding of blocks."""
     height, width = image.shape[:2]
     decoded = np.ascontiguousarray(rival.decoded[:height, :width], dtype=np.float32)
     return replace(rival, decoded=decoded, size=(height, width))

@@ -1,4 +1,4 @@
-"""What every rival of a lightmap does before it encodes: gaps filled, a gamma, and levels relative to a tile's range.
+"""Preparation of lightmaps for rivals: gaps filled, a gamma, and levels relative to the range of a tile.
 
 A lightmap is float32 [H, W, 3] in linear RGB. Its codes are radiance ^ (1 / 2.2), and its levels are the codes in
 [0, 1] between the least and the greatest of their tile and channel, as ours has a scale per tile. These two are half
@@ -47,13 +47,13 @@ def prepare(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def seen_texels(mask: np.ndarray, ring: int = 2) -> np.ndarray:
-    """Says which texels can be seen, bool [H, W]: the valid ones and a ring of this many round them."""
+    """Returns the texels that can be seen, bool [H, W]: the valid ones and a ring of this many around them."""
     side = 2 * ring + 1
     return binary_dilation(np.asarray(mask).astype(bool), np.ones((side, side), bool))
 
 
 def clear_unseen(image: np.ndarray, seen: np.ndarray, block: int) -> np.ndarray:
-    """Makes the blocks that nobody sees black, [H, W, C]: those cost next to nothing on disk.
+    """Makes blocks without a texel that can be seen black, [H, W, C]; they take few bytes on disk.
 
     Args:
         image: [H, W, C].
@@ -76,7 +76,7 @@ class TileRanges:
 
     @classmethod
     def of(cls, codes: np.ndarray, seen: np.ndarray, by_channel: bool = True) -> "TileRanges":
-        """Takes them over the texels that are seen; 0 and 0 for a tile without one.
+        """Computes the ranges over the texels that are seen; 0 and 0 for a tile without one.
 
         Args:
             codes: float32 [..., H, W, 3], finite.
@@ -98,37 +98,37 @@ class TileRanges:
 
     @classmethod
     def over_times(cls, codes: np.ndarray, seen: np.ndarray, by_channel: bool = True) -> "TileRanges":
-        """The same over all times of codes [T, H, W, 3]: [rows, columns, 3]."""
+        """Computes the ranges over all times of codes [T, H, W, 3]: [rows, columns, 3]."""
         ends = cls.of(np.stack([codes.min(axis=0), codes.max(axis=0)]), seen, by_channel)
         return cls(ends.low[0], ends.high[1])
 
     def tobytes(self) -> bytes:
-        """What a decoder needs of them."""
+        """Returns the bytes that a decoder needs."""
         return self.low.tobytes() + self.high.tobytes()
 
     def levels(self, codes: np.ndarray) -> np.ndarray:
-        """Codes [..., H, W, 3] to levels in [0, 1]; 0 where a range is."""
+        """Converts codes [..., H, W, 3] to levels in [0, 1]; 0 where the range is 0."""
         low, _ = self._spread(*codes.shape[-3:-1])
         return np.clip((codes - low) / self.span(*codes.shape[-3:-1]), 0.0, 1.0)
 
     def span(self, height: int, width: int) -> np.ndarray:
-        """The greatest less the least over their texels, float32 [..., H, W, 3]; 1 where they are equal."""
+        """Returns the greatest less the least over their texels, float32 [..., H, W, 3]; 1 where they are equal."""
         low, high = self._spread(height, width)
         return np.where(high > low, high - low, np.float32(1.0))
 
     def radiance(self, levels: np.ndarray) -> np.ndarray:
-        """Levels [..., H, W, 3], clipped to [0, 1], to radiance, float32."""
+        """Converts levels [..., H, W, 3], clipped to [0, 1], to radiance, float32."""
         low, high = self._spread(*levels.shape[-3:-1])
         codes = np.clip(levels, np.float32(0.0), np.float32(1.0)) * (high - low) + low
         return np.minimum(codes**GAMMA, HALF_MAX).astype(np.float32)
 
     def _spread(self, height: int, width: int) -> list[np.ndarray]:
-        """Both over their texels, float32 [..., H, W, 3]."""
+        """Returns both over their texels, float32 [..., H, W, 3]."""
         return [_over_texels(values.astype(np.float32), TILE, height, width) for values in (self.low, self.high)]
 
 
 def to_codes(image: np.ndarray) -> np.ndarray:
-    """Radiance to codes, float32."""
+    """Converts radiance to codes, float32."""
     return np.power(image, np.float32(1.0 / GAMMA), dtype=np.float32)
 
 

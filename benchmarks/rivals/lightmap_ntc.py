@@ -17,6 +17,7 @@ weighted half-way to what PSNR measures, as ours are, and the ring round charts 
 what these choices are worth. It needs torch alone; a GPU fits it in minutes, a CPU in hours.
 """
 
+import itertools
 import lzma
 import math
 from collections.abc import Iterator
@@ -64,12 +65,12 @@ class Latents:
 
     @property
     def bits(self) -> float:
-        """Bits of latents for each texel."""
+        """Returns the bits of latents for each texel."""
         return self.fine * _FINE_BITS / self.fine_step**2 + self.coarse * _COARSE_BITS / self.coarse_step**2
 
     @property
     def inputs(self) -> int:
-        """Inputs of the network."""
+        """Returns the number of inputs of the network."""
         return 4 * self.fine + self.coarse + 4 * len(_TURNS)
 
 
@@ -84,7 +85,7 @@ LADDER = {
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """What one network is for.
+    """The part of the map that one network covers.
 
     Attributes:
         area: Its place in the map.
@@ -110,7 +111,7 @@ def encode_ntc(
     seed: int = 0,
     device: str = "cpu",
 ) -> Rival:
-    """Latents and a network for all lightmaps of a set.
+    """Encodes all lightmaps of a set as latents and a network.
 
     Args:
         frames: [T, H, W, 3], linear RGB.
@@ -166,7 +167,7 @@ def encode_ntc(
 
 
 def _weight(images: np.ndarray, codes: np.ndarray, ranges: TileRanges, mask: np.ndarray) -> np.ndarray:
-    """What a squared error of a level counts, float32 [T, H, W, 3]; the mean is of no matter."""
+    """Returns the weight of squared errors of levels, float32 [T, H, W, 3], up to a factor."""
     height, width = mask.shape
     valid = np.asarray(mask).astype(bool)
     # PSNR is relative to a tile's range of radiance at that hour, over its valid texels.
@@ -184,7 +185,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 class _Places:
-    """Where the N texels of a region that are seen read the grids; rows and columns are the region's."""
+    """Places at which the N seen texels of a region read the grids, in rows and columns of the region."""
 
     def __init__(self, inside: np.ndarray, sizes: Latents, device: str) -> None:
         self.texels = np.nonzero(inside)
@@ -196,7 +197,7 @@ class _Places:
         self.fine, self.coarse = (torch.from_numpy(a).to(device) for a in (self.fine, self.coarse))
 
     def _nodes(self, shape: tuple[int, int], step: int) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-        """Rows and columns of a grid, numbers of each texel's nodes [N, 4] and their bilinear shares [N, 4]."""
+        """Returns rows and columns of a grid, numbers of each texel's nodes [N, 4] and their bilinear shares [N, 4]."""
         rows, columns = (-(-size // step) + 1 for size in shape)
         at = [(i + 0.5) / step for i in self.texels]
         (y, x), (fy, fx) = ([part(a) for a in at] for part in (lambda a: a.astype(np.int64), lambda a: a % 1.0))
@@ -232,7 +233,7 @@ class _Fit:
         self._latents = [0.25 + 0.5 * self._rand(rows * columns, count) for (rows, columns), count in grids]
         widths = (sizes.inputs, _HIDDEN, _HIDDEN, self._levels.shape[1])
         self._network = []
-        for inputs, outputs in zip(widths, widths[1:], strict=False):
+        for inputs, outputs in itertools.pairwise(widths):
             first = (2.0 * self._rand(inputs, outputs) - 1.0) / math.sqrt(inputs)
             self._network += [first, torch.zeros(outputs, device=device)]
         # It begins at each hour's mean.
@@ -299,7 +300,7 @@ def _answer(
     chosen: torch.Tensor,
     random: torch.Generator | None,
 ) -> torch.Tensor:
-    """Levels [B, 3 T] of some texels [B], from latents [nodes, count] in [0, 1]; with noise if there is a generator."""
+    """Computes levels [B, 3 T] of texels [B] of latents [nodes, count] in [0, 1], noisy if a generator is given."""
 
     def read(latents: torch.Tensor, nodes: torch.Tensor, top: int) -> torch.Tensor:
         values = functional.embedding(nodes[chosen], latents)  # [B, 4, count]
@@ -318,7 +319,7 @@ def _answer(
 
 @torch.no_grad()
 def _decode(region: _Region, sizes: Latents, device: str) -> np.ndarray:
-    """Levels of the N texels that are seen, float32 [T, N, 3]."""
+    """Decodes levels of the N texels that are seen, float32 [T, N, 3]."""
     places = _Places(region.inside, sizes, device)
     grids = zip((region.fine, region.coarse), _TOPS, strict=True)
     latents = [torch.from_numpy(a.reshape(-1, a.shape[-1])).to(device).float() / top for a, top in grids]
@@ -329,7 +330,7 @@ def _decode(region: _Region, sizes: Latents, device: str) -> np.ndarray:
 
 
 def _stored(ranges: TileRanges, regions: list[_Region]) -> bytes:
-    """What a GPU holds: latents with their bits, networks and ranges."""
+    """Returns the bytes that a GPU stores: latents with their bits, networks and ranges."""
     parts = [ranges.tobytes()]
     for region in regions:
         parts += [_nibbles(region.fine), region.coarse.tobytes(), *(values.tobytes() for values in region.network)]
@@ -337,13 +338,13 @@ def _stored(ranges: TileRanges, regions: list[_Region]) -> bytes:
 
 
 def _nibbles(levels: np.ndarray) -> bytes:
-    """Levels below 16, two a byte."""
+    """Packs levels below 16, two in a byte."""
     flat = np.append(levels.ravel(), np.zeros(levels.size % 2, np.uint8))
     return (flat[::2] | flat[1::2] << 4).tobytes()
 
 
 def _disk_bytes(ranges: TileRanges, regions: list[_Region]) -> int:
-    """Size under LZMA, the latents plane by plane and a byte each: that is smaller than two a byte."""
+    """Returns the size under LZMA with a byte for each latent, plane by plane, which is smaller than two in a byte."""
     rest = [ranges.tobytes(), *(values.tobytes() for region in regions for values in region.network)]
     planes = [np.moveaxis(grid, -1, 0).tobytes() for region in regions for grid in (region.fine, region.coarse)]
     packed = sum(len(lzma.compress(part)) for part in (*planes, b"".join(rest)))

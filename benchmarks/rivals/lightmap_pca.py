@@ -31,7 +31,7 @@ _MOST_LEVELS = 255  # of a map in bytes
 
 @dataclass(frozen=True, eq=False)
 class _Tile:
-    """One tile's texels that are seen, and its axes.
+    """The seen texels of a tile, and its axes.
 
     Attributes:
         area: Its place in the map.
@@ -49,7 +49,7 @@ class _Tile:
 
 
 def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) -> Rival:
-    """K coefficients a texel as BC4 textures, whose 256 levels span the map's range in the tile.
+    """Encodes K coefficients per texel as BC4 textures, whose 256 levels span the map's range in the tile.
 
     Args:
         frames, mask: The lightmaps.
@@ -85,7 +85,7 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
 
 
 def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Rival:
-    """Coefficients rounded to a step; maps beyond the last that isn't all zero are left out.
+    """Encodes coefficients rounded to a step, without the maps that are all zero.
 
     Args:
         frames, mask: The lightmaps.
@@ -106,7 +106,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
         return _decode(read, ranges, images.shape)
 
     def size(payload: tuple) -> int:
-        """On a GPU: a byte a texel and map."""
+        """Returns the bytes on a GPU: one for each texel and map."""
         ranges, tiles = payload
         texels = sum(tile.inside.size * planes.shape[1] for tile, planes, _ in tiles)
         rest = sum(len(_basis(tile, planes.shape[1])) + scale.nbytes for tile, planes, scale in tiles)
@@ -122,7 +122,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
 
 
 def _tiles(images: np.ndarray, mask: np.ndarray) -> tuple[TileRanges, list[_Tile]]:
-    """The ranges, and the axes of every tile with a texel that is seen."""
+    """Computes the ranges, and the axes of every tile with a texel that is seen."""
     seen = seen_texels(mask)
     codes = to_codes(images)
     ranges = TileRanges.over_times(codes, seen)
@@ -143,7 +143,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 def _principal(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean half [D], axes half [D, D] and coefficients float32 [N, D] of vectors [N, D]."""
+    """Computes mean half [D], axes half [D, D] and coefficients float32 [N, D] of vectors [N, D]."""
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float16)
     centred = vectors - mean.astype(np.float32)
     _, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred)
@@ -156,7 +156,7 @@ def _basis(tile: _Tile, components: int) -> bytes:
 
 
 def _rounded(tile: _Tile, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bytes [N, K] of the coefficients that don't vanish, and float32 [K, 2]: where each begins, and its step."""
+    """Returns bytes [N, K] of the coefficients that are not 0, and float32 [K, 2]: least value and step of each."""
     span = np.ptp(tile.coefficients, axis=0)
     steps = np.maximum(np.float32(step), span / np.float32(_MOST_LEVELS - 1))
     whole = np.rint(tile.coefficients / steps)
@@ -171,14 +171,14 @@ def _lossless(plane: np.ndarray, tile: _Tile) -> bytes:
 
 
 def _over_tile(values: np.ndarray, tile: _Tile) -> np.ndarray:
-    """A map [h, w] of the values [N] of the texels seen; the others have the nearest one's."""
+    """Returns a map [h, w] of the values [N] of the seen texels; other texels take the nearest value."""
     texels = np.zeros(tile.inside.shape, values.dtype)
     texels[tile.inside] = values
     return fill_gaps(texels[..., None], tile.inside)[..., 0]
 
 
 def _bc4(plane: np.ndarray, tile: _Tile) -> tuple[bytes, np.ndarray]:
-    """A map [N] as blocks, and float32 [2]: its least value and its range."""
+    """Encodes a map [N] as blocks and float32 [2], its least value and its range."""
     least = plane.min()
     span = plane.max() - least
     texels = _over_tile(np.rint((plane - least) / (span or 1.0) * 255.0).astype(np.uint8), tile)
@@ -201,7 +201,7 @@ def _decode(
     ranges: TileRanges,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Lightmaps [T, H, W, 3] from coefficients [N, K] a tile; black where no texel is seen."""
+    """Decodes lightmaps [T, H, W, 3] from coefficients [N, K] of each tile; black where no texel is seen."""
     levels = np.zeros(shape, np.float32)
     for tile, coefficients in tiles:
         axes = tile.axes[: coefficients.shape[1]].astype(np.float32)

@@ -6,6 +6,7 @@ the levels that a file would hold, but it writes none. Its feature maps can be o
 paper's ablations (section 11) are made.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -51,18 +52,18 @@ class Features:
 
     @classmethod
     def of(cls, profile: Profile) -> "Features":
-        """Those of a profile: the hybrid of eq. 5."""
+        """Returns the maps of a profile: the hybrid of eq. 5."""
         sizes = {"columns": profile.plane_columns, "rows": profile.plane_rows}
         return cls(uvt=profile.uvt_resolution, slices=profile.uvt_slices, **sizes)
 
     @property
     def inputs(self) -> int:
-        """Inputs of the network, with the encoded time."""
+        """Returns the number of inputs of the network, with the encoded time."""
         return 4 * (self.uv + (self.uvt > 0)) + 2 * self.channels + _ENCODED
 
     @property
     def bytes(self) -> int:
-        """Of the maps of a tile."""
+        """Returns the bytes of the maps of a tile."""
         planes = 2 * self.channels * self.columns * self.rows
         return self.uv * TILE * TILE + self.slices * self.uvt**2 + planes
 
@@ -126,7 +127,7 @@ class PlainFit:
         self._uvt = blocks(f.slices, f.uvt) if f.uvt else ()
         self._planes = [map_(f.channels, f.rows, f.columns) for _ in range(2 * (f.channels > 0))]
         widths = (f.inputs, profile.hidden, profile.hidden, 3)
-        self._layers = [layer(*pair) for pair in zip(widths, widths[1:], strict=False)]
+        self._layers = [layer(*pair) for pair in itertools.pairwise(widths)]
         self._fixed: list[torch.Tensor] | None = None
         maps = [*self._uv, *self._uvt, *self._planes]
         net = [value for pair in self._layers for value in pair]
@@ -173,7 +174,7 @@ class PlainFit:
 
     @torch.no_grad()
     def decode(self) -> np.ndarray:
-        """Radiance at the stored times from what a file would hold, float32 [N, T, 128, 128, 3]."""
+        """Decodes radiance at the stored times from the levels of a file, float32 [N, T, 128, 128, 3]."""
         maps = self._stored() if self._fixed is None else self._fixed
         layers = [(w.half().float(), b.half().float()) for w, b in self._layers]
         n, times = self._colour.shape[:2]
@@ -187,7 +188,7 @@ class PlainFit:
         return result
 
     def _maps(self, quantised: bool) -> list[torch.Tensor]:
-        """Texels of F_uv [N, M, 128, 128, 4], F_uvt [N, S, R, R, 4], F_ut and F_vt [N, C, rows, columns]."""
+        """Returns texels of F_uv [N, M, 128, 128, 4], F_uvt [N, S, R, R, 4], F_ut and F_vt [N, C, rows, columns]."""
 
         def levels(values):
             used = values.clamp(0.0, 1.0)
@@ -200,7 +201,7 @@ class PlainFit:
 
     @torch.no_grad()
     def _stored(self) -> list[torch.Tensor]:
-        """The same as a file would hold them."""
+        """Returns the same on the levels of a file."""
         maps = self._maps(quantised=True)
         count = len(maps) - len(self._planes)
         if self._features.blocks:
@@ -238,7 +239,7 @@ class PlainFit:
 
 
 def through_bc7(texels: torch.Tensor) -> torch.Tensor:
-    """Maps in [0, 1], [..., H, W, 4], as a BC7 encoder of all modes leaves them; H and W are multiples of 4.
+    """Encodes and decodes maps in [0, 1], [..., H, W, 4], with a BC7 encoder of all modes; H and W are multiples of 4.
 
     Raises:
         WlmError: A package of the extra `baselines` is missing.

@@ -10,7 +10,7 @@ from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, MIXED, random_model, shared_model
 
 from wlm.atlas import colour
-from wlm.atlas.bundles import bundle
+from wlm.atlas.bundle import bundle
 from wlm.atlas.data import from_arrays
 from wlm.atlas.shader import glsl
 from wlm.errors import WlmError

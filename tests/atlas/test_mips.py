@@ -84,7 +84,7 @@ def test_the_bits_are_counted_and_the_file_keeps_them(pair, tmp_path):
     assert 0.28 < 1.0 - model.compression_ratio <= 0.3
     model.save(tmp_path / "a.wlm")
     np.testing.assert_array_equal(wlm.load(tmp_path / "a.wlm").tail, model.tail)
-    tail = wlm.atlas.bundle(model).textures["tail"]
+    tail = model.bundle().textures["tail"]
     assert (tail.width, tail.height, tail.mips, tail.fmt) == (24, 16, 4, "BC6H_UF16")
     np.testing.assert_array_equal(tail.data, model.tail)
     for text, there in ((glsl(model), True), (glsl(bare), False)):
@@ -139,7 +139,7 @@ def test_mips_of_other_methods(kind, device):
     if new is not None:
         with pytest.raises(ValueError, match="own: expected the sheet's own UVs"):
             decoder.read(new, lod=lod)
-    tail = wlm.atlas.bundle(model).textures["tail"]
+    tail = model.bundle().textures["tail"]
     assert (tail.width, tail.height) == (24, 16) and tail.fmt.startswith("ASTC" if kind == "astc" else "BC6H")
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-import benchmarks.path_tracer as path_tracer
 import benchmarks.smoke_network as bench_module
+from benchmarks import path_tracer
 from benchmarks.path_tracer import choose_variant
 from benchmarks.runner import Bench
 from wlm.errors import WlmError

@@ -1,8 +1,8 @@
 """The Pareto front by hand, and plots that are drawn, complete and readable."""
 
 import math
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import pytest
 from PIL import Image

@@ -7,8 +7,8 @@ import pytest
 import torch
 from builders.bench_rows import by_option, check_outputs
 
-import benchmarks.path_tracer as path_tracer
 import benchmarks.smoke_network as bench
+from benchmarks import path_tracer
 from benchmarks.path_tracer import PathTracer, denoise
 from benchmarks.smoke_network import (
     FULL,

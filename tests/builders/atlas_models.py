@@ -36,7 +36,7 @@ def random_model(scene: LightmappedScene, kind: str, colour: str = "half", seed:
     random = np.random.default_rng(seed)
     (sheet,) = scene.sheets
     size = sheet.mask.shape
-    method, colour = kind.split()[0], {MIXED: "mixed", WIDE: "bc6h"}.get(kind, colour)
+    method, colour = kind.split(maxsplit=1)[0], {MIXED: "mixed", WIDE: "bc6h"}.get(kind, colour)
     profile = Profile(name="random", method="tiles" if method == "tiles" else "cascade", tile=tile, colour=colour)
     shape = (16, MOST_SIZE + 4) if kind == WIDE else (18, 23)
     texels, lut = random.random((*shape, 3)) * 3.0, np.empty((0, 0, 2), np.uint16)

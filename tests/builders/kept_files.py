@@ -69,7 +69,7 @@ def _atlas(kind: str, colour: str) -> Kept:
 
     free = {"lut": "sizes" if kind == "cascade" else "", "mesh": "size"}
     # Places and triangles beyond those that are named do no harm.
-    free |= {name: "size size size" for name in ("uv_place", "uv_triangle")}
+    free |= dict.fromkeys(("uv_place", "uv_triangle"), "size size size")
     ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv_order": (0, 6), "uv_index": (0, 255)}
     ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
     content = _written(lambda path: save_plainly(random_model(sheet(), kind, colour), path))

@@ -49,7 +49,7 @@ def scene_folder(folder, uv_set=1, states=STATES, **settings):
     text = {"states": states, "sheets": sheets, "objects": objects, "uv_set": uv_set}
     (folder / "lights.json").write_text(json.dumps(text))
     scene = load(path, folder / "lights.json")
-    model = compress(scene, views=1, method="shared", **{"budget": 0.1} | settings)
+    model = compress(scene, views=1, **{"budget": 0.1} | settings)
     if model.lut.shape[2] == ENTRY:
         pages = {name: getattr(model, name) for name in ("texels", "blocks", "block_texels")}
         pages = {name: np.concatenate([0 * each, each]) for name, each in pages.items()}

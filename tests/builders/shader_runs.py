@@ -45,7 +45,7 @@ def gl():
         if not _works(_context()):
             _context.cache_clear()
         return _context()
-    except Exception as error:  # noqa: BLE001  # moderngl has no class of its own for it
+    except Exception as error:  # moderngl has no class of its own for it
         pytest.skip(f"no OpenGL without a display: install Mesa (libegl1, libgl1-mesa-dri): {error}")
 
 
@@ -114,7 +114,7 @@ def device():
     pytest.importorskip("wgpu", reason="wgpu is not installed (pip, extra test)")
     try:
         return _device()
-    except Exception as error:  # noqa: BLE001  # whatever the driver says
+    except Exception as error:  # whatever the driver says
         pytest.skip(f"no GPU for wgpu, not even in software: install Mesa (libegl1, mesa-vulkan-drivers): {error}")
 
 

@@ -46,7 +46,7 @@ class _Writer:
 
     def _packed(self, values: np.ndarray) -> bytes:
         data = values.astype(self._type).tobytes()
-        if not data and self._type == "<f2" or not self._flags & (ZIP | BLOSC):
+        if (not data and self._type == "<f2") or not self._flags & (ZIP | BLOSC):
             return data
         packed = zlib.compress(data) if self._flags & ZIP else imagecodecs.blosc_encode(data) if data else data
         if len(packed) >= len(data):

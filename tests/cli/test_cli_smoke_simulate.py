@@ -1,5 +1,6 @@
 """Simulations from the command line: as told, stopped and resumed, and of hard scenes."""
 
+import itertools
 import os
 import re
 import signal
@@ -46,7 +47,7 @@ def test_simulate(jet, tmp_path):
     footage = load_frames(out)
     assert footage.scene == Scene.model_validate(JET)
     amounts = [float(footage.load(number).density.sum()) for number in footage.numbers]
-    assert all(b > a > 0 for a, b in zip(amounts, amounts[1:], strict=False))
+    assert all(b > a > 0 for a, b in itertools.pairwise(amounts))
     last = footage.load(4)
     assert (last.voxel, last.extinction, last.temperature) == (0.0625, 8.0, None)
     # The jet goes up, and none of it is in the sphere.

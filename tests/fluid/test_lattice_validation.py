@@ -1,5 +1,7 @@
 """The lattice against published and exact flows; tests of minutes on a CPU are marked slow."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -120,7 +122,7 @@ def test_channel_is_of_second_order(lattice: str, operator: str, device: str):
     """Poiseuille between half-way walls, driven by a force."""
     errors = [_channel_error(cells, device, operator, lattice) for cells in (4, 8, 16)]
     assert errors[0] <= 0.04
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in itertools.pairwise(errors):
         assert 1.9 <= np.log2(coarse / fine) <= 2.1, errors
 
 

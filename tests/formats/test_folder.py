@@ -10,12 +10,11 @@ from wlm.errors import WlmError
 from wlm.formats.folder import UNFINISHED, claim, compact_json, read_index, rounded, staged, write_index
 
 INDEX, FORMAT = "index.json", "wlm-test"
-OURS = {INDEX, "a", "b", "c"}
 
 
 def write(folder, *names: str) -> None:
     """Writes an output of these files, which hold their names."""
-    with staged(folder, INDEX, FORMAT, OURS.__contains__) as temporary:
+    with staged(folder, INDEX, FORMAT) as temporary:
         for name in names:
             (temporary / name).write_text(name)
         write_index(temporary / INDEX, {"format": FORMAT, "files": names})
@@ -63,7 +62,7 @@ def test_nothing_half_written_is_left(tmp_path):
     for name in ("old", "new"):
         for error, words in errors:
             with pytest.raises((WlmError, KeyboardInterrupt)) as caught:  # noqa: SIM117
-                with staged(tmp_path / name, INDEX, FORMAT, OURS.__contains__) as temporary:
+                with staged(tmp_path / name, INDEX, FORMAT) as temporary:
                     (temporary / "b").write_text("b")
                     raise error(temporary / "b")
             assert words in str(caught.value) and ".tmp" not in str(caught.value)
@@ -73,7 +72,7 @@ def test_nothing_half_written_is_left(tmp_path):
 
 
 def test_files_in_subfolders_are_replaced(tmp_path):
-    """Without a rule for names: what the old index lists goes; other files, and what lies elsewhere, stay."""
+    """Files that the old index lists go; other files, and files elsewhere, stay."""
     folder = tmp_path / "out"
 
     def put(*names):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import os
 import struct
@@ -141,8 +142,8 @@ def test_a_name_stays_in_its_folder(tmp_path):
 # YAML.
 
 LETTERS = "abcdefghi"
-BOMB = "".join(f"- &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip(LETTERS, LETTERS[1:], strict=False))
-MERGES = "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in zip(LETTERS, LETTERS[1:], strict=False))
+BOMB = "".join(f"- &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in itertools.pairwise(LETTERS))
+MERGES = "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in itertools.pairwise(LETTERS))
 
 
 @pytest.mark.parametrize(
@@ -459,7 +460,7 @@ def test_what_a_terminal_obeys_is_escaped(capsys):
 def test_a_link_planted_in_an_export_is_replaced_and_not_followed(tmp_path):
     folder, victim = tmp_path / "out", write(tmp_path / "victim", b"precious")
     for _ in range(2):
-        with staged(folder, "index.json", "test", lambda name: name.endswith(".dds")) as temporary:
+        with staged(folder, "index.json", "test") as temporary:
             write(temporary / "tile.dds", b"texels")
             write_index(temporary / "index.json", {"format": "test"})
         assert victim.read_bytes() == b"precious"
@@ -467,7 +468,7 @@ def test_a_link_planted_in_an_export_is_replaced_and_not_followed(tmp_path):
         for name in ("tile.dds", "old.dds"):
             (folder / name).unlink(missing_ok=True)
             (folder / name).symlink_to(victim)
-    with staged(folder, "index.json", "test", lambda name: name.endswith(".dds")) as temporary:
+    with staged(folder, "index.json", "test") as temporary:
         write_index(temporary / "index.json", {"format": "test"})
     assert sorted(path.name for path in folder.iterdir()) == ["index.json"] and victim.read_bytes() == b"precious"
 

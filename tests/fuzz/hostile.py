@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import gzip
+import itertools
 import json
 import os
 import struct
@@ -203,7 +204,7 @@ def _mask(name: str, data: bytes = b"") -> Write:
 def _merges(depth: int = 8) -> str:
     names = "abcdefghi"[:depth]
     lines = ["a: &a {" + ", ".join(f"k{i}: 1" for i in range(9)) + "}"]
-    lines += [f"{b}: &{b} {{<<: [{', '.join([f'*{a}'] * 9)}]}}" for a, b in zip(names, names[1:], strict=False)]
+    lines += [f"{b}: &{b} {{<<: [{', '.join([f'*{a}'] * 9)}]}}" for a, b in itertools.pairwise(names)]
     return "\n".join(lines) + "\n"
 
 

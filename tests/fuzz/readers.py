@@ -344,7 +344,7 @@ def _settings(name: str, model: Callable[[], type], files: str, check: Callable[
 def _scene_figures(scene: Scene) -> None:
     """What follows from an accepted scene's numbers is of use too."""
     check_finite(fastest=scene.fastest, step=scene.step)
-    assert 1 <= scene.steps, f"accepted with {scene.steps} steps a frame"
+    assert scene.steps >= 1, f"accepted with {scene.steps} steps a frame"
 
 
 _ALL = (

@@ -144,13 +144,13 @@ def test_forces(operator: str, kind: str, device: str):
     _run(Pair(lattice, device, operator=operator, force=force))
 
 
-WALLS = {name: ("wall", (0.0, 0.0, 0.0)) for name in reference.FACES}
+WALLS = dict.fromkeys(reference.FACES, ("wall", (0.0, 0.0, 0.0)))
 TUNNEL = {"-x": ("inlet", (0.05, 0.01, 0.0)), "+x": ("outlet", None)}
 BOXES = {
     "walls": WALLS,
     "one pair of walls": {"-y": WALLS["-y"], "+y": ("wall", (0.1, 0.0, 0.02))},
     "lids": WALLS | {"+y": ("wall", (0.1, 0.0, 0.0)), "-z": ("wall", (0.0, -0.05, 0.0))},
-    "slip": {name: ("slip", (0.0, 0.0, 0.0)) for name in reference.FACES},
+    "slip": dict.fromkeys(reference.FACES, ("slip", (0.0, 0.0, 0.0))),
     "slip and walls": {"-x": WALLS["-x"], "+x": WALLS["+x"], "-z": ("slip", (0, 0, 0)), "+z": ("slip", (0, 0, 0))},
     "tunnel": WALLS | TUNNEL,
     "open tunnel": TUNNEL | {"-y": ("slip", (0, 0, 0)), "+y": ("outlet", None)},

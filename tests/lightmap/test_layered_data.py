@@ -106,7 +106,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     np.testing.assert_array_equal(values_of(chosen, "small", "L0")[0], small)
     assert values_of(chosen, "small", "L1").shape == (1, 3, 5, 1)
     assert [own.mask.sum() for own in chosen.sheets.values()] == [40, 40, 15, 15]
-    write_part(tmp_path / "order.exr", {name: planes["R"] for name in ("A", "B", "BA", "G", "R")}, read_channels)
+    write_part(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]), read_channels)
     assert read_channels(tmp_path / "order.exr")[1] == ("R", "G", "B", "A", "BA")
     layers["dir"]["channels"] = ["G", "R"]
     both = write_set_json(

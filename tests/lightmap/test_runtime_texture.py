@@ -112,9 +112,7 @@ def test_the_command_writes_the_texture(tmp_path):
     model = random_model(KINDS, hidden=16)
     model.save(tmp_path / "a.wlm")
     files = ["-o", str(tmp_path / "a.exr"), "--texture", str(tmp_path / "a.dds")]
-    assert (
-        CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
-    )
+    assert CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
     (sheet,) = model.sheets.values()
     decoder = MapDecoder(sheet)
     decoder.set_time(9.0)

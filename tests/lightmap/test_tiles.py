@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from builders.checks import error_of
 from builders.small_sets import sheet_from_arrays as from_arrays
 
 from wlm.errors import WlmError
@@ -15,7 +14,6 @@ from wlm.lightmap.tiles import (
     assemble,
     channel_means,
     classify,
-    parse_tiles,
     split,
     static_pattern,
 )
@@ -254,31 +252,3 @@ def test_classify_refuses():
         classify(tile, GAMMA, float("nan"))
     with pytest.raises(WlmError, match="gamma"):
         classify(tile, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [("0-3,7", [0, 1, 2, 3, 7]), ("5", [5]), (" 7 , 0 - 1 ", [7, 0, 1]), ("2-2", [2])],
-)
-def test_parse_tiles(text, expected):
-    assert parse_tiles(text, 8) == expected
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "expected a number or first-last"),
-        ("1,", "expected a number or first-last"),
-        ("a", "got 'a'"),
-        ("-1", "got '-1'"),
-        ("1-2-3", "got '1-2-3'"),
-        ("1.5", "got '1.5'"),
-        ("9" * 5000, "expected a number"),
-        ("3-1", "runs down"),
-        ("8", "tile 8 is out of range; expected 0 to 7"),
-        ("0-999999999", "out of range"),
-        ("1,0-2", "tile 1 is given twice"),
-    ],
-)
-def test_parse_tiles_refuses(text, expected):
-    assert expected in error_of(parse_tiles, text, 8)

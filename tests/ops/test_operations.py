@@ -296,7 +296,7 @@ def test_nothing_in(device: str, name: str):
         for value, value64 in zip(values, want, strict=True):
             close(value, value64, EXACT["value"])
         sum(v.sum() for v in values).backward()
-        if cut != ["rows"] and cut != ["toward", "colour"]:
+        if cut not in (["rows"], ["toward", "colour"]):
             assert not any(tensors[leaf].grad.any() for leaf in case.leaves)
 
 
@@ -367,7 +367,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "message"), REFUSED, ids=[f"{r[0]}-{[*r[1]][0]}" for r in REFUSED])
+@pytest.mark.parametrize(("name", "changes", "message"), REFUSED, ids=[f"{r[0]}-{next(iter(r[1]))}" for r in REFUSED])
 def test_refused(name: str, changes: dict, message: str):
     case = CASES[name]
     with pytest.raises(ValueError) as error:

@@ -32,10 +32,7 @@ def slow(model, point):
         ]
         away = [x[a] - row[a] for a in range(3)]
         d2 = sum((sum(turn[a][b] * away[a] for a in range(3)) / scale[b]) ** 2 for b in range(3))
-        if p.support == "sphere":
-            reached = math.dist(x, row[:3]) < CUT * max(scale)
-        else:
-            reached = d2 < CUT**2
+        reached = math.dist(x, row[:3]) < CUT * max(scale) if p.support == "sphere" else d2 < CUT**2
         if reached:
             latent = [f + math.exp(-d2 / 2) * v for f, v in zip(latent, row[10:], strict=True)]
     values, numbers = [*latent, *x], iter(content.net.tolist())

@@ -1,5 +1,6 @@
 """What an engine gets: numbers that decode to the same light with NumPy alone, and a shader that does the same."""
 
+import itertools
 import shutil
 import subprocess
 from dataclasses import replace
@@ -54,7 +55,7 @@ class Files:
         self.latent = numbers[:, 10:]
         self.layers, at = [], 0
         sizes = [latent + 3, hidden, hidden, info["outputs"]]
-        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        for inputs, outputs in itertools.pairwise(sizes):
             rows, fours = 1 + -(-inputs // 4) * 4, -(-outputs // 4)
             layer = halves[at : at + 4 * rows * fours].reshape(fours, rows, 4).transpose(1, 0, 2).reshape(rows, -1)
             at += layer.size

@@ -1,5 +1,6 @@
 """Six-way lightmaps of smoke: the axes' names, their own error, a path tracer."""
 
+import itertools
 import math
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_a_screen_darkens_one_map(device: str, direction: str):
     assert after[direction].max() < 1e-2 < 0.2 < before[direction].max()
     for other in DIRECTIONS:
         # The wall behind is seen, and lit, through the smoke.
-        if other != direction and direction != "back":
+        if direction not in (other, "back"):
             np.testing.assert_allclose(after[other].cpu(), before[other].cpu(), atol=1e-5)
 
 
@@ -76,7 +77,7 @@ def test_halving_the_step(device: str):
         stated.append(maps.error.rms)
         assert float(off.abs().max()) < maps.error.largest
         assert float((maps.transparency - fine.transparency).abs().max()) < maps.error.transparency + 1e-6
-    assert all(b < 0.5 * a for a, b in zip(errors, errors[1:], strict=False))
+    assert all(b < 0.5 * a for a, b in itertools.pairwise(errors))
     assert all(error < said for error, said in zip(errors, stated, strict=True))
     assert errors[2] < 0.01
 

@@ -188,7 +188,7 @@ def test_a_gpu_sees_the_same(device: str, pool):
     if device == "cpu":
         pytest.skip("the CPU's is what it is compared with")
     samples = make_pool(SMALL, seed=5, device=device)
-    assert str(samples.device).startswith(device.split(":")[0])
+    assert str(samples.device).startswith(device.split(":", maxsplit=1)[0])
     assert torch.equal(samples.sequence.cpu(), pool[0].sequence)
     assert float((samples.targets.cpu().float() - pool[0].targets.float()).square().mean()) < 1e-3
 
@@ -206,7 +206,7 @@ def test_what_a_pool_holds(pool):
     targets = samples.targets.float()
     assert targets.min() >= 0 and targets.max() <= 1
     covered = (targets[:, 1, OPACITY_PLANE] > 0.05).float().mean((1, 2))
-    assert 0.02 < covered.min() and 0.08 < covered.mean() < 0.8
+    assert covered.min() > 0.02 and 0.08 < covered.mean() < 0.8
     # The guide is a rough picture of the same smoke.
     off = (opacity - targets[:, :, OPACITY_PLANE]).square().mean() / targets[:, :, OPACITY_PLANE].square().mean()
     assert off < 0.15

@@ -1,5 +1,6 @@
 """The window: every kind of file has a picture that follows its controls, and what has none is said in one line."""
 
+import itertools
 import re
 import sys
 
@@ -85,8 +86,8 @@ def lightmaps(tmp_path_factory):
     """A model of a dynamic, a static, a constant and an empty tile as `four.wlm`; its set; a quad with lightmap UVs."""
     folder = tmp_path_factory.mktemp("lightmaps")
     frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = small_sets.moving_light().frames
-    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, :128, :128] = small_sets.moving_light().light.frames
+    frames[:, :128, 128:] = small_sets.static_light().light.frames / 24.0
     frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
     mask = np.ones((256, 256), bool)
     mask[128:, 128:] = False
@@ -131,6 +132,7 @@ def test_a_texel_tells_its_tile_and_its_light(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", flat=True, mesh=lightmaps / "quad.glb")
     assert window.scene.panels == ("decoded", "original", "error") and window.scene.flat
     model, panel = wlm.load(lightmaps / "four.wlm"), SIZE[0] // 3
+    (sheet,) = model.sheets.values()
     middle = STRIP + (SIZE[1] - STRIP) // 2
     for x, y, kind in ((-20, 20, "dynamic"), (20, 20, "static"), (-20, -20, "constant"), (20, -20, "empty")):
         told = window.tell(panel // 2 + x, middle + y)
@@ -138,7 +140,7 @@ def test_a_texel_tells_its_tile_and_its_light(lightmaps, show):
         u, v = map(float, re.search(r"UV (\S+) (\S+)", told).groups())
         assert (int(u * 256), int(v * 256)) == (column, row)
         number = row // 128 * 2 + column // 128
-        assert f"tile {number} ({kind})" in told and TileKind(model.kind[number]).name.lower() == kind
+        assert f"tile {number} ({kind})" in told and TileKind(sheet.kind[number]).name.lower() == kind
         decoded = model.decoder().frame(window.state.values["hour"])[row, column]
         assert f"decoded {' '.join(f'{value:.4g}' for value in decoded)}" in told and "original" in told
     told = window.tell(panel // 2 - 20, middle + 20)
@@ -152,7 +154,7 @@ def test_panels_show_decoded_original_and_error(lightmaps, show):
     window = show(lightmaps / "four.wlm", original=lightmaps / "set", mesh=lightmaps / "quad.glb")
     decoded, original, error = np.split(scene_of(window)[40:], 3, axis=1)
     assert np.abs(decoded - original).max() > 5 and np.abs(error - original).max() > 100
-    # The last quarter is outside of the mask: filled in the original, 0 in the decoded light, and grey.
+    # The last quarter is outside the mask: filled in the original, 0 in the decoded light, and grey.
     flat = np.split(scene_of(show(lightmaps / "four.wlm", original=lightmaps / "set"))[40:], 3, axis=1)
     quarter = [part[part.shape[0] // 2 + 5 :, part.shape[1] // 2 + 2 :][:15, :15] for part in flat]
     assert quarter[0].max() == 0 and quarter[1].min() > 50 and (quarter[2] == 77).all()
@@ -388,24 +390,24 @@ def test_light_falls_off_through_smoke_as_it_should():
 
 def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps, tmp_path, show):
     given = wlm.lightmap.load(lightmaps / "set")
-    mask = given.mask.copy()
+    mask = given.light.mask.copy()
     mask[40:80, 30:90] = False
     small_sets.write_set(tmp_path / "set", given)
     Image.fromarray(mask).save(tmp_path / "set" / "mask.png")
     window = show(lightmaps / "four.wlm", original=tmp_path / "set")
     model, masked = wlm.load(lightmaps / "four.wlm"), wlm.lightmap.load(tmp_path / "set")
     report = wlm.lightmap.evaluate(model, masked, metrics=("psnr",))
-    for hour, score in zip(report.time_values, report.psnr_by_time, strict=True):
+    for hour, score in zip(report.times, report.light.psnr_by_time, strict=True):
         window.set("hour", hour)
         assert f"PSNR {score:.2f} dB" in caption(window)
-    before, after = report.time_values[1:3]
+    before, after = report.times[1:3]
     window.set("hour", 0.5 * (before + after))
     assert f"original interpolated from {before:g} and {after:g}" in caption(window)
     texture = window.canvas._drawn[2, "mesh"][0].texture
     pixels = np.asarray(texture.to_array()).reshape(256, 256, 3)
     grey = (pixels == 77).all(-1)
     assert grey[mask].sum() == 0 and grey[~mask].all()
-    assert "outside of the mask" in window.scene.tell_texel(50, 50, window.state)
+    assert "outside the mask" in window.scene.tell_texel(50, 50, window.state)
 
 
 def test_the_walls_of_a_room_are_left_out_from_outside(lightmaps, tmp_path, show):
@@ -455,7 +457,7 @@ def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
         for number in range(4):
             movie.seek(number)
             frames.append(np.asarray(movie.convert("RGB")).astype(int))
-    assert all(np.abs(one - two).max() > 12 for one, two in zip(frames, frames[1:], strict=False))
+    assert all(np.abs(one - two).max() > 12 for one, two in itertools.pairwise(frames))
     with pytest.raises(WlmError, match="ends in .gif or .webp, found .mp4"):
         window.movie(tmp_path / "day.mp4")
 
@@ -463,7 +465,7 @@ def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
 def test_the_command_writes_a_picture_and_a_movie(lightmaps, tmp_path, show):
     del show  # only for its check of OpenGL
     out, movie = tmp_path / "out.png", tmp_path / "out.webp"
-    options = ["--hour", "18.5", "--exposure", "1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
+    options = ["--set", "hour=18.5", "--set", "exposure=1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
     outputs = ["--screenshot", str(out), "--movie", str(movie), "--frames", "2"]
     result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options, *outputs])
     assert result.exit_code == 0, result.output
@@ -487,18 +489,18 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
         ([tmp_path / "bad.npz"], {}, "bad.npz"),
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
         ([four, four], {}, "expected one file"),
-        ([four], {"key": "sh"}, "--key means nothing"),
-        ([four], {"walk": four}, "--walk means nothing"),
+        ([four], {"key": "sh"}, "--key has no meaning"),
+        ([four], {"walk": four}, "--walk has no meaning"),
         ([four], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
         ([four], {"original": tmp_path / "half"}, "half: expected a lightmap of 256x256, found 128x64"),
-        ([lightmaps / "set"], {"original": four}, "--original means nothing"),
+        ([lightmaps / "set"], {"original": four}, "--original has no meaning"),
         ([tmp_path / "probe.wlm"], {}, "--original"),
-        ([tmp_path / "probe.wlm"], {"flat": True}, "--flat means nothing"),
+        ([tmp_path / "probe.wlm"], {"flat": True}, "--flat has no meaning"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
         ([tmp_path / "a.exr", tmp_path / "b.exr"], {}, "expected 8x8 pixels as the first frame, found 4x4"),
-        ([tmp_path / "a.exr"], {"extinction": 2.0}, "--extinction means nothing"),
+        ([tmp_path / "a.exr"], {"extinction": 2.0}, "--extinction has no meaning"),
         ([lightmaps / "quad.glb"], {}, "quad.glb: a mesh has no light of its own"),
-        ([__file__], {}, "found .py"),
+        ([__file__], {}, "expected a .wlm, a lightmap"),
     ):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:
             open_scene(files, **options)
@@ -511,14 +513,14 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
     monkeypatch.delenv("DISPLAY", raising=False)
     for options, said in (
         ([], "expected a display"),
-        (["--turn", "3", "--frame", "2", *out], "--frame means nothing"),
-        (["--hour", "nan", *out], "--hour: expected a finite number"),
-        (["--mesh", str(lightmaps / "quad.glb"), "--turn", "inf", *out], "--turn: expected a finite number"),
+        (["--set", "frame=2", *out], "frame has no meaning"),
+        (["--set", "hour=nan", *out], "hour: expected a finite number"),
+        (["--mesh", str(lightmaps / "quad.glb"), "--set", "turn=inf", *out], "turn: expected a finite number"),
         (["--view", "volume", *out], "--view: expected light or tiles"),
         (["--outside", *out], "--outside: expected the mesh of a room"),
         (["--size", "10", *out], "--size: expected a width and a height"),
         (["--rate", "0", *out], "--rate"),
-        (["--frames", "3", *out], "--frames: means nothing without --movie"),
+        (["--frames", "3", *out], "--frames: has no meaning without --movie"),
         (["--movie", str(tmp_path / "a.gif"), "--frames", "0"], "--frames: expected at least 1"),
         (["--screenshot", str(tmp_path / "out.jpg")], "ends in .png"),
     ):

@@ -11,7 +11,6 @@ _PLACES = {
     "Report": "wlm.atlas.evaluation",
     "Sheet": "wlm.atlas.data",
     "View": "wlm.ops.views",
-    "bundle": "wlm.atlas.bundles",
     "compare": "wlm.atlas.evaluation",
     "compress": "wlm.atlas.fit",
     "evaluate": "wlm.atlas.evaluation",

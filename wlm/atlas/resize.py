@@ -3,8 +3,8 @@
 import warnings
 
 import numpy as np
-import scipy.sparse as sparse
 import torch
+from scipy import sparse
 
 from wlm.formats.exr import HALF_MAX
 

@@ -223,7 +223,7 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
         pairs = zip(names[_LIGHT], names[_DIRECTION], strict=True)
         files = [{"files": {_ATLAS: {_LIGHT: light, _DIRECTION: toward}}} for light, toward in pairs]
     listed["lightmaps"] = [{"time_hours": hour} | file for hour, file in zip(baked.hours, files, strict=True)]
-    with staged(folder, INDEX, FORMAT, _is_ours) as made:
+    with staged(folder, INDEX, FORMAT) as made:
         for file, stamp, light, noise in zip(names[_LIGHT], stamps, baked.light, baked.noise, strict=True):
             write_exr(made / file, light)
             _write_planes(
@@ -254,9 +254,3 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
 
 def _write_planes(path: Path, planes: dict[str, np.ndarray]) -> None:
     write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}, read_part)
-
-
-def _is_ours(name: str) -> bool:
-    return name in (INDEX, SET_FILE, _MESH, _MASK, _COVERAGE) or (
-        name.endswith("h.exr") and name.startswith((f"{_LIGHT}_", f"{_DIRECTION}_", f"{_NOISE}_"))
-    )

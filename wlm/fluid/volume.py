@@ -248,7 +248,7 @@ def load_volume(
         heat = None if volume.temperature is None else volume.temperature.to(device)
         volume = replace(volume, density=volume.density.to(device), temperature=heat)
         if not told and is_long_along_z(volume):
-            warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--up z)"
+            warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
     if voxel is None:
         return volume
@@ -427,7 +427,7 @@ def from_grid(
 def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
     """Returns the arrays with bricks expanded to whole fields on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
-    if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (1 <= shape.min() and shape.max() <= most):
+    if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (shape.min() >= 1 and shape.max() <= most):
         raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
     sides = shape.tolist()
     counts = [-(-n // EDGE) for n in sides]

@@ -107,7 +107,7 @@ def read_encoded(path: str | os.PathLike[str], encoding: str) -> np.ndarray:
     pixels, names, levels = read_channels(path)
     if not levels:
         raise WlmError(f"{path}: encoding: expected a PNG; other formats define their encoding themselves")
-    if names not in (("R", "G", "B"), ("R", "G", "B", "A")) or encoding in _ALPHA and len(names) == 3:
+    if names not in (("R", "G", "B"), ("R", "G", "B", "A")) or (encoding in _ALPHA and len(names) == 3):
         alpha = " with alpha" if encoding in _ALPHA else ""
         raise WlmError(f"{path}: encoding {encoding}: expected a PNG of RGB{alpha}, found {''.join(names)}")
     colour, alpha = pixels[..., :3], pixels[..., 3:]

@@ -77,10 +77,7 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
-    if half:
-        pixels = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16)
-    else:
-        pixels = pixels.astype(np.float32, copy=False)
+    pixels = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16) if half else pixels.astype(np.float32, copy=False)
     planes = zip((*_COLOUR, _ALPHA), np.moveaxis(pixels, -1, 0), strict=False)
     # The library requires contiguous planes.
     write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes}, read_exr)

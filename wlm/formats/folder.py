@@ -7,7 +7,7 @@ holds all files that the index lists.
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,7 @@ def made_parents(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], bool] | None = None) -> Iterator[Path]:
+def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
     """Yields a temporary folder beside the real one, and moves its files into the real one if nothing went wrong.
 
     The files may lie in subfolders. The index is moved last, with their names as its entry "files"; files that the
@@ -86,7 +86,6 @@ def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], boo
         folder: The folder; made if it does not exist.
         index: Name of the index file, which the block has to write.
         format_name: The index's `format`.
-        ours: Whether a file name may belong to an earlier output without a list of its files; such files are removed.
 
     Raises:
         WlmError: A file cannot be written (the message names the real folder), or another process is writing there.
@@ -96,21 +95,19 @@ def staged(folder: Path, index: str, format_name: str, ours: Callable[[str], boo
         try:
             with temporary(Path(os.path.realpath(folder)), folder=True) as made:
                 yield made
-                _move(made, folder, index, format_name, ours)
+                _move(made, folder, index, format_name)
         except OSError as error:
             raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
         except WlmError as error:
             raise WlmError(str(error).replace(str(made), str(folder))) from error
 
 
-def _move(made: Path, folder: Path, index: str, format_name: str, ours: Callable[[str], bool] | None) -> None:
+def _move(made: Path, folder: Path, index: str, format_name: str) -> None:
     """Moves an output's files into their folder."""
     names = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file())
     names.remove(index)
     folder.mkdir(exist_ok=True)
     old = set(_listed(folder, index))
-    if ours is not None:
-        old |= {path.name for path in folder.iterdir() if path.name != index and ours(path.name)}
     write_index(made / index, read_index(made / index) | {"files": names})
     # An old index must not vouch for new files, nor may the folder become one that cannot be written again.
     write_index(folder / index, {"format": format_name, UNFINISHED: True, "files": sorted(old | set(names))})

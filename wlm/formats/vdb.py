@@ -238,7 +238,7 @@ class _Tree:
         corners = np.concatenate([np.zeros((0, 3), np.int64), *self._corners])
         masks = np.frombuffer(b"".join(self._masks), np.uint8).reshape(-1, _MASK_BYTES)
         low, high = self._box(corners, masks)
-        if not (-_FARTHEST <= low.min() and high.max() <= _FARTHEST and math.prod((high - low).tolist()) <= most):
+        if not (low.min() >= -_FARTHEST and high.max() <= _FARTHEST and math.prod((high - low).tolist()) <= most):
             box = [low.tolist(), (high - 1).tolist()]
             raise WlmError(f"{self._where}: expected a box of at most {most} voxels, found {box}")
         # The array consists of whole leaves.

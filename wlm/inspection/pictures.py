@@ -100,7 +100,7 @@ def inspect_picture(path: Path) -> Finding:
     if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
         return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))
-    if _GUIDE <= set(picture.channels):
+    if set(picture.channels) >= _GUIDE:
         return Finding(path, f"a guiding map of smoke, {picture.size}; wlm smoke predict makes its own from a volume")
     if picture.is_cube:
         return Finding(path, f"six faces of a cube, {picture.size}: a reflection probe, which no command reads")

@@ -1,4 +1,4 @@
-"""Fields of a `set.json`: what each may hold, and the line that says what it holds instead."""
+"""Checks of the fields of a `set.json`; an error names the field, the expected and the found value."""
 
 import json
 from collections.abc import Callable
@@ -22,18 +22,18 @@ def read_set(path: Path) -> dict[str, Any]:
 
 
 def field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
-    """The value of a field.
+    """Returns the value of a field.
 
     Args:
         path: The file.
-        holder: The object that has the field.
-        key: Its name.
-        place: Where the object is in the file, for messages: `lightmaps[0].`.
-        ok: Whether a value is right.
-        expected: What is right, in words.
+        holder: The object with the field.
+        key: Name of the field.
+        place: Place of the object in the file, for messages: `lightmaps[0].`.
+        ok: Returns whether a value is right.
+        expected: Description of right values.
 
     Raises:
-        WlmError: It is missing or wrong.
+        WlmError: The field is missing or wrong.
     """
     if key not in holder:
         raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
@@ -43,52 +43,52 @@ def field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable
 
 
 def name_of(path: Path, content: dict[str, Any]) -> str:
-    """The set's name: its own, or that of its folder."""
+    """Returns the name of the set: its own, or that of its folder."""
     if content.get("name") is None:
         return path.resolve().parent.name
     return field(path, content, "name", "", is_text, "a name")
 
 
 def period_of(path: Path, content: dict[str, Any]) -> float | None:
-    """The length of the set's day, or None."""
+    """Returns the length of the day of the set, or None."""
     if content.get("period_hours") is None:
         return None
     return float(field(path, content, "period_hours", "", is_positive, "a number above 0"))
 
 
 def is_text(value: object) -> bool:
-    """Whether a value is text that can name something."""
-    # No file can have a NUL or half a character in its name.
+    """Returns whether a value is text that can be a name."""
+    # File names cannot have a NUL or half of a surrogate pair.
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         return False
     return not any("\ud800" <= character <= "\udfff" for character in value)
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a number of a usable size."""
-    # True is an int to Python, and JSON as Python reads it has NaN, Infinity and integers of any length.
+    """Returns whether a value is a finite number of a usable size."""
+    # Python's True is an int, and its JSON reader accepts NaN, Infinity and integers of any length.
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) <= 1e300
 
 
 def is_positive(value: object) -> bool:
-    """Whether a value is such a number above 0."""
+    """Returns whether a value is such a number above 0."""
     return is_number(value) and value > 0
 
 
 def is_list(value: object) -> bool:
-    """Whether a value is a list that is not empty."""
+    """Returns whether a value is a list that is not empty."""
     return isinstance(value, list) and bool(value)
 
 
 def is_size(value: object) -> bool:
-    """Whether a value is a whole number above 0."""
+    """Returns whether a value is a whole number above 0."""
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def kind(value: object) -> str:
-    """Describes a JSON value in a message: itself, or its kind where it is long."""
+    """Describes a JSON value in a message: the value itself, or its kind if it is long."""
     if isinstance(value, dict):
         return "an object"
     if isinstance(value, list):

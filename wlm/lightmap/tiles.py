@@ -1,4 +1,4 @@
-"""Tiles: how a lightmap is cut into them, and which of them need feature maps.
+"""Tiles of a lightmap: cutting, assembling and classifying them.
 
 A tile is the unit of streaming and of fitting, with a model of its own (neural-dynamic-gi, sections 3.5 and 9).
 """
@@ -6,8 +6,6 @@ A tile is the unit of streaming and of fitting, with a model of its own (neural-
 from __future__ import annotations
 
 import math
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -97,7 +95,7 @@ class TileData:
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
-        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask hold the
+        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask repeat the
             nearest valid one of the tile; past the map's end its last row and column repeat. All zero in an empty
             tile.
         mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
@@ -214,7 +212,7 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
     means = np.zeros((*colour.shape[:2], 3))
     for n, valid in enumerate(mask):
         if valid.any():
-            # [T, K, 3]: only the valid texels are summed, so what the gaps hold has no weight.
+            # [T, K, 3]: only the valid texels are summed, so texels in gaps have no weight.
             means[n] = colour[n][:, valid].mean(axis=1, dtype=np.float64)
     return means
 
@@ -248,7 +246,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
 
     - `EMPTY`: the tile has no valid texel.
     - `CONSTANT`: at every time no channel spans more than one step of half float, measured at the channel's least
-      value. A half-float source holds nothing finer. An all-zero tile is constant.
+      value. A half-float source has nothing finer. An all-zero tile is constant.
     - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at that time
       as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any texel is off by more
       than one step of half float. The second condition covers times whose range is zero or so small that the PSNR would
@@ -303,39 +301,6 @@ def check_index(index: np.ndarray, grid: TileGrid) -> None:
     numbers, counts = np.unique(index, return_counts=True)
     if (counts > 1).any():
         raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
-
-
-def parse_tiles(text: str, count: int) -> list[int]:
-    """Reads a list of tiles: numbers and closed ranges, separated by commas.
-
-    Args:
-        text: Such as "0-3,7".
-        count: Number of tiles in the grid.
-
-    Returns:
-        The numbers in the order written.
-
-    Raises:
-        WlmError: A part that is neither, a range that runs down, a number outside [0, count) or given twice.
-    """
-    tiles: list[int] = []
-    for part in text.split(","):
-        # At most 9 digits: a longer number is outside any grid, and int() refuses very long ones in its own
-        # words.
-        match = re.fullmatch(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?", part)
-        if not match:
-            raise WlmError(f"tiles: expected a number or first-last, got {part.strip()!r} in {text!r}")
-        first = int(match[1])
-        last = first if match[2] is None else int(match[2])
-        if last < first:
-            raise WlmError(f"tiles: the range {part.strip()!r} runs down; expected first-last")
-        if last >= count:
-            raise WlmError(f"tiles: tile {last} is out of range; expected 0 to {count - 1}")
-        tiles.extend(range(first, last + 1))
-    for tile, count in Counter(tiles).items():
-        if count > 1:
-            raise WlmError(f"tiles: tile {tile} is given twice in {text!r}")
-    return tiles
 
 
 def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:

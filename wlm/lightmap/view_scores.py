@@ -371,10 +371,7 @@ class Tally:
         after = (index + 1) % self._count
         first, second = self._lightmaps.frames[index], self._lightmaps.frames[after]
         middle = float(self._middles[index])
-        if self._decode is None:
-            light = 0.5 * (self._added[index] + self._added[after])
-        else:
-            light = self._decode(middle)
+        light = 0.5 * (self._added[index] + self._added[after]) if self._decode is None else self._decode(middle)
         name = f"{self._name} at {middle:g}"
         metrics = evaluate_frame(0.5 * (first + second), light, self._mask, TILE, ("psnr",), name=name, peak=self._peak)
         self._between[index] = metrics.psnr

@@ -121,10 +121,7 @@ def gaussian_sum(rows: Tensor, points: Tensor, *, cut: float = 3.0, support: str
     d = points[..., None, :] - rows[:, :3]
     u = torch.einsum("kij,...kj->...ki", rotations(rows[:, 6:10]).transpose(1, 2), d) / scale
     d2 = u.square().sum(-1)
-    if support == "sphere":
-        reached = d.detach().norm(dim=-1) < cut * scale.detach().amax(1)
-    else:
-        reached = d2.detach() < cut * cut
+    reached = d.detach().norm(dim=-1) < cut * scale.detach().amax(1) if support == "sphere" else d2.detach() < cut * cut
     return torch.where(reached, torch.exp(-0.5 * d2), 0.0) @ rows[:, 10:]
 
 
@@ -156,7 +153,7 @@ def pixel_centres(height: int, width: int) -> Tensor:
 
 
 def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """b of triangles at places in pixels, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
+    """B of triangles at places in pixels, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
 
     `position` is [V, 4] in clip space or [V, 2] in UV space.
     """

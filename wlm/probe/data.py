@@ -40,6 +40,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -306,19 +307,18 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
     """Returns positions, values and convention of an export for an engine; None for other content."""
     form = content.get("format") if isinstance(content, dict) else None
-    if form == THREE_GRID:
-        from wlm.probe.engines.three import read_grid
+    if form not in _EXPORTS:
+        return None
+    module, function, convention = _EXPORTS[form]
+    return *getattr(import_module(module), function)(path, content), convention
 
-        return *read_grid(path, content), CANONICAL
-    if form == UNREAL_LIGHT:
-        from wlm.probe.engines.unreal import read_unreal
 
-        return *read_unreal(path, content), "unreal"
-    if form == UNITY_PROBES:
-        from wlm.probe.engines.unity import read_unity
-
-        return *read_unity(path, content), "unity"
-    return None
+# By `format` of an index: module and function that read it, and the convention of its coefficients.
+_EXPORTS = {
+    THREE_GRID: ("wlm.probe.engines.three", "read_grid", CANONICAL),
+    UNREAL_LIGHT: ("wlm.probe.engines.unreal", "read_unreal", "unreal"),
+    UNITY_PROBES: ("wlm.probe.engines.unity", "read_unity", "unity"),
+}
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:

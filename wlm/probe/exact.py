@@ -39,10 +39,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
         part = x[start : start + piece]
         away = part[:, None] - rows[:, CENTRE]
         d2 = (np.einsum("kij,nkj->nki", whiten, away) ** 2).sum(2)
-        if content.support == "sphere":
-            within = (away**2).sum(2) < (CUT * scale.max(1)) ** 2
-        else:
-            within = d2 < CUT**2
+        within = (away**2).sum(2) < (CUT * scale.max(1)) ** 2 if content.support == "sphere" else d2 < CUT**2
         h = np.concatenate([np.where(within, np.exp(-0.5 * d2), 0.0) @ rows[:, LATENT], part], 1)
         for weight, bias in net[:2]:
             h = expit(h @ weight + bias)

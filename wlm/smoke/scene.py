@@ -22,6 +22,7 @@ the time step
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Sequence
@@ -48,7 +49,7 @@ def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
-    if any(later[0] <= earlier[0] for earlier, later in zip(path, path[1:], strict=False)):
+    if any(later[0] <= earlier[0] for earlier, later in itertools.pairwise(path)):
         raise PydanticCustomError("path", "expected times that rise")
     return path
 
@@ -67,7 +68,7 @@ _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
 
 def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
-    if len(glow) == 1 or any(b[0] <= a[0] for a, b in zip(glow, glow[1:], strict=False)):
+    if len(glow) == 1 or any(b[0] <= a[0] for a, b in itertools.pairwise(glow)):
         raise PydanticCustomError("glow", "expected no stops of glow, or at least two that rise")
     return glow
 

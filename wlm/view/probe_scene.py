@@ -1,4 +1,4 @@
-"""Light probes in a window: balls, Gaussians, and the cascaded volume round a viewer who walks."""
+"""Light probes in a window: balls, Gaussians, and the cascaded volume around a moving viewer."""
 
 import math
 from collections.abc import Callable
@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
+from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
@@ -24,31 +26,36 @@ from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import compared
 
 _BALLS, _MESH, _GAUSSIANS, _BLOCKS, _PATH, _VIEWER = "balls", "mesh", "gaussians", "blocks", "path", "viewer"
-_DETAIL = ((64, 3), (1024, 2), (8192, 1), (10**9, 0))  # balls, then subdivisions of an icosahedron
-_LOOP = 120  # frames of the walk where none is given
+_DETAIL = ((64, 3), (1024, 2), (8192, 1), (10**9, 0))  # number of balls, and subdivisions of an icosahedron for each
+_LOOP = 120  # frames of the default walk
 _SIGMAS = Slider("sigma", 0.1, 3.0, 1.0, 0.1, views=("gaussians",))
-_GREY = 40  # of the mesh in the panel of the error, which is of probes alone
-_WINDOWS = ((1.0, 1.0, 1.0), (1.0, 0.8, 0.3), (1.0, 0.5, 0.3), (0.8, 0.3, 0.9))  # of the levels, the finest first
-# The corners of a block's six sides, from which its light is seen.
+_GREY = 40  # grey level of the mesh in the error panel, which shows only probes
+_WINDOWS = (
+    (1.0, 1.0, 1.0),
+    (1.0, 0.8, 0.3),
+    (1.0, 0.5, 0.3),
+    (0.8, 0.3, 0.9),
+)  # colours of the levels' windows, the finest first
+# Corners of the six faces of a block.
 _SIDES = np.array(
     [[axis, end, *corner] for axis in range(3) for end in (0, 1) for corner in ((0, 0), (1, 0), (1, 1), (0, 1))]
 )
-_SHRUNK = 0.8  # of a block's side, so that neighbours stay apart
+_SHRUNK = 0.8  # drawn size of a block, so that neighbours stay apart
 
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """What there is of a set of probes, live ones alone.
+    """The live probes of a file.
 
     Attributes:
         position: float64 [N, 3].
-        number: int [N], of each in its file.
-        coefficients: C.
-        values: By "decoded" and "original", as there are, float32 [N, C, 3].
-        decode: Light float32 [M, 3 C] at points [M, 3].
-        light: That of the probes, for a volume.
-        model: The Gaussians; None: there are none.
-        note: For the caption.
+        number: int [N], index of each probe in the file.
+        coefficients: Number C of coefficients.
+        values: float32 [N, C, 3] by name, "decoded" or "original" or both.
+        decode: Function that returns light float32 [M, 3 C] at points [M, 3].
+        light: Light of the probes, for a volume.
+        model: The model, if it has Gaussians; otherwise None.
+        note: Text of the caption.
     """
 
     position: np.ndarray
@@ -69,10 +76,10 @@ class Probes:
         live: np.ndarray,
         title: str,
     ) -> Self:
-        """Takes what `wlm.probe.places.probes_of` found of a model.
+        """Takes the probes of a model, as `wlm.probe.places.probes_of` returns them.
 
         Raises:
-            WlmError: A probe's numbers are no spherical harmonics.
+            WlmError: The numbers of a probe are not spherical harmonics.
         """
         count = _coefficients(model.outputs, title)
         decoder, places = model.decoder(position=position), position[live]
@@ -87,10 +94,10 @@ class Probes:
 
     @classmethod
     def of_set(cls, probes: ProbeSet, title: str) -> Self:
-        """Takes an input; between probes its light is that of the nearest.
+        """Takes the probes of an input file; the light between probes is that of the nearest one.
 
         Raises:
-            WlmError: A probe's numbers are no spherical harmonics.
+            WlmError: The numbers of a probe are not spherical harmonics.
         """
         count = _coefficients(probes.outputs, title)
         places, values = probes.position[probes.live], probes.values[probes.live]
@@ -117,14 +124,14 @@ def probe_scene(
 
     Args:
         probes: The probes.
-        title: Of the window.
-        geometry: The scene's mesh, lit at its vertices; None: none.
-        walk: [F, 3], viewpoints of the cascaded volume; None: a loop through the scene.
-        block: Side of the volume's finest blocks; None: from the probes' spacing.
+        title: Title of the window.
+        geometry: Mesh of the scene, lit at its vertices; or None.
+        walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
+        block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
         up: The axis that points up.
 
     Raises:
-        WlmError: The side isn't above 0.
+        WlmError: The side is not above 0.
     """
     volume = Volume(probes.position, probes.light, block=block)
     path = walk if walk is not None else camera_path(volume.position, _LOOP, up=up)
@@ -222,7 +229,8 @@ class _ProbeScene(Scene):
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
         rows = model.content.rows().astype(np.float64)
-        shape = _rotations(rows[:, ROTATION]) * np.exp(rows[:, SCALE])[:, None, :]
+        turn = rotations(torch.from_numpy(rows[:, ROTATION])).numpy()
+        shape = turn * np.exp(rows[:, SCALE])[:, None, :]
         centre = model.origin + model.extent * rows[:, CENTRE]
         ball, faces = _icosphere(1)
         reach = state.values["sigma"] * model.extent
@@ -236,7 +244,7 @@ class _ProbeScene(Scene):
     def _draw_volume(self, canvas: Canvas, state: State, windows: list[str]) -> None:
         frame = state.frame
         if frame != self._frame:
-            # A jump is waited for; the next frame shows what a frame's budget fills.
+            # After a jump the volume is filled completely; the next frame fills one frame's budget.
             if self._frame is None or frame != self._frame + 1:
                 settle(self.volume, self.path[frame])
             self._stats = self.volume.update(self.path[frame])
@@ -247,7 +255,7 @@ class _ProbeScene(Scene):
         for level, size in enumerate(self.volume.sizes):
             place = np.argwhere(valid[level])
             centre = (self.volume.base[level] + place + 0.5) * size
-            # What a finer window covers answers from there.
+            # Blocks that a finer window covers are not read.
             seen = np.ones(len(centre), bool)
             if inner is not None:
                 seen = ((centre < inner[0]) | (centre > inner[1])).any(1)
@@ -284,14 +292,14 @@ def _mean(values: np.ndarray) -> str:
 
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] of length 1 and triangles [F, 3]."""
+    """Vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
     sphere = import_pyvista("view").Icosphere(nsub=subdivisions)
     points = np.asarray(sphere.points, np.float64)
     return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
 
 
 def _block() -> tuple[np.ndarray, np.ndarray]:
-    """The corners [24, 3] of the six sides of a cube of side 1 about the origin, and the sides' normals there."""
+    """Corners [24, 3] of the six faces of a unit cube around the origin, and the normals of the faces there."""
     offsets, normals = np.zeros((len(_SIDES), 3)), np.zeros((len(_SIDES), 3))
     for number, (axis, end, first, second) in enumerate(_SIDES):
         offsets[number, [axis, (axis + 1) % 3, (axis + 2) % 3]] = np.array([end, first, second]) - 0.5
@@ -299,21 +307,8 @@ def _block() -> tuple[np.ndarray, np.ndarray]:
     return offsets, normals
 
 
-def _rotations(quaternion: np.ndarray) -> np.ndarray:
-    """Rotations float64 [K, 3, 3] of quaternions w, x, y, z of any length; of length zero: none."""
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = np.where(length > 0, quaternion / np.maximum(length, 1e-30), [1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = unit.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
-
-
 def _normals(geometry: Geometry) -> np.ndarray:
-    """A normal for each vertex, the mean of its triangles' by area, float64 [V, 3]; upwards where there is none."""
+    """Area-weighted vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
     corners = geometry.position.astype(np.float64)[geometry.triangle]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros(geometry.position.shape)
@@ -324,7 +319,7 @@ def _normals(geometry: Geometry) -> np.ndarray:
 
 
 def _facing(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Irradiance float64 [V, 3] of SH [V, C, 3] at normals [V, 3], one each."""
+    """Irradiance float64 [V, 3] of spherical harmonics [V, C, 3] for normals [V, 3]."""
     count = values.shape[1]
     factors = [cosine_factor(band) for band in coefficient_bands(count).tolist()]
     return np.einsum("vc,vcd->vd", basis(normals, count) * factors, values)

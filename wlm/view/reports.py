@@ -163,9 +163,7 @@ def atlas_report(
     return page.write(path)
 
 
-def probe_report(
-    path: str | os.PathLike[str], model: ProbeModel, probes: ProbeSet, report: ProbeReport
-) -> int:
+def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeSet, report: ProbeReport) -> int:
     """Writes a probe report: the summary, errors by band and by probe, and the worst probes.
 
     Args:

@@ -1,7 +1,7 @@
-"""A scene as pictures, in memory: each frame is simulated, lit and drawn before the next, with no file between.
+"""Simulation, lighting and drawing of a scene frame by frame, in memory.
 
-On CUDA the light of a frame, from its march to its picture, is one graph, but where a network makes the lightmaps: that
-has a graph of its own.
+On CUDA the lighting of a frame, from the march to the picture, is one graph, except if a network makes the lightmaps,
+which has its own graph.
 """
 
 import time
@@ -29,35 +29,35 @@ from wlm.view.smoke import Drawing
 from wlm_kernels.smoke.settings import March
 
 SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"
-"""Stages of a frame, beside a lighting's own. A graph is of that and the picture; it is measured after them."""
+"""Names of the stages of a frame, besides that of the lighting. A graph covers the lighting and the picture."""
 
 MARCH = 130
-"""Steps of the march along the longest edge, where none are given."""
+"""Default number of steps of the march along the longest edge."""
 
-_STAGED = 4  # frames of which each stage is measured before a graph takes over
-_SURFACE = March(step=2.0, jitter=0.0)  # of the depth at which shadows fall, where a network makes the lightmaps
+_STAGED = 4  # frames whose stages are measured one by one before a graph replaces them
+_SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, if a network makes the lightmaps
 
 
 class Lighting(ABC):
-    """How the smoke of a frame is lit, and what its stage is called."""
+    """A way to light the smoke of a frame, with the name of its stage."""
 
     stage: ClassVar[str]
     in_graph = True
-    """Whether nothing in it waits for the device, so that a graph may capture it."""
+    """Whether it never waits for the device, so that a graph can capture it."""
 
     @abstractmethod
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights it, on the smoke's device, with the depth of its surface."""
+        """Lights the smoke on its device; the result has the depth of its surface."""
 
 
 @dataclass(frozen=True)
 class AllOrders(Lighting):
-    """Light of all orders of each light itself, and of fire.
+    """Light of all orders of each light and of fire.
 
     Attributes:
-        albedo: R, G, B, the share of light that a scattering leaves.
-        model: The learned mix; None: the one that comes with wlm.
-        step: Of the march, in voxels; None: that of `orders_march`.
+        albedo: R, G, B single-scattering albedo.
+        model: The learned mix; None for the one that is part of the package.
+        step: Step of the march in voxels; None for that of `orders_march`.
     """
 
     albedo: Sequence[float] = (1.0, 1.0, 1.0)
@@ -72,12 +72,12 @@ class AllOrders(Lighting):
 
 @dataclass(frozen=True)
 class SixWays(Lighting):
-    """Light scattered once, by six-way lightmaps, as an engine shows it.
+    """Light scattered once, by six-way lightmaps, as engines show it.
 
     Attributes:
-        step: Of the march, in voxels; None: 1 / `MARCH` of the longest edge.
-        network: Makes the lightmaps in place of the march; None: the march.
-        seed: Of the march's jitter.
+        step: Step of the march in voxels; None for 1 / `MARCH` of the longest edge.
+        network: Network that makes the lightmaps; None for the march.
+        seed: Seed of the march's jitter.
     """
 
     step: float | None = None
@@ -86,7 +86,7 @@ class SixWays(Lighting):
     stage = "lightmaps"
 
     @property
-    def in_graph(self) -> bool:
+    def in_graph(self) -> bool:  # type: ignore[override]
         return self.network is None
 
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay:
@@ -101,12 +101,12 @@ class SixWays(Lighting):
 
 @dataclass
 class Frame:
-    """A frame as it comes out.
+    """A finished frame.
 
     Attributes:
-        number: From 1.
+        number: Frame number, from 1.
         pixels: uint8 [H, W, 3] in sRGB.
-        seconds: What each stage took, by its name.
+        seconds: Duration of each stage by name.
     """
 
     number: int
@@ -125,18 +125,18 @@ def run(
     """Simulates a scene and draws each of its frames.
 
     Args:
-        scene: The scene; for six ways its camera is orthographic.
-        lighting: How its smoke is lit; None: with light of all orders, of the scene's albedo.
+        scene: The scene; six-way lighting needs an orthographic camera.
+        lighting: The lighting; None for light of all orders with the scene's albedo.
         white: The light that becomes white.
-        device: As `wlm.interop.check_device` returns it.
+        device: A device as `wlm.interop.check_device` returns it.
         progress: Called after each frame.
 
     Yields:
-        The frames. Each stage waits for the device, so that its time is its own.
+        The frames. Each stage waits for the device, so that its duration is measured separately.
 
     Raises:
-        ValueError: The camera is in perspective, for six ways.
-        WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; the air blew up.
+        ValueError: Six-way lighting with a perspective camera.
+        WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; or the simulation diverged.
     """
     lighting = AllOrders(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
@@ -146,7 +146,7 @@ def run(
     drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
     graph = None
     if lighting.in_graph and device != "cpu":
-        # Frames before have loaded the kernels.
+        # The frames before have loaded the kernels.
         graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
@@ -171,7 +171,7 @@ def run(
 
 
 class _Clock:
-    """Seconds of stages, each to the end of what the device has to do."""
+    """Measures the duration of stages, each until the device has finished."""
 
     def __init__(self, device: str) -> None:
         self._device, self.seconds = device, {}
@@ -188,14 +188,14 @@ class _Clock:
 
 
 def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> dict[str, list[float]]:
-    """Writes frames as they come.
+    """Writes frames as they are made.
 
     Args:
-        frames: From `run`.
-        write: Takes a frame's number and its pixels.
+        frames: Frames of `run`.
+        write: Function of a frame's number and its pixels.
 
     Returns:
-        The seconds of each stage, one for each frame that had it, "writing" among them.
+        The durations of each stage, "writing" among them, one for each frame that had the stage.
     """
     seconds: dict[str, list[float]] = {}
     for frame in frames:

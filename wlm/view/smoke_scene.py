@@ -1,4 +1,4 @@
-"""Smoke in a window: volumes under a light, and six-way lightmaps as the billboard that they light."""
+"""Smoke in a window: volumes under a light, and six-way lightmaps on a billboard."""
 
 import itertools
 import math
@@ -25,13 +25,18 @@ from wlm.view.surface import flat_geometry
 
 _TURN = Slider("turn", -180.0, 180.0, 40.0, 5.0, ".0f", "°", wraps=True)
 _HEIGHT = Slider("height", -90.0, 90.0, 35.0, 5.0, ".0f", "°")
-_WHITE = 0.8  # of the screen, where the brightest light is
-_GLOW = np.array([1.0, 0.45, 0.12], np.float32)  # of heat, as the pages for a browser have it
-_DARK, _BRIGHT, _SQUARES = 0.03, 0.06, 8  # the ground that shows through, of white, and its squares along a side
-_MOST_VOXELS, _MOST_LIT = 4_000_000, 250_000  # of what is drawn, and of what the light is marched through
-_AMBIENT = 0.15  # of the light, everywhere in the smoke, so that its dark side has a shape
-_COLUMNS, _LEAST_PLANE, _NAME = 3, 160, 1 / 12  # of the sheet of planes: pixels, and share of a plane
-_EMPTY = "#5a5d63"  # where the sheet has no plane
+_WHITE = 0.8  # screen value of the brightest light
+_GLOW = np.array([1.0, 0.45, 0.12], np.float32)  # colour of heat, as on the HTML pages
+_DARK, _BRIGHT, _SQUARES = 0.03, 0.06, 8  # checkerboard behind the smoke: its two levels, and its squares along a side
+_MOST_VOXELS, _MOST_LIT = 4_000_000, 250_000  # voxels that are drawn, and voxels that the light is marched through
+_AMBIENT = 0.15  # share of the light everywhere in the smoke, so that its dark side is visible
+# The sheet of planes: columns, least width of a plane in pixels, and size of a name relative to a plane.
+_COLUMNS, _LEAST_PLANE, _NAME = (
+    3,
+    160,
+    1 / 12,
+)  # sheet of planes: columns, least width in pixels, and size of a name relative to a plane
+_EMPTY = "#5a5d63"  # colour of the sheet's empty cells
 _PLANES, _SMOKE, _BOX = "planes", "smoke", "box"
 
 
@@ -40,11 +45,11 @@ def six_way_scene(paths: Sequence[Path], *, title: str, progress: OnProgress | N
 
     Args:
         paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
-        title: Of the window.
+        title: Title of the window.
         progress: Called about twice a second.
 
     Raises:
-        WlmError: A file can't be read, or is of another size than the first.
+        WlmError: A file cannot be read, or has another size than the first one.
     """
     frames: list[SixWay] = []
     meter = Meter(progress, "read", len(paths))
@@ -72,8 +77,8 @@ def volume_scene(frames: Frames, *, title: str, up: int = 1) -> Scene:
     """Makes the scene of a volume, or of the frames of a simulation.
 
     Args:
-        frames: As `wlm.smoke.data.load_frames` opened them.
-        title: Of the window.
+        frames: Frames as `wlm.smoke.data.load_frames` returns them.
+        title: Title of the window.
         up: The axis that points up.
 
     Raises:
@@ -86,11 +91,11 @@ def volume_scene(frames: Frames, *, title: str, up: int = 1) -> Scene:
 
 
 def transmittance(volume: DensityVolume, toward: np.ndarray) -> np.ndarray:
-    """The share of a far light that reaches each voxel's centre.
+    """Computes the transmittance from each voxel's centre to a distant light.
 
     Args:
-        volume: Float32, of any size; it is marched in steps of one voxel.
-        toward: [3], the direction to the light, of length 1.
+        volume: A float32 volume; it is marched in steps of one voxel.
+        toward: [3], unit vector to the light.
 
     Returns:
         float32 [X, Y, Z].
@@ -101,7 +106,7 @@ def transmittance(volume: DensityVolume, toward: np.ndarray) -> np.ndarray:
     step = torch.tensor(np.asarray(toward), dtype=torch.float32)
     depth = torch.zeros(density.shape)
     for number in range(math.ceil(float(shape.norm()))):
-        # The sampler takes z, y, x in [-1, 1] over the box; what is outside of it counts as empty.
+        # The sampler takes z, y, x in [-1, 1] over the box, and reads 0 outside.
         place = (2.0 * (centres + (number + 0.5) * step) / shape - 1.0).flip(-1)
         depth += grid_sample(density[None, None], place[None], align_corners=False)[0, 0]
     return torch.exp(-volume.extinction * volume.voxel * depth).numpy()
@@ -112,7 +117,7 @@ class _SixWayScene(Scene):
     frames: Sequence[SixWay]
 
     def __post_init__(self) -> None:
-        self._brightness = _WHITE / max(max(float(frame.lightmaps.max()) for frame in self.frames), 1e-12)
+        self._brightness = _WHITE / max(1e-12, *(float(frame.lightmaps.max()) for frame in self.frames))
 
     def draw(self, canvas: Canvas, state: State) -> None:
         frame, display = self._frame(state), state.display(self._brightness)
@@ -185,7 +190,7 @@ class _VolumeScene(Scene):
         return f"{shape} voxels{drawn}, extinction {volume.extinction:g}{frames}"
 
     def _world(self, state: State) -> np.ndarray:
-        """Towards the light; turn 0 is along the last axis that isn't up."""
+        """Direction to the light in the world; a turn of 0 is along the last axis that is not up."""
         x, y, z = _toward(state)
         return np.array([x, y, z] if self.up == 1 else [x, -z, y])
 
@@ -199,13 +204,13 @@ class _VolumeScene(Scene):
 
 
 def _toward(state: State) -> np.ndarray:
-    """To the light: right, up and towards the viewer, of length 1."""
+    """Unit vector to the light: right, up and towards the viewer."""
     turn, height = (math.radians(state.values[name]) for name in ("turn", "height"))
     return np.array([math.sin(turn) * math.cos(height), math.sin(height), math.cos(turn) * math.cos(height)])
 
 
 def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
-    """A volume of at most so many voxels: means of cubes, of which the last are cut off where the volume ends."""
+    """Reduces a volume to at most `most` voxels, by averaging cubes of voxels."""
     factor = next(n for n in itertools.count(1) if math.prod(-(-side // n) for side in volume.shape) <= most)
     if factor == 1:
         return volume
@@ -218,7 +223,7 @@ def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
 
 
 def _squares(height: int, width: int) -> np.ndarray:
-    """A ground of squares, float32 [height, width, 3]."""
+    """A checkerboard, float32 [height, width, 3]."""
     side = max(height, width) / _SQUARES
     rows, columns = (np.arange(n) // side for n in (height, width))
     odd = (rows[:, None] + columns) % 2
@@ -226,13 +231,13 @@ def _squares(height: int, width: int) -> np.ndarray:
 
 
 def _sheet(frame: SixWay, display: Display) -> np.ndarray:
-    """The lightmaps, the opacity and the emission with their names, in columns, uint8 [H, W, 3]."""
+    """A sheet of the lightmaps, the opacity and the emission with their names, uint8 [H, W, 3]."""
     planes = {name: display.picture(frame[name].numpy()) for name in DIRECTIONS}
     planes["alpha"] = Display().picture(1.0 - frame.transparency.numpy())
     if frame.emission is not None:
         planes["emission"] = display.picture(frame.emission.numpy())
     height, width = frame.lightmaps.shape[1:]
-    # Small planes would have names larger than themselves.
+    # The names would be larger than small planes.
     enlarged = -(-_LEAST_PLANE // width)
     height, width = height * enlarged, width * enlarged
     sheet = Image.new("RGB", (_COLUMNS * width, -(-len(planes) // _COLUMNS) * height), _EMPTY)

@@ -1,17 +1,36 @@
-"""Scenes of a lightmap on its mesh or as a flat picture: lightmaps over time and lightmaps of meshes."""
+"""Scenes of lightmaps, on their mesh or as a flat picture: lightmaps over time, and lightmaps of meshes."""
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 
+from wlm.atlas.data import LightmappedScene
+from wlm.atlas.model import AtlasModel, unpack_entries
 from wlm.formats.geometry import Geometry
+from wlm.lightmap.data import SheetFrames
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.evaluation import count_kinds, psnr_of
+from wlm.lightmap.model import SheetModel
+from wlm.lightmap.profile import TimeAxis
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind
+from wlm.texels import exposure, fill_gaps
 from wlm.view.canvas import Canvas, Hit
-from wlm.view.scene import Scene, State
+from wlm.view.display import heat
+from wlm.view.scene import Scene, Slider, State
 
 _NO_CHART = 77  # grey level, as on the HTML pages
 _SHARE = 0.6  # opacity of a tile's colour over the light
 _MESH = "mesh"
+_COLOURS = {
+    TileKind.EMPTY: ("grey", (0.15, 0.15, 0.15)),
+    TileKind.CONSTANT: ("blue", (0.25, 0.5, 1.0)),
+    TileKind.STATIC: ("green", (0.2, 0.8, 0.35)),
+    TileKind.DYNAMIC: ("orange", (1.0, 0.45, 0.1)),
+    TileKind.FRAMES: ("violet", (0.65, 0.35, 0.9)),
+}
+"""Name and colour of each kind of tile in the view "tiles"."""
 
 
 def flat_geometry(height: int, width: int) -> Geometry:
@@ -86,3 +105,204 @@ class SurfaceScene(Scene):
 
 def _rgb(light: np.ndarray) -> str:
     return " ".join(f"{value:.4g}" for value in light)
+
+
+def lightmap_scene(
+    model: SheetModel | None,
+    lightmaps: SheetFrames | None,
+    *,
+    title: str,
+    geometry: Geometry | None = None,
+    up: int = 1,
+) -> SurfaceScene:
+    """Makes the scene of a sheet of lightmaps over time: the model, its input, or both side by side.
+
+    Args:
+        model: The model of the sheet; or None.
+        lightmaps: The input of the model's size; or None.
+        title: Title of the window.
+        geometry: The mesh, with lightmap UVs; None for a flat picture.
+        up: The axis that points up.
+    """
+    first = model if model is not None else lightmaps
+    height, width = (model.height, model.width) if model is not None else lightmaps.mask.shape
+    times = first.times
+    low, high = (0.0, first.period) if first.period is not None else (float(times[0]), float(times[-1]))
+    noon = float(times[len(times) // 2])
+    sliders = ()
+    if len(times) > 1:
+        wraps = first.period is not None
+        sliders = (Slider("hour", low, high, noon, (high - low) / 96, wraps=wraps, clock=first.period == 24.0),)
+    scene = _LightmapScene(
+        title,
+        compared(model is not None, lightmaps is not None),
+        views=("light", "tiles") if model is not None else ("light",),
+        sliders=sliders,
+        plays="hour" if sliders else None,
+        flat=geometry is None,
+        up=up,
+        room=geometry is not None and geometry.is_room,
+        geometry=flat_geometry(height, width) if geometry is None else geometry,
+        height=height,
+        width=width,
+        mask=None if lightmaps is None else lightmaps.mask,
+        model=model,
+        lightmaps=lightmaps,
+    )
+    lights = scene.lights(State({"hour": noon}, "light"))
+    scene.brightness = exposure(lights.get("original", next(iter(lights.values()))))
+    return scene
+
+
+@dataclass(kw_only=True)
+class _LightmapScene(SurfaceScene):
+    model: SheetModel | None
+    lightmaps: SheetFrames | None
+
+    def __post_init__(self) -> None:
+        self._shown: tuple[float, dict[str, np.ndarray], str] | None = None
+        self._decoder = None if self.model is None else SheetDecoder(self.model)
+        if self.lightmaps is not None:
+            given = self.lightmaps
+            self._axis = TimeAxis(given.times, given.period, "frames")
+            self._frames = fill_gaps(given.frames, given.mask)
+
+    def lights(self, state: State) -> dict[str, np.ndarray]:
+        hour = self._hour(state)
+        if self._shown is None or self._shown[0] != hour:
+            lights, note = {}, ""
+            if self._decoder is not None:
+                lights["decoded"] = self._decoder.frame(hour)
+            if self.lightmaps is not None:
+                before, after, share = self._axis.neighbours(hour)
+                mixed = (1.0 - share) * self._frames[before] + share * self._frames[after]
+                lights["original"] = mixed.astype(np.float32)
+                if self.model is not None and share == 0.0:
+                    score = psnr_of(self.model, self.lightmaps, before, lights["decoded"])
+                    note = "" if math.isnan(score) else f"PSNR {score:.2f} dB"
+                elif share:
+                    note = f"original interpolated from {self._axis.times[before]:g} and {self._axis.times[after]:g}"
+            self._shown = hour, lights, note
+        return self._shown[1]
+
+    def tile_colours(self) -> np.ndarray:
+        grid = TileGrid.of(self.height, self.width)
+        table = np.array([_COLOURS[kind][1] for kind in sorted(_COLOURS)], np.float32)
+        colours = table[self.model.kind].reshape(grid.rows, grid.cols, 3)
+        whole = colours.repeat(TILE, 0).repeat(TILE, 1)
+        # Dark borders separate tiles of one kind.
+        whole[::TILE] *= 0.3
+        whole[:, ::TILE] *= 0.3
+        return whole[: self.height, : self.width]
+
+    def tell_texel(self, row: int, column: int, state: State) -> str:
+        outside = "" if self.mask is None or self.mask[row, column] else "outside the mask"
+        if self.model is None:
+            return outside
+        number = row // TILE * self.model.grid.cols + column // TILE
+        told = f"tile {number} ({TileKind(self.model.kind[number]).name.lower()})"
+        return "   ".join(filter(None, (told, outside)))
+
+    def caption(self, state: State) -> str:
+        self.lights(state)
+        note = f"; {self._shown[2]}" if self._shown[2] else ""
+        if self.model is None:
+            count = len(self.lightmaps.times)
+            hours = f", {count} hours" if count > 1 else ""
+            return f"{self.lightmaps.name}, {self.width} × {self.height}{hours}{note}"
+        size = f"{self.model.name}, {self.width} × {self.height}, profile {self.model.profile.name}"
+        counts = count_kinds(self.model)
+        kinds = [(kind.name.lower(), _COLOURS[kind][0]) for kind in TileKind if counts[kind.name.lower()]]
+        told = (f"{counts[name]} {name}{f' ({colour})' * (state.view == 'tiles')}" for name, colour in kinds)
+        return f"{size}, tiles: {', '.join(told)}{note}"
+
+    def _hour(self, state: State) -> float:
+        first = self.model if self.model is not None else self.lightmaps
+        return state.values.get("hour", float(first.times[0]))
+
+
+def atlas_scene(
+    scene: LightmappedScene,
+    model: AtlasModel | None = None,
+    original: np.ndarray | None = None,
+    *,
+    title: str,
+    flat: bool = False,
+    up: int = 1,
+) -> SurfaceScene:
+    """Makes the scene of a mesh under its lightmap: the first sheet of a scene in its first state.
+
+    Args:
+        scene: The meshes; without a model their input lightmap is shown.
+        model: The compressed lightmaps; None for the input.
+        original: [H, W, 3], the lightmap that was compressed, shown beside the decoded one; or None.
+        title: Title of the window.
+        flat: Whether the lightmap is shown unwrapped, not on its mesh.
+        up: The axis that points up.
+    """
+    sheet = scene.sheets[0]
+    height, width = sheet.mask.shape
+    shape = Geometry(sheet.position.astype(np.float32), sheet.triangle[sheet.active].astype(np.uint32), sheet.uv)
+    light = {"original": sheet.lightmap} if model is None else {"decoded": model.decoder().lightmap()}
+    if model is not None:
+        light["decoded"] = fill_gaps(light["decoded"], sheet.mask)
+    if original is not None:
+        light["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), sheet.mask)
+    return _AtlasScene(
+        title,
+        compared("decoded" in light, "original" in light),
+        views=("light", "tiles") if model is not None and model.method == "tiles" else ("light",),
+        flat=flat,
+        up=up,
+        room=not flat and shape.is_room,
+        geometry=flat_geometry(height, width) if flat else shape,
+        brightness=exposure(light.get("original", next(iter(light.values())))[sheet.mask]),
+        height=height,
+        width=width,
+        model=model,
+        light=light,
+        mask=sheet.mask,
+    )
+
+
+@dataclass(kw_only=True)
+class _AtlasScene(SurfaceScene):
+    model: AtlasModel | None
+    light: dict[str, np.ndarray]
+
+    def lights(self, state: State) -> dict[str, np.ndarray]:
+        return self.light
+
+    def tile_colours(self) -> np.ndarray:
+        _, size, _ = unpack_entries(self.model.lut, self.model.first_block_code)
+        side = self.model.profile.tile
+        share = size.prod(-1) / (side + 1) ** 2
+        rows, columns = (
+            np.minimum(np.arange(n) // side, count - 1) for n, count in zip(self.mask.shape, share.shape, strict=True)
+        )
+        colours = heat(share)[rows][:, columns] / 255.0
+        colours[::side] *= 0.7
+        colours[:, ::side] *= 0.7
+        return colours
+
+    def tell_texel(self, row: int, column: int, state: State) -> str:
+        outside = "" if self.mask[row, column] else "outside charts"
+        if self.model is None or self.model.method != "tiles":
+            return outside
+        side = self.model.profile.tile
+        y, x = (
+            min(place // side, count - 1) for place, count in zip((row, column), self.model.lut.shape, strict=False)
+        )
+        entries = unpack_entries(self.model.lut, self.model.first_block_code)
+        (left, top), (wide, high), (blocks, _) = (part[y, x] for part in entries)
+        text = f"tile {x}, {y}: {wide} × {high} texels{' of blocks' * bool(blocks)} at {left}, {top}"
+        return text + f"   {outside}" * bool(outside)
+
+    def caption(self, state: State) -> str:
+        if self.model is None:
+            return f"{self.width} × {self.height}, input"
+        size = f"textures {100 * (1.0 - self.model.compression_ratio):.1f}% of half floats"
+        text = f"{self.width} × {self.height}, {size}, method {self.model.method}"
+        if state.view == "tiles":
+            text += f"; a tile's texels: 1 is black, {(self.model.profile.tile + 1) ** 2} is white"
+        return text

@@ -47,6 +47,8 @@ class Window:
         sliders: The sliders by name.
     """
 
+    _played: float
+
     def __init__(
         self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
     ) -> None:
@@ -91,9 +93,9 @@ class Window:
             WlmError: The scene has no such slider, or the value is not finite.
         """
         if name not in self.sliders:
-            raise WlmError(f"{self.scene.title}: --{name} means nothing to this file")
+            raise WlmError(f"{self.scene.title}: {name} has no meaning for this file")
         if not np.isfinite(value):
-            raise WlmError(f"--{name}: expected a finite number, got {value}")
+            raise WlmError(f"{name}: expected a finite number, got {value}")
         self.state.values[name] = self.sliders[name].fit(value)
         self.draw()
 
@@ -137,7 +139,7 @@ class Window:
             WlmError: The angle is not finite.
         """
         if not np.isfinite(degrees):
-            raise WlmError(f"--turn: expected a finite number, got {degrees}")
+            raise WlmError(f"turn: expected a finite number, got {degrees}")
         camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
         focus = np.array(camera.focal_point)
         camera.position = focus + _turned(np.array(camera.position) - focus, axis, np.radians(degrees))

@@ -1,4 +1,4 @@
-"""Hand-written adjoints of sampling a temporal lightmap's maps: each scatters a gradient to the cells it was read from.
+"""Hand-written adjoints of sampling a temporal lightmap's maps: each adds a gradient to the cells that were read.
 
 On CUDA gradients are added as 64-bit integers, since the result of integer addition does not depend on the order and
 one seed must give one result; on the CPU each lane (a range of samples, run by one thread) has its own float buffers.
@@ -18,7 +18,7 @@ from wlm_kernels.lightmap.features import Maps, Offsets
 
 @wp.func
 def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
-    """The linear weights of an axis's two cells; 0 for a cell outside `block`."""
+    """Returns the linear weights of the two cells of an axis; 0 for a cell outside `block`."""
     a = wp.where(first // 4 == block, 1.0 - f, 0.0)
     b = wp.where(second // 4 == block, f, 0.0)
     return wp.vec2(a, b)
@@ -48,7 +48,7 @@ _Spread = wp.types.vector(8, float)
 #endif
 """)
 def _spread_texels(g: wp.vec4) -> _Spread:
-    """Channel l % 4 of the samples of lanes 4 r + l / 8, for lane l."""
+    """Returns channel l % 4 of the samples of lanes 4 r + l / 8, for lane l."""
 
 
 @wp.func_native("""
@@ -68,7 +68,7 @@ def _spread_texels(g: wp.vec4) -> _Spread:
 #endif
 """)
 def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
-    """Adds a g to 4 sums from `at` on and b g to the next 4, if `at` isn't negative; all lanes of a warp call it."""
+    """Adds a g to 4 sums from `at` on and b g to the next 4, if `at` is not negative; all lanes of a warp call it."""
 
 
 @wp.func_native("""
@@ -104,7 +104,7 @@ def _spread_none(g: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """How numbers are added to sums: one number, the sums' type, a block's endpoints, and what these take for g."""
+    """Returns the functions and types of additions: of one number, its type, of the endpoints of a block, and of g."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 

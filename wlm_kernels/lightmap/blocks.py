@@ -1,7 +1,7 @@
 """Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and their texels.
 
-A map of 4 channels is cut into blocks of 4x4 texels. A block holds two endpoints `e0, e1` in [0, 1]^4 and one
-weight in [0, 1] a texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
+A map of 4 channels is cut into blocks of 4x4 texels. A block has two endpoints `e0, e1` in [0, 1]^4 and one
+weight in [0, 1] per texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
 endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
 
 `quantised` evaluates the map on exactly those levels, so that training sees the texels that the file decodes to. The
@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def weight_index(w: float) -> int:
-    """The 4-bit index of a weight; index i stands for the level (64 i + 7) // 15 of 64."""
+    """Returns the 4-bit index of a weight; index i stands for the level (64 i + 7) // 15 of 64."""
     return int(wp.floor(wp.clamp(w, 0.0, 1.0) * 15.0 + 0.5))
 
 
@@ -30,7 +30,7 @@ def index_level(index: int) -> int:
 
 @wp.func
 def ste_weight(w: float, quantised: int) -> float:
-    """The weight as used: clamped, or on its exact level of 64ths. Its derivative is taken as 1."""
+    """Returns the weight as used: clamped, or on its exact level of 64ths. Its derivative is taken as 1."""
     if quantised == 0:
         return wp.clamp(w, 0.0, 1.0)
     return float(index_level(weight_index(w))) / 64.0
@@ -46,7 +46,7 @@ def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
 
 @wp.func
 def endpoint_byte(e: wp.vec4) -> wp.vec4:
-    """The stored bytes (as floats 0..255) of an endpoint, with the better of the two shared lowest bits."""
+    """Returns the stored bytes (as floats 0..255) of an endpoint, with the better of the two shared lowest bits."""
     v = wp.vec4(
         wp.clamp(e[0], 0.0, 1.0) * 255.0,
         wp.clamp(e[1], 0.0, 1.0) * 255.0,
@@ -62,7 +62,7 @@ def endpoint_byte(e: wp.vec4) -> wp.vec4:
 
 @wp.func
 def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
-    """The endpoint as used, in [0, 1]: clamped, or on its exact bytes over 255. Its derivative is taken as 1."""
+    """Returns the endpoint as used, in [0, 1]: clamped, or on its exact bytes / 255. Its derivative is taken as 1."""
     if quantised == 0:
         return wp.vec4(
             wp.clamp(e[0], 0.0, 1.0),
@@ -75,19 +75,19 @@ def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
 
 @wp.func
 def byte_mix(a: float, b: float, w: float) -> float:
-    """BC7's integer interpolation of two bytes with a weight in 64ths, exact in float32."""
+    """Returns BC7's integer interpolation of two bytes with a weight in 64ths, exact in float32."""
     return wp.floor(((64.0 - w) * a + w * b + 32.0) / 64.0)
 
 
 @wp.func
 def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
-    """(1 - w) e0 + w e1 (eq. 8); when quantised, rounded to bytes as the hardware decoder does."""
+    """Returns (1 - w) e0 + w e1 (eq. 8); when quantised, rounded to bytes as the hardware decoder does."""
     if quantised == 0:
         return (1.0 - w) * e0 + w * e1
     a = e0 * 255.0
     b = e1 * 255.0
     k = wp.floor(w * 64.0 + 0.5)
-    # e * 255 is an integer up to float rounding: round first, so that the floor below can't slip.
+    # e * 255 is an integer up to float rounding: round first, so that the floor below is exact.
     return (
         wp.vec4(
             byte_mix(wp.floor(a[0] + 0.5), wp.floor(b[0] + 0.5), k),
@@ -103,7 +103,7 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
 def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
-    """The texel (y, x) of slice s of a map in training."""
+    """Returns the texel (y, x) of slice s of a map in training."""
     e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
     e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
@@ -116,7 +116,7 @@ def bits7(word: wp.uint64, at: int) -> float:
 
 @wp.func
 def stored_texel(blocks: wp.array4d[wp.uint64], s: int, y: int, x: int) -> wp.vec4:
-    """The texel (y, x) of slice s of a map in the file's bytes: BC7 mode 6, in [0, 1]."""
+    """Returns the texel (y, x) of slice s of a stored map: BC7 mode 6, in [0, 1]."""
     low = blocks[s, y // 4, x // 4, 0]
     high = blocks[s, y // 4, x // 4, 1]
     p0 = float(int(wp.rshift(low, wp.uint64(63))))
@@ -209,7 +209,7 @@ def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
 
 
 def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False) -> None:
-    """The adjoint of `reconstruct`, straight through clamps and roundings; the same bits at each run.
+    """The adjoint of `reconstruct`, straight through clamps and roundings; each run gives the same bits.
 
     Args:
         endpoints, weights, quantised: As for `reconstruct`.

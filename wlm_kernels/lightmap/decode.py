@@ -1,9 +1,9 @@
 """Reading temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
 `exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is the
-runtime path: what depends on the time alone is computed once per frame (the two slices of F_uvt are mixed; F_ut and the
-encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is loaded once
-for four.
+runtime path: values that depend on the time alone are computed once per frame (the two slices of F_uvt are mixed; F_ut
+and the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is
+loaded once for four texels.
 
 Read first: `wlm/lightmap/exact.py`, the same decode in NumPy.
 """
@@ -35,7 +35,7 @@ class Stored:
 
 @wp.struct
 class TimeState:
-    """One time, and what turns a network's output y into colour: (shift + spread y) scale."""
+    """One time, and the numbers that turn the output y of a network into colour: (shift + spread y) scale."""
 
     tau: float
     encoding: wp.vec4
@@ -95,7 +95,7 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
 
 @wp.func
 def finish_colour(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
-    """The colour in gamma space, >= 0."""
+    """Returns the colour in gamma space, not below 0."""
     c = wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n])
     return wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0))
 
@@ -123,7 +123,7 @@ def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
 
 @wp.func
 def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
-    """A colour in 8 bits over a bound; alpha is 255."""
+    """Returns a colour in 8 bits relative to a bound; alpha is 255."""
     r = finish_byte(colour[0], inverse_bound)
     g = finish_byte(colour[1], inverse_bound)
     b = finish_byte(colour[2], inverse_bound)
@@ -132,18 +132,18 @@ def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
 
 @wp.func
 def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """The 8-bit output: gamma-space colour over the tile's bound at this time; alpha is 255."""
+    """Returns the 8-bit output: gamma-space colour relative to the bound of the tile at this time; alpha is 255."""
     return bytes_over(finish_colour(time, n, y), time.inverse_peak[n])
 
 
 @wp.func
 def finish_shared(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Linear radiance as RGB9E5."""
+    """Returns linear radiance as RGB9E5."""
     return pack_rgb9e5(finish_radiance(time, n, y))
 
 
 def finish_words(shared: bool) -> Any:
-    """What makes words of a network's output: RGB9E5, or 8 bits over a bound."""
+    """Returns the function that packs the output of a network: as RGB9E5, or as 8 bits relative to a bound."""
     return finish_shared if shared else finish_bytes
 
 
@@ -158,9 +158,9 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any
 
     Returns:
         Two kernels over (tiles, 128, 128). Their inputs are `Stored`, hidden vecH [N, I + H + 2], output vec3
-        [N, H + 1], `TimeState`, places int [N] (of each tile in `TimeState`) and tiles int [n]. Their output is
-        [n, 128, 128]: linear radiance as vec3; 8-bit colour as uint32, RGBA from the lowest byte; or linear radiance as
-        uint32, RGB9E5.
+        [N, H + 1], `TimeState`, places int [N] (position of each tile in `TimeState`) and tiles int [n]. Their output
+        is [n, 128, 128]: linear radiance as vec3; 8-bit colour as uint32, RGBA from the lowest byte; or linear radiance
+        as uint32, RGB9E5.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -229,7 +229,7 @@ def frame_volume(
     # out:
     volume: wp.array3d[wp.vec4],
 ):
-    """F_uvt at one time, centred: [N, R, R]."""
+    """Computes F_uvt at one time, centred: [N, R, R]."""
     n, y, x = wp.tid()
     t = cell(tau, stored.slices)
     ft = fraction(tau, stored.slices)
@@ -276,7 +276,7 @@ class StripKernels:
             volume: vec4 [N, R, R], scratch.
             columns: float [N, H, 128], scratch.
             rows: vec2 [N, 128], scratch.
-            places: int [N], each tile's place in `time`.
+            places: int [N], position of each tile in `time`.
             tiles: int [n], the tiles to decode. The scratch of all N is filled.
             out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
@@ -301,7 +301,7 @@ class StripKernels:
 
 @wp.func
 def centred_texel(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
-    """Texel i of a block with endpoint bytes a and b, as it enters the network."""
+    """Returns texel i of a block with endpoint bytes a and b, as it enters the network."""
     index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
     if i == 0:
         index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
@@ -338,7 +338,7 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
     Args:
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
-        shared: Whether they write RGB9E5 rather than 8 bits.
+        shared: Whether they write RGB9E5 instead of 8 bits.
     """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
     finish = finish_words(shared)
@@ -355,7 +355,8 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         columns: wp.array3d[float],
         rows: wp.array2d[wp.vec2],
     ):
-        """Contribution of F_ut and the time to the first layer of each column, and F_vt of each row, centred."""
+        """Computes the contribution of F_ut and the time to the first layer of each column, and F_vt of each row,
+        centred."""
         n, i = wp.tid()
         p = (float(i) + 0.5) / 128.0
         ut = stored_plane_at(stored.ut, n, p, time.tau, stored.periodic)

@@ -34,7 +34,7 @@ class Maps:
 
 @wp.struct
 class Offsets:
-    """Where the gradients of each map begin in the flat gradient array, in scalars."""
+    """Start of the gradients of each map in the flat gradient array, in scalars."""
 
     uv_endpoints: int
     uv_weights: int
@@ -46,7 +46,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """A plane's value, clamped or on its level; its adjoint is straight-through, in `scatter_plane`."""
+    """Returns the value of a plane, clamped or on its level; its adjoint is straight-through, in `scatter_plane`."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
@@ -143,7 +143,7 @@ class Sample:
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Sample b of tile n at this step: a valid texel and a stored time."""
+    """Draws sample b of tile n at this step: a valid texel and a stored time."""
     state = draw_state(batch, n, b, samples)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
@@ -181,7 +181,7 @@ def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
 
 @wp.func
 def track_error(batch: Batch, lane: int, n: int, k: int, target: wp.vec3, error: wp.vec3):
-    """Adds a sample's error as PSNR measures it, for progress reports alone."""
+    """Adds the error of a sample as PSNR measures it; only progress reports use it."""
     if batch.tracked.shape[0] > 0:
         e = radiance_of(batch, n, k, target + error) - radiance_of(batch, n, k, target)
         wp.atomic_add(batch.tracked, lane, n, k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, k])

@@ -1,9 +1,10 @@
 """Turns the sums of `step` into gradients, and advances the schedule; on a GPU it also moves the parameters.
 
-There Adam is ours, in the launches that sum the gradients: torch's fused one reads and writes them once more, and gives
-each block of threads 65,536 numbers, with which the networks of 64 tiles would keep one to six multiprocessors busy.
+On a GPU the launches that sum the gradients also run Adam: the fused Adam of torch reads and writes the gradients once
+more, and gives each block of threads 65,536 numbers, so that the networks of 64 tiles would use only one to six
+multiprocessors.
 
-Read first: `kernels/stepping.py` in the tests, which reads these gradients and holds them to autograd's.
+Read first: `kernels/stepping.py` in the tests, which reads these gradients and compares them with autograd's.
 """
 
 import warp as wp
@@ -11,7 +12,7 @@ import warp as wp
 
 @wp.func
 def drain(partial: wp.array2d[float], i: int, clear: int) -> float:
-    """The sum of column i, which is cleared if `clear` isn't 0."""
+    """Returns the sum of column i, and clears it if `clear` is not 0."""
     s = float(0.0)
     for p in range(partial.shape[0]):
         s += partial[p, i]
@@ -46,7 +47,7 @@ class Adam:
 
 @wp.func
 def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """A parameter after a step. `corrections`: 1 - decay^t of the gradients, and its root of their squares."""
+    """Returns a parameter after a step. `corrections`: 1 - decay^t of the gradients, and its root of their squares."""
     first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
     second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
     adam.first[i] = first
@@ -87,7 +88,7 @@ def _update_maps(
 
 @wp.func
 def toward(mean: float, value: float) -> float:
-    """A running mean over about 50 steps."""
+    """Returns a running mean over about 50 steps."""
     return mean + (value - mean) * 0.02
 
 

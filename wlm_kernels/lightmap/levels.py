@@ -1,4 +1,4 @@
-"""Networks on 8-bit levels in one launch: of torch's operations it takes some forty, each a launch.
+"""Rounding of networks to 8-bit levels in one launch; operations of torch would take about forty launches.
 
 Read first: `tests/reference/levels.py`, the same in torch, bit for bit.
 """
@@ -17,7 +17,7 @@ def _half(value: float) -> float:
 
 @wp.func
 def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
-    """The weights into one unit, and the bias behind them."""
+    """Rounds the weights into one unit, and copies the bias behind them."""
     most = float(0.0)
     for i in range(rows):
         most = wp.max(most, wp.abs(values[n, first + i, j]))
@@ -51,7 +51,7 @@ def _put_on_levels(
 
 
 def put_on_levels(hidden: wp.array, output: wp.array, hidden_out: wp.array, output_out: wp.array) -> None:
-    """Networks with their weights on levels and their biases as they are.
+    """Rounds the weights of networks to levels; biases are not changed.
 
     Args:
         hidden: float [N, I + H + 2, H], see `wlm_kernels.mlp`.

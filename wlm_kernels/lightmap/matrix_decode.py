@@ -40,7 +40,7 @@ def _frame_planes(
     ut: wp.array2d[wp.vec2],
     vt: wp.array2d[wp.vec2],
 ):
-    """F_ut and F_vt at one time, centred: [N, 128] each."""
+    """Computes F_ut and F_vt at one time, centred: [N, 128] each."""
     n, i = wp.tid()
     p = (float(i) + 0.5) / 128.0
     half = wp.vec2(0.5)
@@ -77,7 +77,7 @@ class MatrixKernels:
             time: The time.
             volume: vec4 [N, R, R], scratch.
             ut, vt: vec2 [N, 128], scratch.
-            places: int [N], each tile's place in `time`.
+            places: int [N], position of each tile in `time`.
             tiles: int [n], the tiles to decode. The scratch of all N is filled.
             out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
@@ -100,7 +100,7 @@ def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
 
     Args:
         hidden: H, a multiple of 16.
-        shared: Whether they write RGB9E5 rather than 8 bits.
+        shared: Whether they write RGB9E5 instead of 8 bits.
 
     Raises:
         ValueError: Another width.

@@ -16,7 +16,7 @@ _WIDEST = 64  # a block's activations and weights then fill its 48 KiB of shared
 
 
 def fits_matrix_units(inputs: int, hidden: int) -> bool:
-    """Whether `matrix_network` has a network's shape."""
+    """Returns whether `matrix_network` supports the shape of a network."""
     return inputs <= _STEP and hidden % _STEP == 0 and hidden <= _WIDEST
 
 
@@ -24,12 +24,12 @@ def fits_matrix_units(inputs: int, hidden: int) -> bool:
 def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     """Builds (once) the `wp.func` that takes a block of `BLOCK` samples of one tile through its network and back.
 
-    Its arguments are the networks `hidden` [N, I + H + 2] and `output` [N, H + 1], see `wlm_kernels.mlp`, and `n`, the
-    block's; of each sample the inputs `f`, the `target` and the channels' `weight`; `share`, which every squared error
-    is multiplied by; `row`, the row of the outputs that the block fills; and the outputs, written: `partial`
-    [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+    Its arguments are the networks `hidden` [N, I + H + 2] and `output` [N, H + 1], see `wlm_kernels.mlp`, and the
+    number `n` of the block's network; the inputs `f`, the `target` and the `weight` of the channels of each sample;
+    `share`, the factor of every squared error; `row`, the row of the outputs that the block fills; and the outputs,
+    written: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
 
-    It gives, of each sample, the gradient of the inputs and behind it the error of the answer.
+    It returns the gradient of the inputs of each sample, followed by the error of the output.
 
     Args:
         inputs, hidden: I and H, as `fits_matrix_units` allows.

@@ -20,7 +20,7 @@ def byte_at(word: wp.uint32, c: int) -> float:
 
 @wp.func
 def with_byte(word: wp.uint32, c: int, share: float) -> wp.uint32:
-    """Sets channel c of a word to a share of 255."""
+    """Returns a word whose channel c is a share of 255."""
     return word | wp.lshift(wp.uint32(int(wp.clamp(share, 0.0, 1.0) * 255.0 + 0.5)), wp.uint32(8 * c))
 
 

@@ -7,8 +7,8 @@ computes the weighted squared error and sums the gradients. `gather` turns the s
 On CUDA networks of up to 64 units, in steps of 16, run on the matrix units in half floats (`matrix_step`), the others
 in float32 as on the CPU.
 
-The sums are in a fixed order or of integers, so that one seed gives one result on one device. A tile's samples depend
-on the seed, the step and its number alone, so that a tile fits to the same result in any batch.
+The sums are integers or have a fixed order, so that one seed gives one result on one device. The samples of a tile only
+depend on the seed, the step and the number of the tile, so that a tile fits to the same result in any batch.
 
 Read first: `tests/reference/temporal.py`, `train_features` and `losses`: the same loss in torch.
 """
@@ -87,7 +87,7 @@ class StepKernels:
 
         Args:
             maps: The parameters.
-            offsets: Of their gradients in `acc`.
+            offsets: Positions of their gradients in `acc`.
             hidden: vecH [N, I + H + 2], see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1].
             batch: The training data.
@@ -96,7 +96,7 @@ class StepKernels:
             partial: float [P, N, I + H + 2, H]: written on CUDA, one P per block; added to on the CPU, one P per lane.
             partial_out: float [P, N, H + 1, 3], likewise.
             loss: float [P, N], likewise: the sum of weighted squared errors over samples and channels / (3 B).
-            base, count: A lane of the CPU: samples base to base + count - 1 of each tile; default all.
+            base, count: The samples of a lane on the CPU, base to base + count - 1 of each tile; default all.
         """
         tiles = hidden.shape[0]
         span = samples if count is None else count
@@ -196,7 +196,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
 
     @wp.struct
     class Pass:
-        """The factors of the gradients: each layer's input and the delta behind it, and the sample's loss."""
+        """The factors of the gradients: the input and the delta of each layer, and the loss of the sample."""
 
         f: vec_in
         h1: vec_hidden

@@ -10,7 +10,7 @@ from benchmarks.rivals.probe_torch import DenseFit
 
 
 def dense(x, values, steps=40, count=12, seed=0, device="cpu", **changes):
-    settings = dict(latent=4, hidden=16, rates=(1e-3, 1e-2, 1e-2, 3e-2, 2e-2), final=1e-3, bits=10)
+    settings = {"latent": 4, "hidden": 16, "rates": (1e-3, 1e-2, 1e-2, 3e-2, 2e-2), "final": 1e-3, "bits": 10}
     return DenseFit(x, values, count=count, steps=steps, seed=seed, device=device, **(settings | changes))
 
 

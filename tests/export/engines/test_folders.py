@@ -66,7 +66,7 @@ def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     """Of a model with mips too: their texture goes with the shader that reads it."""
     mesh = sheet()
     model = random_atlas(mesh, MIXED)
-    model = dataclasses.replace(model, tail=make_tail(mesh, "bc6h"))
+    model = dataclasses.replace(model, tail=make_tail(mesh.sheets[0], "bc6h"))
     for engine in (*ENGINES, None):
         paths = export(model, tmp_path / "out", engine)
         info = json.loads(paths[-1].read_text())

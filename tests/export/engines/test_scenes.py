@@ -76,7 +76,7 @@ def test_inspect_names_a_scenes_files(made, tmp_path):
     """Their pictures are no lightmaps to compress, the file no network."""
     made.save(tmp_path / "made.wlm")
     (file,) = inspect(tmp_path / "made.wlm")
-    assert file.what.startswith("atlas") and not file.command
+    assert file.what.startswith("compressed lightmaps of meshes") and file.command.startswith("wlm web")
     for engine in (*ENGINES, None):
         export(made, tmp_path / f"{engine}", engine)
         (found,) = inspect(tmp_path / f"{engine}")

@@ -70,8 +70,8 @@ def figure(page, name: str) -> str:
 def lightmaps():
     """A dynamic, a static, a constant and an empty tile."""
     frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = small_sets.moving_light().frames
-    frames[:, :128, 128:] = small_sets.static_light().frames / 24.0
+    frames[:, :128, :128] = small_sets.moving_light().light.frames
+    frames[:, :128, 128:] = small_sets.static_light().light.frames / 24.0
     frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
     mask = np.ones((256, 256), bool)
     mask[128:, 128:] = mask[50:60, 90:200] = mask[::16, ::8] = False

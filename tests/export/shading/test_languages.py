@@ -20,7 +20,7 @@ from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
 
 from wlm import probe
-from wlm.atlas.bundles import sheet_texels
+from wlm.atlas.bundle import sheet_texels
 from wlm.atlas.colour import quantise
 from wlm.atlas.decode import Decoder as AtlasDecoder
 from wlm.atlas.exact import decode64

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm.atlas.bundles import bundle as make_bundle
+from wlm.atlas.bundle import bundle as make_bundle
 from wlm.atlas.model import BLOCK_SIDE
 from wlm.bundle import Bundle, Texture
 from wlm.errors import WlmError

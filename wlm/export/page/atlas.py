@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,24 +17,26 @@ from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import Geometry
 from wlm.formats.light import read_light
 from wlm.formats.shared_exponent import pack_rgb9e5
+from wlm.system import load
 from wlm.texels import exposure, fill_gaps
 
 _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "ASTC", "mixed": "RGB9E5"}
 
 
-def model_page(
-    model: AtlasModel, *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
+def atlas_page(
+    paths: Sequence[Path], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
     """Makes the page of a model with one lightmap.
 
     Args:
-        model: The model.
+        paths: The model's file.
         original: The lightmap that was compressed, to compare with.
         up: The axis that points up in the scene.
 
     Raises:
-        WlmError: The model has several lightmaps, or the original can't be read or has another size.
+        WlmError: The model has several lightmaps, or the original cannot be read or has another size.
     """
+    model = load(paths[0], "atlas")
     if model.method == "shared":
         raise WlmError(f"{model.name}: the page shows one lightmap, found {len(model.sheets) * len(model.states)}")
     mesh, (height, width) = model.scene.sheets[0], model.sheets[0].size

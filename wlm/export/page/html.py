@@ -1,4 +1,4 @@
-"""One HTML file: our script and style, a manifest, and arrays that zlib packed and base64 made text of."""
+"""Writes a page as one HTML file: scripts and style, a JSON manifest, and arrays compressed by zlib in base64."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.geometry import Geometry
 
-_ALIGNMENT = 16  # bytes, of an array in the content
+_ALIGNMENT = 16  # bytes; alignment of arrays in the content
 _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "light.js", "surface.js", "reading.js")
 
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """What a page shows.
+    """The content of a page.
 
     Attributes:
-        kind: `lightmap`, `atlas`, `probe` or `smoke`: whose script it runs.
-        title: Above the panel, and of the browser's window.
-        note: A sentence below it; may be empty.
+        kind: `lightmap`, `atlas`, `probe` or `smoke`; selects the script.
+        title: Title of the panel and of the browser's window.
+        note: Sentence below the title; may be empty.
         figures: Names and texts of the panel's table.
         manifest: JSON values for the script.
-        arrays: By name; bytes are carried as they are.
-        scripts: Texts of further scripts that the kind's own needs.
+        arrays: Arrays for the script by name, stored byte by byte.
+        scripts: Further scripts that the script of the kind needs.
     """
 
     kind: str
@@ -45,13 +45,13 @@ class Page:
     scripts: Sequence[str] = ()
 
     def write(self, path: str | os.PathLike[str]) -> int:
-        """Writes the page, whole or not at all.
+        """Writes the page atomically.
 
         Returns:
-            The file's size, bytes.
+            Size of the file in bytes.
 
         Raises:
-            WlmError: A number of the manifest isn't finite, or the file can't be written.
+            WlmError: A number of the manifest is not finite, or the file cannot be written.
         """
         content, places = bytearray(), {}
         for name, values in self.arrays.items():
@@ -69,7 +69,7 @@ class Page:
             "bytes": len(content),
         }
         try:
-            # No "<" in a script: a name could otherwise end it.
+            # Without "<" no name can end the script element.
             text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
         except ValueError as error:
             raise WlmError(f"{self.title}: cannot be shown: a number is NaN or infinite") from error
@@ -80,14 +80,14 @@ class Page:
             "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
             "SCRIPT": "\n".join([*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]),
         }
-        # Cut first, then filled: what goes in may hold a mark too.
+        # The template is split before it is filled, since the parts may contain marks.
         first, *rest = _asset("page.html").split("@")
         page = [first, *(pieces.get(part, part) for part in rest)]
         return atomic_write(path, "".join(page).encode())
 
 
 def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of triangles by the names that the script knows, and for the manifest the box that its camera sees."""
+    """Returns the arrays of a mesh by the script's names, and the manifest's entries about its bounding box."""
     parts = {"position": geometry.position, "triangles": geometry.triangle, "uv": geometry.uv}
     low, high = geometry.box
     box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up), "inward": geometry.is_room}

@@ -1,9 +1,11 @@
-"""The page of lightmaps over the day."""
+"""The page of lightmaps over time."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +19,10 @@ from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.data import SheetFrames, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
-from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.model import SheetModel
 from wlm.lightmap.sheet import LIGHT, first_light
 from wlm.system import Meter, OnProgress
+from wlm.system import load as load_model
 from wlm.texels import exposure, fill_gaps
 
 _DESCRIBED = (
@@ -29,8 +32,7 @@ _DESCRIBED = (
 
 
 def lightmap_page(
-    model: LightmapModel,
-    file_bytes: int,
+    paths: Sequence[Path],
     *,
     mesh: str | os.PathLike[str] | None = None,
     original: str | os.PathLike[str] | None = None,
@@ -41,15 +43,15 @@ def lightmap_page(
     """Makes the page of the first sheet of light of a lightmap model.
 
     Args:
-        model: The model.
-        file_bytes: Size of its file.
+        paths: The model's file.
         mesh, original, hours, up, progress: As for `wlm.export.page.pages.make_page`.
 
     Raises:
-        WlmError: The mesh or the set can't be read, or the set is of another size.
+        WlmError: The mesh or the set cannot be read, or the set has another size.
     """
-    sheet, others = first_light(model.sheets), len(model.sheets) - 1
-    whole, model = model, model.sheets[sheet]
+    whole, file_bytes = load_model(paths[0], "lightmap"), paths[0].stat().st_size
+    sheet, others = first_light(whole.sheets), len(whole.sheets) - 1
+    model = whole.sheets[sheet]
     bundle = sheet_bundle(sheet, model, whole.name, whole.source)
     textures = {name: texture for name, texture in bundle.textures.items() if name != "valid"}
     described = {name: bundle.document[name] for name in _DESCRIBED}
@@ -65,7 +67,7 @@ def lightmap_page(
     if original is not None:
         reference, originals = _originals(model, load(original).find(sheet), original, hours, progress)
         arrays |= originals
-        # A page begins where its original is.
+        # The page starts at an hour with an original.
         time = min(reference["times"], key=lambda stored: abs(stored - time))
     manifest: dict[str, Any] = {
         "width": model.width,
@@ -89,7 +91,7 @@ def lightmap_page(
     ]
     if reference is not None:
         manifest["reference"] = reference
-    note = "Lightmaps over the day, decoded on this GPU."
+    note = "Lightmaps over time, decoded on this GPU."
     if sheet != LIGHT or others:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
         note += f" Shown is {sheet.label}{rest}."
@@ -103,7 +105,7 @@ def _originals(
     hours: int,
     progress: OnProgress | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Some frames of the set, spread evenly, their gaps filled: what a filter would read there; with their scores."""
+    """Returns evenly spread frames of the set with filled gaps, and their scores."""
     if hours < 1:
         raise WlmError(f"--hours: expected at least 1, got {hours}")
     size = lightmaps.mask.shape
@@ -113,7 +115,7 @@ def _originals(
     chosen = np.unique(np.linspace(0, count - 1, min(hours, count)).round().astype(int))
     frames = fill_gaps(lightmaps.frames[chosen], lightmaps.mask)
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
-    # Texels outside of it were never compressed: they have no error.
+    # Texels outside of the mask were not compressed and have no error.
     arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
     times, decoder, scores = lightmaps.times[chosen].tolist(), SheetDecoder(model), []
     meter = Meter(progress, "score", len(times))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,11 +16,11 @@ from wlm.formats.geometry import read_geometry
 from wlm.probe.bundle import bundle
 from wlm.probe.data import load
 from wlm.probe.evaluation import evaluate
-from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.sphere import sh_count
+from wlm.system import load as load_model
 
-_BANDS = 9  # coefficients that diffuse light needs
+_BANDS = 9  # coefficients for diffuse light
 _BUFFERS = ("gaussians", "network", "probes")
 
 _BETWEEN = """
@@ -59,8 +61,7 @@ void wlm_probe_sh(vec3 position, out vec3 sh[COUNT])
 
 
 def probe_page(
-    model: ProbeModel,
-    file_bytes: int,
+    paths: Sequence[Path],
     *,
     mesh: str | os.PathLike[str] | None = None,
     original: str | os.PathLike[str] | None = None,
@@ -70,16 +71,16 @@ def probe_page(
     """Makes the page of a probe model: spheres at its positions or at those of the original.
 
     Args:
-        model: The model.
-        file_bytes: Size of its file.
+        paths: The model's file.
         mesh, original, key, up: As for `wlm.export.page.pages.make_page`.
 
     The page holds the buffers of the model's bundle.
 
     Raises:
-        WlmError: A probe's numbers are no spherical harmonics; the positions are not known; the mesh or the original
-            can't be read, or is of other probes.
+        WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the
+            original cannot be read; or the original has other probes.
     """
+    model, file_bytes = load_model(paths[0], "probe"), paths[0].stat().st_size
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")

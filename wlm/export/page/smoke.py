@@ -14,7 +14,7 @@ from wlm.smoke.data import read_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.system import Meter, OnProgress
 
-_WHITE = 0.8  # of the screen, where the brightest lightmap is
+_WHITE = 0.8  # screen value of the brightest lightmap
 
 
 def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
@@ -26,7 +26,7 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
         progress: Called about twice a second.
 
     Raises:
-        WlmError: A file can't be read or is of another size, or the rate isn't above 0.
+        WlmError: A file cannot be read or has another size, or the rate is not above 0.
     """
     if not 0 < rate < float("inf"):
         raise WlmError(f"--rate: expected a number above 0, got {rate}")
@@ -40,7 +40,7 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
         if sizes[i] != sizes[0]:
             raise WlmError(f"{path}: expected {sizes[0]} pixels as the first frame, found {sizes[i]}")
         planes, scales = _planes(frame)
-        # sRGB-like codes of 8 bits: what a flip book has.
+        # Square roots in 8 bits, whose steps are perceptually more even.
         codes = np.round(np.sqrt(planes) * 255.0).astype(np.uint8).transpose(1, 2, 0)
         arrays[f"first_{i}"], arrays[f"second_{i}"] = codes[..., :4], codes[..., 4:]
         most.append(scales)
@@ -66,7 +66,7 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
 
 
 def _planes(frame: SixWay) -> tuple[np.ndarray, list[float]]:
-    """The eight planes in [0, 1], and by what to multiply the lightmaps, the opacity and the emission."""
+    """Returns the eight planes in [0, 1], and the factors of the lightmaps, the opacity and the emission."""
     lightmaps = frame.lightmaps.numpy().clip(0.0, None)
     opacity = np.ones_like(lightmaps[0]) if frame.transparency is None else 1.0 - frame.transparency.numpy()
     glow = np.zeros_like(lightmaps[0]) if frame.emission is None else frame.emission.numpy().clip(0.0, None)

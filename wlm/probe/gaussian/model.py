@@ -19,6 +19,7 @@ ellipsoid with its axes in another order. The rotation with the smallest angle i
 """
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -158,14 +159,10 @@ class Gaussians(Content):
         return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
-        from wlm.probe.gaussian.decode import GaussianDecoder
-
-        return GaussianDecoder(model, device, **options)
+        return import_module("wlm.probe.gaussian.decode").GaussianDecoder(model, device, **options)
 
     def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
-        from wlm.probe.gaussian.bundle import gaussian_bundle
-
-        return gaussian_bundle(model, decoder)
+        return import_module("wlm.probe.gaussian.bundle").gaussian_bundle(model, decoder)
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}

@@ -9,6 +9,7 @@ for Precomputed Radiance Transfer (2003), use several clusters; on sets this sma
 """
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -51,14 +52,10 @@ class Components(Content):
         return component_bytes(len(self.code), self.outputs, self.count, identity=not len(self.basis))
 
     def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
-        from wlm.probe.pca.decode import ComponentDecoder
-
-        return ComponentDecoder(model, device, **options)
+        return import_module("wlm.probe.pca.decode").ComponentDecoder(model, device, **options)
 
     def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
-        from wlm.probe.pca.bundle import component_bundle
-
-        return component_bundle(model, decoder)
+        return import_module("wlm.probe.pca.bundle").component_bundle(model, decoder)
 
     def facts(self) -> dict[str, Any]:
         return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}

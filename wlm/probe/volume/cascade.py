@@ -23,6 +23,7 @@ Everything except the windows' origins is computed on the device in launches of 
 graph.
 """
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -411,7 +412,7 @@ def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, r
     """Checks the ranges of settings."""
     if block is not None and not _SMALLEST <= block <= 1.0 / _SMALLEST:
         raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
-    rising = list(ratios[:1]) == [1] and all(a < b for a, b in zip(ratios, ratios[1:], strict=False))
+    rising = list(ratios[:1]) == [1] and all(a < b for a, b in itertools.pairwise(ratios))
     if not rising or len(ratios) > frame_kernels.LEVELS or any(r & (r - 1) or r > 1024 for r in ratios):
         raise WlmError(f"volume ratios: expected up to 8 rising powers of two from 1 to 1024, got {list(ratios)}")
     if not 2 <= side <= _LONGEST or side % 2:

@@ -86,7 +86,7 @@ def pack(
 
 def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
     """Lays pictures [N, H, W, C] out in cells of one texture, each with `padding` pixels that repeat its border."""
-    count, height, width, channels = frames.shape
+    _count, height, width, channels = frames.shape
     page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
     around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
     for i, cell in enumerate(np.pad(frames, around, mode="edge")):

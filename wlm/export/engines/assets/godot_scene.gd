@@ -1,10 +1,10 @@
-## Gives the meshes below this node their parts of the compressed lightmaps of a scene. See README.md.
+## Lights the meshes below this node with their parts of a scene's compressed lightmaps. See README.md.
 @tool
 extends Node
 
 ## The folder of the export.
 @export_dir var folder: String = "res://scene"
-## A state's number; between two they are mixed.
+## Index of a state; between two states they are mixed.
 @export var state: float = 0.0: set = set_state
 
 var _info: Dictionary = {}
@@ -52,7 +52,7 @@ func _lit(shader: Shader, object: Dictionary, old: BaseMaterial3D) -> ShaderMate
 	return material
 
 
-## The layers of a picture, one below the other.
+## Splits a picture into layers, which are stacked from top to bottom.
 func _layers(picture: Texture2D, height: int) -> Texture2DArray:
 	var image: Image = picture.get_image()
 	var images: Array[Image] = []

@@ -1,11 +1,11 @@
-// A compressed lightmap for three.js' WebGLRenderer, read in the materials' own shaders.
+// A compressed lightmap for the WebGLRenderer of three.js, read in the materials' shaders.
 //
 //     import * as THREE from 'three';
 //     import { loadAtlas } from './atlas.js';
 //     const atlas = await loadAtlas(new URL('bundle.json', import.meta.url), THREE);
 //     model.traverse((mesh) => mesh.material && atlas.apply(mesh.material));
 //
-// `model` is mesh.glb, or any with its UVs. three.js divides what a lightMap gives by pi.
+// `model` is mesh.glb, or a mesh with its UVs. three.js divides the value of a lightMap by pi.
 
 @DDS@
 
@@ -19,7 +19,7 @@ export async function loadAtlas(url, THREE) {
   return {
     info,
     textures,
-    // The light on a material of three.js; `channel`: n of its mesh's TEXCOORD_n.
+    // Lights a material; `channel` is n of its mesh's TEXCOORD_n.
     apply(material, channel = info.uv_set) {
       colour.channel = channel;
       material.lightMap = colour;
@@ -32,7 +32,7 @@ export async function loadAtlas(url, THREE) {
           .replaceAll('texture2D( lightMap, vLightMapUv )', 'vec4( wlm_atlas( vLightMapUv ), 1.0 )')
           .replace('void main() {', `${shader}\nvoid main() {`);
       };
-      // Of one lightmap there may be atlases of several methods.
+      // Kits of one lightmap can differ in method, so the shader is the key of the program.
       material.customProgramCacheKey = () => shader;
       material.needsUpdate = true;
     },

@@ -1,4 +1,4 @@
-// The compressed lightmaps of a scene for three.js' WebGLRenderer, read in the materials' own shaders.
+// The compressed lightmaps of a scene for the WebGLRenderer of three.js, read in the materials' shaders.
 //
 //     import * as THREE from 'three';
 //     import { loadScene } from './scene.js';
@@ -6,7 +6,7 @@
 //     light.apply(gltf.scene);  // of mesh.glb, by GLTFLoader
 //     light.setState(1.5);      // half-way from the second of `light.info.states` to the third
 //
-// three.js divides what a lightMap gives by pi.
+// three.js divides the value of a lightMap by pi.
 
 @DDS@
 
@@ -18,12 +18,12 @@ export async function loadScene(url, THREE) {
   await Promise.all(Object.entries(info.textures).map(async ([name, entry]) => {
     shared[`wlm_scene_${name}`] = {value: await readDds(entry, base, THREE)};
   }));
-  // What switches the materials' lightmap on; the shader reads the others in its place.
+  // Turns on the lightmap code of the materials; the shader reads the other textures instead.
   const shown = new THREE.DataTexture(new Uint8Array(4), 1, 1);
   shown.channel = info.uv_set;
   const made = new Map();
 
-  // A material of its own for each place: objects share materials, and not their part of the lightmaps.
+  // One material for each position in the lightmaps: objects may share materials, but not their part of the lightmaps.
   const lit = (material, object) => {
     const key = `${material.uuid} ${object.sheet} ${object.scale_offset}`;
     if (!made.has(key)) made.set(key, withLight(material.clone(), object));
@@ -49,7 +49,7 @@ export async function loadScene(url, THREE) {
 
   const light = {
     info,
-    // A state's number; between two they are mixed.
+    // Sets the state by its index; between two states they are mixed.
     setState(number) {
       state.value = number;
     },
@@ -61,7 +61,7 @@ export async function loadScene(url, THREE) {
           const all = each.material;
           each.material = Array.isArray(all) ? all.map((one) => lit(one, own)) : lit(all, own);
         }
-        // A node's primitives, where it has several, are below it; the loader gives names to nodes, and none to those.
+        // The primitives of a node with several are its children; the loader names nodes, but not these.
         for (const child of each.children) visit(child, each.isMesh || child.userData.name ? undefined : own);
       };
       visit(root, undefined);

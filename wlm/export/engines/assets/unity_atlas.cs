@@ -1,4 +1,4 @@
-// A compressed lightmap: puts its textures on the materials of this object's renderers. See README.md.
+// Sets the textures of a compressed lightmap on the renderers below this object. See README.md.
 using System;
 using UnityEngine;
 using UnityEngine.Experimental.Rendering;
@@ -6,7 +6,7 @@ using UnityEngine.Experimental.Rendering;
 [ExecuteAlways]
 public class WlmAtlas : MonoBehaviour
 {
-    [Tooltip("The files of bytes; those that the export lacks stay empty.")]
+    [Tooltip("The .bytes files of the same names; leave the fields without a file empty.")]
     public TextAsset colour, lut, blocks;
 
     readonly System.Collections.Generic.List<Texture> made = new();

@@ -43,7 +43,7 @@ Shader "Wlm/Atlas"
                 made.place = second;
             #endif
             #ifndef WLM_V_DOWN
-                // Importers turn glTF's v round.
+                // Importers flip v of glTF.
                 made.place.y = 1.0 - made.place.y;
             #endif
                 return made;

@@ -1,4 +1,4 @@
-// The compressed lightmaps of a scene: gives the renderers below this object their parts. See README.md.
+// Lights the renderers below this object with their parts of a scene's compressed lightmaps. See README.md.
 using System;
 using System.Collections.Generic;
 using UnityEngine;
@@ -9,7 +9,7 @@ public class WlmScene : MonoBehaviour
 {
     [Tooltip("bundle.json and the .bytes files of the same names; not every scene has blocks.")]
     public TextAsset bundle, sheets, lut, factors, colour, blocks;
-    [Tooltip("A state's number; between two they are mixed.")]
+    [Tooltip("Index of a state; between two states they are mixed.")]
     public float state;
 
     [Serializable]
@@ -41,7 +41,7 @@ public class WlmScene : MonoBehaviour
             textures["wlm_scene_blocks"] = ReadDds(blocks, true);
         foreach (Renderer each in GetComponentsInChildren<Renderer>())
         {
-            // A node of several primitives is an object with one below it for each.
+            // A node of several primitives is an object with a child for each.
             Place found = null;
             for (Transform at = each.transform; found == null && at != null && at != transform.parent; at = at.parent)
                 found = Array.Find(read.objects, place => place.label == at.name);

@@ -39,7 +39,7 @@ Shader "Wlm/Scene"
                 made.uv = TRANSFORM_TEX(first, _MainTex);
                 made.place = second;
             #ifndef WLM_V_DOWN
-                // Importers turn glTF's v round.
+                // Importers flip v of glTF.
                 made.place.y = 1.0 - made.place.y;
             #endif
                 return made;

@@ -1,4 +1,4 @@
-// A mesh's lightmap, read in the fragment shader by the exported function.
+// The page of a mesh's lightmap, which the exported function reads in the fragment shader.
 
 class AtlasPage {
   constructor(graphics, page, panel, changed) {
@@ -16,13 +16,13 @@ class AtlasPage {
     if (page.has('lut')) {
       const [across, down] = manifest.atlas.lut, tiles = manifest.atlas.method === 'tiles';
       const lut = this.lut = page.array('lut', Uint16Array);
-      // Normalised 16-bit textures are missing in browsers, so coordinates travel on as floats.
+      // Normalised 16-bit textures are missing in browsers, so coordinates are uploaded as floats.
       this.textures.wlm_atlas_lut = tiles
         ? graphics.plain(across, down, [gl.RG16UI, gl.RG_INTEGER, gl.UNSIGNED_SHORT], lut, gl.NEAREST)
         : graphics.plain(across, down, [gl.RG32F, gl.RG, gl.FLOAT], Float32Array.from(lut, (x) => x / 65535),
           graphics.floatLinear ? gl.LINEAR : gl.NEAREST);
     }
-    // Four texels mixed in floats: the filter unit's eight bits show in large tiles.
+    // Texels are mixed in floats: the eight bits of the texture filter are visible in large tiles.
     this.source = `#define WLM_ATLAS_EXACT\n${manifest.shader}\nvec3 wlm_light() { return wlm_atlas(v_coordinate); }`;
     this.display = new Display(page, panel, changed);
     const tell = (...texel) => this.#tell(...texel);
@@ -34,7 +34,7 @@ class AtlasPage {
     this.surface.draw(this.textures, this.display.compares ? this.originals.get(0) : undefined);
   }
 
-  // What is known of a texel.
+  // Describes a texel.
   #tell(column, row, coordinate) {
     const {originals} = this, [red, green, blue] = this.#light(coordinate);
     return {
@@ -55,7 +55,7 @@ class AtlasPage {
     return `tile ${x}, ${y}: ${wide} × ${high} texels${blocks ? ' of blocks' : ''} at ${left}, ${top}`;
   }
 
-  // For scripts: light at coordinates [N, 2], RGBA.
+  // For scripts: RGBA light at coordinates [N, 2].
   async read(coordinates) { return this.#light(coordinates); }
 
   #light(coordinates) {

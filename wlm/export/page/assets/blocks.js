@@ -1,6 +1,6 @@
-// BC7 blocks of all modes to RGBA of 8 bits, for browsers that can't take them.
+// Decodes BC7 blocks of all modes to RGBA8, for browsers without block compression.
 
-// Of each mode: subsets; bits of the partition's number, the rotation and the index selection; of a colour and an alpha
+// For each mode: subsets; bits of the partition's number, the rotation and the index selection; of a colour and an alpha
 // of an endpoint; P bits of each endpoint and of each subset; bits of an index, and of the second index.
 const MODES = [
   [3, 4, 0, 0, 4, 0, 1, 0, 3, 0], [2, 6, 0, 0, 6, 0, 0, 1, 3, 0], [3, 6, 0, 0, 5, 0, 0, 0, 2, 0],
@@ -8,7 +8,7 @@ const MODES = [
   [1, 0, 0, 0, 7, 7, 1, 0, 4, 0], [2, 6, 0, 0, 5, 5, 1, 0, 2, 0],
 ];
 const hexadecimal = (text) => text.trim().split(/\s+/).map((word) => parseInt(word, 16));
-// By the number of subsets less one: the subset of each texel, in one bit or two; and the subsets' anchors, a digit for
+// For two and three subsets: the subset of each texel, in one bit or two; and the subsets' anchors, a digit for
 // each partition, whose indices have one bit less.
 const PARTITIONS = [[0], hexadecimal(`
   CCCC 8888 EEEE ECC8 C880 FEEC FEC8 EC80 C800 FFEC FE80 E800 FFE8 FF00 FFF0 F000
@@ -42,7 +42,7 @@ function unpackBlocks(bytes, width, height) {
   return texels;
 }
 
-// Writes the texels of a block of four words at a place of `texels`; `ends` and `shares` are scratch.
+// Decodes a block of four words into `texels` at an offset; `ends` and `shares` are scratch.
 function unpackBlock(block, ends, shares, texels, place, width) {
   const mode = 31 - Math.clz32(block[0] & -block[0]);
   if (!(mode in MODES)) throw new Error('the page is damaged: a block is of no BC7 mode');

@@ -1,11 +1,11 @@
-// An orbit round a scene, or a flat picture that can be moved and enlarged; mouse, wheel, fingers.
+// Camera: an orbit around a scene, or a flat picture that can be moved and zoomed; by mouse, wheel and touch.
 
 const mix = (a, b, t) => a + (b - a) * t;
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 
-// The lines of the help on the mouse and on fingers; `drag` is what one of them does, `reset` begins again.
+// Lines of the help on mouse and touch; `drag` is the effect of dragging, `reset` resets the view.
 function explainCamera(panel, drag, reset) {
   panel.explain('drag', drag);
   if (drag !== 'move') panel.explain('shift + drag', 'move');
@@ -17,7 +17,7 @@ const FOCAL = 2.4;  // of the perspective, in halves of the picture's height
 const FILLED = 0.93;  // of the picture, at first
 
 class Camera {
-  // `low`, `high`: the corners of what is to be seen; `up`: 1 for y, 2 for z.
+  // `low`, `high`: corners of the visible box; `up`: 1 for y, 2 for z.
   constructor(canvas, low, high, {flat = false, up = 1, changed}) {
     Object.assign(this, {canvas, low, high, flat, up, changed, pointers: new Map(), active: true});
     this.reset();
@@ -34,7 +34,7 @@ class Camera {
       if (this.active) this.#zoom(Math.exp(event.deltaY * 0.001));
     }, {passive: false});
     canvas.addEventListener('dblclick', () => this.reset());
-    // The right button moves too.
+    // The right button moves the view, too.
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     this.started = true;
   }
@@ -66,7 +66,7 @@ class Camera {
       this.#pan(0.5 * dx, 0.5 * dy);
       this.#zoom(span(before) / span(now));
     } else if (this.still && !event.shiftKey) {
-      // One finger has another use.
+      // A single touch has another use.
     } else if (this.flat || event.shiftKey || event.buttons & 6) this.#pan(dx, dy);
     else {
       this.yaw -= dx * 0.006;
@@ -81,11 +81,11 @@ class Camera {
     this.centre = this.centre.map((x, i) => x - step * (dx * right[i] - dy * above[i]));
   }
 
-  // Half the height of what is seen, in the scene's unit.
+  // Half the height of the visible region, in scene units.
   #reach() {
     const aspect = this.canvas.clientWidth / this.canvas.clientHeight;
     if (!this.flat) {
-      // At first each corner of the box is within the picture; a near one seems further from its middle.
+      // Initially each corner of the box is inside the picture; near corners are further from its middle.
       const each = this.corners.map(([x, y, z]) => Math.max(Math.abs(y), Math.abs(x) / aspect) / FILLED + z / FOCAL);
       return this.distance * Math.max(...each, 1e-9);
     }
@@ -103,7 +103,7 @@ class Camera {
     return {right, above: cross(toward, right), toward};
   }
 
-  // World to clip, by columns: a parallel view of pictures, a perspective one of scenes.
+  // The matrix from world to clip space, column-major: orthographic for pictures, perspective for scenes.
   matrix() {
     const {right, above, toward} = this.#axes(), reach = this.#reach();
     const aspect = this.canvas.clientWidth / this.canvas.clientHeight;

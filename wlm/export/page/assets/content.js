@@ -1,4 +1,4 @@
-// What the page carries: a manifest in JSON, and arrays in one block that zlib packed and base64 made text of.
+// The content of the page: a JSON manifest, and arrays in one block, compressed by zlib and encoded in base64.
 
 async function readContent() {
   const manifest = JSON.parse(document.getElementById('manifest').textContent);
@@ -7,7 +7,7 @@ async function readContent() {
   if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old to unpack the page');
   let bytes;
   try {
-    // The stream checks zlib's sum over everything that it gives.
+    // The stream verifies zlib's checksum.
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'));
     bytes = await new Response(stream).arrayBuffer();
   } catch {

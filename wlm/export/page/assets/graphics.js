@@ -1,4 +1,4 @@
-// A thin layer over WebGL2: programs with their uniforms by name, textures, targets.
+// A thin layer over WebGL2: programs with uniforms by name, textures, render targets.
 
 const HEAD = `#version 300 es
 precision highp float;
@@ -8,7 +8,7 @@ precision highp usampler2D;
 precision highp sampler2DArray;
 `;
 
-// One triangle over the whole target.
+// A triangle that covers the whole target.
 const WHOLE = `${HEAD}
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
@@ -18,7 +18,7 @@ class Graphics {
     if (!gl) throw new Error('this browser has no WebGL2');
     this.gl = gl;
     this.canvas = canvas;
-    // `#unpacked` at the end of the address tries what browsers without block compression do.
+    // `#unpacked` at the end of the address acts as if the browser had no block compression.
     this.bptc = location.hash === '#unpacked' ? null : gl.getExtension('EXT_texture_compression_bptc');
     if (!gl.getExtension('EXT_color_buffer_float')) throw new Error('this browser can not draw into float textures');
     this.floatLinear = gl.getExtension('OES_texture_float_linear');
@@ -44,7 +44,7 @@ class Graphics {
     return {program, places, attribute: (name) => gl.getAttribLocation(program, name)};
   }
 
-  // Makes a program current and sets uniforms: numbers, vectors, matrices; textures take units in their order.
+  // Activates a program and sets its uniforms: numbers, vectors, matrices; textures get units in order.
   use(program, values) {
     const {gl} = this;
     gl.useProgram(program.program);
@@ -78,14 +78,14 @@ class Graphics {
     return {target, texture};
   }
 
-  // A texture of plain texels; `form` is [internal format, format, type].
+  // Makes a texture of uncompressed texels; `form` is [internal format, format, type].
   plain(width, height, form, values, filter, wraps) {
     const {gl} = this, result = this.#texture(gl.TEXTURE_2D, filter, wraps);
     gl.texImage2D(gl.TEXTURE_2D, 0, form[0], width, height, 0, form[1], form[2], values);
     return {...result, width, height};
   }
 
-  // Blocks of BC7, uploaded as they are where the browser takes them.
+  // Makes a texture of BC7 blocks, which are unpacked if the browser does not support them.
   blocks(width, height, bytes, filter) {
     const {gl} = this;
     if (!this.bptc) return this.plain(width, height, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], unpackBlocks(bytes, width, height), filter);
@@ -109,14 +109,14 @@ class Graphics {
     else gl.texSubImage3D(...place, gl.RGBA, gl.UNSIGNED_BYTE, unpackBlocks(data, width, height));
   }
 
-  // Floats as a texture of four each, 1,024 a row.
+  // Makes a texture of RGBA floats, 1,024 texels a row.
   fours(values) {
     const {gl} = this, padded = new Float32Array(4096 * Math.max(Math.ceil(values.length / 4096), 1));
     padded.set(values);
     return this.plain(1024, padded.length / 4096, [gl.RGBA32F, gl.RGBA, gl.FLOAT], padded, gl.NEAREST);
   }
 
-  // Float32 or uint32 numbers as a texture that `fetch` reads by their index.
+  // Makes a texture of float32 or uint32 numbers, which `fetch` reads by index.
   numbers(values) {
     const {gl} = this, whole = values instanceof Uint32Array, rows = Math.max(Math.ceil(values.length / 1024), 1);
     const padded = new values.constructor(rows * 1024);
@@ -125,7 +125,7 @@ class Graphics {
     return this.plain(1024, rows, form, padded, gl.NEAREST);
   }
 
-  // A texture to draw into, with its frame buffer; `depth`: what is nearer hides what is behind it.
+  // Makes a render target with its frame buffer; `depth` adds a depth buffer.
   target(width, height, form, filter, {depth = false} = {}) {
     const {gl} = this, result = this.plain(width, height, form, null, filter);
     result.buffer = gl.createFramebuffer();
@@ -139,7 +139,7 @@ class Graphics {
     return result;
   }
 
-  // Gives the memory of textures and targets back.
+  // Frees textures and targets.
   discard(...items) {
     for (const {texture, buffer} of items) {
       this.gl.deleteTexture(texture);
@@ -153,7 +153,7 @@ class Graphics {
 
   draw(vertices) { this.gl.drawArrays(this.gl.TRIANGLES, 0, vertices); }
 
-  // RGBA of a target, as floats, row 0 first. Waits for all that was drawn before.
+  // Reads a target as RGBA floats, row 0 first. Waits until drawing is done.
   read(target, width = target.width, height = target.height, left = 0, top = 0) {
     const {gl} = this, values = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -161,7 +161,7 @@ class Graphics {
     return values;
   }
 
-  // Triangles with named attributes: {name: [numbers a vertex, array]}; indices may be left out.
+  // Makes a mesh with named attributes {name: [numbers per vertex, array]} and optional indices.
   geometry(program, attributes, indices) {
     const {gl} = this, array = gl.createVertexArray();
     gl.bindVertexArray(array);
@@ -179,7 +179,7 @@ class Graphics {
     return {array, count: indices.length};
   }
 
-  // `oneSided`: triangles that face away, clockwise on the screen, are left out.
+  // `oneSided` hides triangles that face away from the camera.
   drawGeometry(geometry, instances = 1, oneSided = false) {
     const {gl} = this;
     gl.bindVertexArray(geometry.array);
@@ -189,7 +189,7 @@ class Graphics {
     gl.bindVertexArray(null);
   }
 
-  // Begins a picture on the canvas at the screen's own resolution.
+  // Starts a picture on the canvas at the resolution of the screen.
   begin() {
     const {gl, canvas} = this, ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);

@@ -1,4 +1,4 @@
-// From linear light to the screen: exposure, tone mapping, sRGB, and the colours of an error.
+// Conversion of linear light to screen colours: exposure, tone mapping, sRGB, and false colours of an error.
 
 const TONES = ['clamped', 'filmic'];
 
@@ -27,7 +27,7 @@ uniform int u_view;        // 0 decoded, 1 original, 2 split, 3 error
 uniform float u_wipe;      // pixels from the left: the original's side
 uniform float u_gain;
 
-// What is shown of two lights; the error is that of the picture on the screen.
+// Chooses between decoded light, original and error; the error is that of the displayed picture.
 vec3 wlm_shown(vec3 decoded, vec3 original)
 {
     vec3 now = wlm_screen(decoded);
@@ -42,7 +42,7 @@ vec3 wlm_shown(vec3 decoded, vec3 original)
 
 const VIEWS = ['decoded', 'original', 'split', 'error'];
 
-// The state that every kind of page has, and its controls.
+// The display state of all kinds of pages, and its controls.
 class Display {
   constructor(page, panel, changed) {
     this.values = {u_exposure: page.manifest.exposure, u_tone: 0, u_view: 0, u_wipe: 0, u_gain: 8};
@@ -80,7 +80,7 @@ class Display {
     };
   }
 
-  // Whether the original is on the screen.
+  // Whether the original is visible.
   get compares() { return this.values.u_view > 0; }
 
   uniforms(width) { return {...this.values, u_wipe: this.share * width}; }

@@ -25,8 +25,8 @@ class LightmapPage {
     this.textures = this.#upload();
     this.layers = new Set();
     const texture = () => graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
-    // An hour is decoded into `next`, and kept in one of two maps when it is whole; until the first is, its tiles
-    // appear one by one. What is seen are one or two of the maps, the later one by its share.
+    // An hour is decoded into `next` and moved to one of two maps when it is complete; the tiles of the first hour
+    // appear one by one. One of the maps is shown, or a mix of both.
     this.next = texture();
     this.maps = [texture(), texture()];
     this.seen = [];
@@ -53,7 +53,7 @@ class LightmapPage {
       graphics, page, MIXED, this.display, panel, changed, (column, row) => this.#tell(column, row));
   }
 
-  // The hour that an arrow key goes to: a quarter of an hour on, or the next that has an original.
+  // The hour after an arrow key: a quarter of an hour further, or the next one with an original.
   #beside(time, direction) {
     const {times} = this.originals, {period} = this.lightmap;
     if (this.display.compares) {
@@ -64,7 +64,7 @@ class LightmapPage {
     return period ? this.first + (since + period) % period : next;
   }
 
-  // The nearest hour that the view can show: those that need the original have it at some hours alone.
+  // The nearest hour that the view can show; views with the original only show hours that have one.
   #shown(time) {
     return this.display.compares ? this.originals.times[this.originals.nearest(time, this.lightmap.period)] : time;
   }
@@ -129,7 +129,7 @@ class LightmapPage {
 
   #map(read) { return this.maps.find((map) => map.key === read.key); }
 
-  // Decodes some tiles of a wanted hour; returns whether it did.
+  // Decodes some tiles of a waiting hour; returns whether there was one.
   work(elapsed) {
     const reads = wlmReads(this.lightmap, this.time), missing = reads.find((read) => !this.#map(read));
     if (!this.waiting.length) {
@@ -143,7 +143,7 @@ class LightmapPage {
       this.waiting = [...this.tiles];
       this.began = performance.now();
     }
-    // As many tiles between two pictures as leave the page responsive.
+    // The number of tiles between two pictures adapts, so that the page stays responsive.
     if (elapsed > LONG_FRAME) this.batch = Math.max(Math.floor(this.batch / 2), 1);
     else if (elapsed < SHORT_FRAME) this.batch = Math.min(2 * this.batch, this.tiles.length);
     for (const tile of this.waiting.splice(0, this.batch)) this.#decode(tile);
@@ -156,7 +156,7 @@ class LightmapPage {
     return true;
   }
 
-  // Fills the gaps of the hour that is whole, in the map that is wanted least.
+  // Fills the gaps of a complete hour, and replaces the map that is not needed now.
   #keep(read, wanted) {
     const {graphics, maps, manifest} = this, {gl} = graphics;
     const map = maps.find(({key}) => !wanted.some((other) => other.key === key)) ?? maps[0];
@@ -167,11 +167,11 @@ class LightmapPage {
     graphics.draw(3);
     graphics.read(map, 1, 1);
     map.key = read.key;
-    // Alone until the other one is there.
+    // Shown alone until the other one is complete.
     if (!this.seen.length || !this.seen.every((other) => this.#map(other))) this.seen = [{...read, weight: 1}];
   }
 
-  // Tells the score of the hour that is seen, if it has an original here.
+  // Shows the score of the current hour, if the page has its original.
   #score() {
     const {times} = this.originals;
     if (!times.length) return;
@@ -182,9 +182,9 @@ class LightmapPage {
 
   advance(elapsed) {
     if (this.playing === undefined || this.waiting.length) return;
-    // The slider was moved meanwhile.
+    // The slider was moved in the meantime.
     if (this.time !== this.played) this.playing = this.time - this.first;
-    // A day in twelve seconds.
+    // One day lasts twelve seconds.
     this.playing = (this.playing + Math.min(elapsed, 250) / 12000 * this.length) % this.length;
     this.setTime(this.#shown(this.first + this.playing));
     this.played = this.time;
@@ -196,18 +196,18 @@ class LightmapPage {
       return;
     }
     if (this.#shown(this.time) !== this.time) this.setTime(this.#shown(this.time));
-    // Until both are of one hour, the last picture stays.
+    // The last picture stays until both have the same hour.
     const index = this.originals.times.indexOf(this.shown);
     if (index >= 0) this.surface.draw(this.#light(), this.originals.get(index));
   }
 
-  // The uniforms of what is seen.
+  // Uniforms of the visible maps.
   #light() {
     const [early, late] = this.#pictures();
     return {u_early: early, u_late: late ?? early, u_share: late ? this.seen[1].weight : 0};
   }
 
-  // What is known of a texel.
+  // Describes a texel.
   #tell(column, row) {
     const {graphics, manifest, lightmap, originals} = this, index = originals.nearest(this.time, lightmap.period);
     const number = Math.floor(row / 128) * Math.ceil(manifest.width / 128) + Math.floor(column / 128);
@@ -221,10 +221,10 @@ class LightmapPage {
     };
   }
 
-  // What is seen: one map or, between two stored hours, two.
+  // The visible maps: one, or two between two stored hours.
   #pictures() { return this.seen.length ? this.seen.map((read) => this.#map(read)) : [this.next]; }
 
-  // For scripts: radiance of the whole map at an hour, RGBA by rows.
+  // For scripts: RGBA radiance of the whole map at an hour, row by row.
   async read(time) {
     this.setTime?.(time);
     while (this.shown !== this.time || this.waiting.length) await new Promise(requestAnimationFrame);

@@ -1,4 +1,4 @@
-// Starts the page: its kind, the loop that draws when something has changed, and what scripts may call.
+// Starts the page: its kind, the loop that draws after changes, and the interface for scripts.
 
 const KINDS = {
   lightmap: typeof LightmapPage === 'undefined' ? null : LightmapPage,
@@ -32,7 +32,7 @@ async function start() {
     try {
       kind.advance?.(elapsed);
       if (kind.work?.(elapsed)) dirty = true;
-      // A large scene may take longer to draw than a tile to decode: while an hour is decoded it is drawn now and then.
+      // A large scene can take longer to draw than a tile to decode, so it is drawn less often while decoding.
       const busy = kind.waiting?.length && kind.playing === undefined && time - drawn < BUSY_FRAME;
       if ((dirty || kind.playing !== undefined) && !busy) {
         dirty = false;

@@ -1,4 +1,4 @@
-// The panel: sliders, choices and a table of figures, and what the keyboard does.
+// The panel: sliders, choices, a table of figures, and keyboard actions.
 
 class Panel {
   constructor(root, title, note) {
@@ -29,7 +29,7 @@ class Panel {
     window.addEventListener('keydown', (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       const key = event.key === '=' ? '+' : event.key.toLowerCase(), {target} = event;
-      // Buttons have the space bar, and sliders the arrows, for themselves.
+      // Buttons use the space bar themselves, and sliders the arrow keys.
       if (target.matches?.('button, summary') && key === ' ') return;
       if (target.matches?.('input') && key.startsWith('arrow') && this.owners.get(key) !== target) return;
       const action = this.keys.get(key);
@@ -42,20 +42,20 @@ class Panel {
 
   #add(parent, kind) { return parent.appendChild(document.createElement(kind)); }
 
-  // A line of the help: what one does with the mouse, a finger or a key, and what for.
+  // Adds a line of the help: an action with mouse, touch or key, and its effect.
   explain(how, what) {
     const row = this.#add(this.help, 'tr');
     this.#add(row, 'td').textContent = how;
     this.#add(row, 'td').textContent = what;
   }
 
-  // A key, by the browser's name of it in small letters, with its line of the help.
+  // Adds a key, by the browser's name in lower case, with its line of the help.
   key(key, how, what, action) {
     this.keys.set(key, action);
     if (how) this.explain(how, what);
   }
 
-  // A slider; gives a function that sets it and tells `changed`. `keys` move it, by `by` or to what `next` says.
+  // Adds a slider; returns a function that sets it and calls `changed`. `keys` move it by `by` or to the result of `next`.
   slider(name, {min, max, step, value, text, changed, keys = [], by = step, next = (now, sign) => now + sign * by, told}) {
     const label = this.#add(this.controls, 'label');
     this.#add(label, 'span').textContent = name;
@@ -82,7 +82,7 @@ class Panel {
     return set;
   }
 
-  // Named buttons of which one is pressed; gives a function that presses one.
+  // Adds a group of buttons, one of them pressed; returns a function that presses one.
   choices(title, names, value, changed, firstKey) {
     const row = this.#row(title), buttons = new Map();
     const press = (name) => {
@@ -99,7 +99,7 @@ class Panel {
     return press;
   }
 
-  // A button that is pressed or not, with a key.
+  // Adds a toggle button with a key.
   toggle(name, key, value, changed) {
     const button = this.#button(this.#row(''), name, () => {
       value = !value;
@@ -110,7 +110,7 @@ class Panel {
     this.key(key, key.toUpperCase(), name, button.onclick);
   }
 
-  // The button that plays and pauses; `changed` is told which.
+  // Adds the button that plays and pauses; `changed` gets the state.
   player(changed) {
     let playing = false;
     const button = this.#button(this.#row(''), 'play', () => {
@@ -136,14 +136,14 @@ class Panel {
     const button = this.#add(row, 'button');
     button.textContent = name;
     button.onclick = (event) => {
-      // After the mouse the space bar plays again; who came by the keyboard stays on the button.
+      // After a click the button loses the focus, so that the space bar plays; keyboard users keep the focus.
       if (event?.detail) button.blur();
       action();
     };
     return button;
   }
 
-  // Says what lies under the pointer, in pieces; what is undefined is left out.
+  // Describes the point under the pointer, in parts; undefined parts are skipped.
   tell(pieces) {
     const texts = pieces.filter(Boolean);
     this.told.replaceChildren(...(texts.length ? texts : ['point at the picture to read a texel']).map((text) => {

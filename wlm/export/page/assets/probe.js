@@ -35,7 +35,7 @@ void main()
 }`;
 const TABLES = 7;
 
-// What a white diffuse surface shows under spherical harmonics of radiance: irradiance / pi.
+// Radiance of a white diffuse surface under spherical harmonics of radiance: irradiance / pi.
 const LIT = `${HEAD}
 in vec3 a_position;
 in vec3 a_normal;
@@ -71,7 +71,7 @@ void main()
     gl_Position = u_camera * vec4(centre + (u_radius > 0.0 ? u_radius : 1.0) * a_position, 1.0);
 }`;
 
-// A sphere of radius 1 as rows of triangles.
+// Makes a unit sphere of rows of triangles.
 function sphere(rows) {
   const points = [], indices = [], columns = 2 * rows;
   for (let r = 0; r <= rows; ++r) {
@@ -86,7 +86,7 @@ function sphere(rows) {
   return [new Float32Array(points), new Uint32Array(indices)];
 }
 
-// Normals of a mesh's vertices, weighted by the area of the triangles around each.
+// Area-weighted vertex normals of a mesh.
 function normals(position, triangles) {
   const sums = new Float32Array(position.length);
   const at = (i) => [position[3 * i], position[3 * i + 1], position[3 * i + 2]];
@@ -146,7 +146,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     }
   }
 
-  // Places to decode at, as a texture, and the table of the coefficients there.
+  // A texture of the positions to decode at, and the table of the coefficients there.
   #places(values) {
     const {graphics} = this, {gl} = graphics, count = values.length / 3, rows = Math.max(Math.ceil(count / WIDTH), 1);
     const texels = new Float32Array(WIDTH * rows * 4);
@@ -166,7 +166,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     return graphics.plain(1024, rows, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT], padded, gl.NEAREST);
   }
 
-  // Decodes some places; returns whether it did.
+  // Decodes some positions; returns whether there were any.
   work(elapsed) {
     const {graphics} = this, {gl} = graphics;
     const places = this.groups.map((group) => group.places).find((each) => each.done < each.count);
@@ -174,7 +174,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     this.began ??= performance.now();
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.SCISSOR_TEST);
-    // Half of the time at least, however long a picture takes.
+    // At least half of the time, regardless of the drawing time.
     const until = performance.now() + Math.max(30, elapsed);
     while (places.done < places.count && performance.now() < until) {
       const column = places.done % WIDTH, row = Math.floor(places.done / WIDTH);
@@ -185,7 +185,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
       graphics.use(this.decoder, {...this.buffers, u_places: places.texture});
       graphics.draw(3);
       places.done += many;
-      // Waits, so that the clock tells what has been done.
+      // Waits, so that the clock measures finished work.
       gl.readBuffer(gl.COLOR_ATTACHMENT0);
       gl.readPixels(column, row, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
     }
@@ -210,7 +210,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     }
   }
 
-  // For scripts: the 27 numbers of every probe, by probes; of group 1 those of the mesh's vertices.
+  // For scripts: the 27 numbers of each probe; for group 1 those of the mesh's vertices.
   async read(group = 0) {
     const {places} = this.groups[group], {gl} = this.graphics, {width, height} = places.texture;
     while (places.done < places.count) await new Promise(requestAnimationFrame);

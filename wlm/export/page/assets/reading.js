@@ -1,4 +1,4 @@
-// What lies under the pointer: a texel, told in the panel in the words of `wlm view`.
+// Describes the texel under the pointer in the panel, as `wlm view` does.
 
 const PLACES = `${HEAD}
 in vec2 v_uv;
@@ -7,9 +7,9 @@ out vec4 place;
 void main() { place = vec4(v_uv, v_coordinate); }`;
 const NOWHERE = -1e9;  // beyond any UV
 
-// Draws a surface once more, into the one pixel under the pointer, with places for colours.
+// Draws the surface again into the single pixel under the pointer, with coordinates as colours.
 class Reading {
-  // `tell`: gives {tile, decoded, original} of a texel's column, row and coordinate; what is unknown is left out.
+  // `tell` returns {tile, decoded, original} for a texel's column, row and coordinate; unknown entries are undefined.
   constructor(graphics, surface, manifest, panel, tell) {
     const {gl, canvas} = graphics;
     Object.assign(this, {graphics, surface, manifest, panel, tell});
@@ -25,7 +25,7 @@ class Reading {
     panel.tell([]);
   }
 
-  // Tells what lies there now; the surface calls it after each picture too.
+  // Updates the description; the surface also calls it after each picture.
   show() {
     if (!this.point) return;
     const {width, height} = this.manifest, found = this.#place();
@@ -47,7 +47,7 @@ class Reading {
   #place() {
     const {graphics, surface, target, point: [x, y]} = this, {gl, canvas} = graphics;
     const {clientWidth: width, clientHeight: height} = canvas, matrix = surface.camera.matrix();
-    // The pointer's pixel fills the clip space.
+    // The pixel under the pointer fills clip space.
     for (let column = 0; column < 16; column += 4) {
       matrix[column] = width * matrix[column] - (2 * x - width) * matrix[column + 3];
       matrix[column + 1] = height * matrix[column + 1] + (2 * y - height) * matrix[column + 3];

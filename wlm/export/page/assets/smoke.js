@@ -1,4 +1,4 @@
-// Six-way lightmaps of smoke: a billboard under a light that the pointer turns, over a ground that shows through.
+// The page of six-way lightmaps: a billboard under a light that follows the pointer, in front of a checkerboard.
 
 const BILLBOARD = `${HEAD}
 uniform mat4 u_camera;
@@ -19,7 +19,7 @@ uniform float u_light, u_glow, u_ground;
 uniform int u_plane;
 out vec4 colour;
 ${DISPLAY}
-// Numbers are stored by their square roots, which suit the eye.
+// Numbers are stored as square roots, whose steps are perceptually more even.
 vec4 wlm_planes(sampler2D page) { vec4 x = texture(page, v_uv); return x * x; }
 
 // The lightmaps' weights are the squares of the direction's parts, which add up to 1 (smoke-lightmaps, eq. 4 and 5).
@@ -66,13 +66,13 @@ class SmokePage {
     this.display = new Display(page, panel, changed);
     this.aspect = width / height;
     this.camera = new Camera(graphics.canvas, [0, -1, 0], [this.aspect, 0, 0], {flat: true, changed});
-    // The pointer turns the light; two fingers and the wheel still move the picture.
+    // The pointer moves the light; two touches and the wheel still move the picture.
     const pan = this.camera;
     graphics.canvas.addEventListener('pointermove', (event) => {
       if (!event.buttons || pan.pointers.size > 1 || event.shiftKey) return;
       const box = graphics.canvas.getBoundingClientRect(), half = 0.5 * Math.min(box.width, box.height);
       const x = (event.clientX - box.left - box.width / 2) / half, y = (box.top + box.height / 2 - event.clientY) / half;
-      // Within the circle the light is in front of the smoke, beyond it behind.
+      // Inside the circle the light is in front of the smoke, outside behind it.
       const far = Math.hypot(x, y), angle = Math.min(far, 2) * Math.PI / 2, scale = far > 1e-6 ? Math.sin(angle) / far : 0;
       this.toward = unit([x * scale, y * scale, Math.cos(angle)]);
       changed();
@@ -92,7 +92,7 @@ class SmokePage {
 
   advance(elapsed) {
     if (this.playing === undefined) return;
-    // The slider was moved meanwhile.
+    // The slider was moved in the meantime.
     if (Math.floor(this.playing) % this.frames.length !== this.frame) this.playing = this.frame;
     this.playing += elapsed / 1000 * this.manifest.smoke.rate;
     const frame = Math.floor(this.playing) % this.frames.length;

@@ -16,7 +16,7 @@ void main()
     gl_Position = u_camera * vec4(u_unwrapped ? vec3(a_uv.x * u_aspect, -a_uv.y, 0.0) : a_position, 1.0);
 }`;
 
-// What a page of this kind adds: `source`, GLSL with vec3 wlm_light(), its uniforms, and `tell`, as `Reading` takes it.
+// A page passes `source`, GLSL with vec3 wlm_light(), and `tell`, as for `Reading`.
 class Surface {
   constructor(graphics, page, source, display, panel, changed, tell) {
     const {manifest} = page;
@@ -32,7 +32,7 @@ ${DISPLAY}
 void main()
 {
     colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
-    // Texels of no chart are never seen on the mesh, and no score has them.
+    // Texels outside charts are not visible on the mesh, and are in no score.
     if (u_view == ${VIEWS.indexOf('error')} && u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = vec3(0.3);
 }`);
     const [width, height] = page.has('mask') ? [manifest.width, manifest.height] : [1, 1], {gl} = graphics;
@@ -41,7 +41,7 @@ void main()
     const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
     const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
     const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
-    // Whether light is read elsewhere than at the lightmap's UV.
+    // Whether light is read at other coordinates than the lightmap's UV.
     this.apart = page.has('coordinate');
     const coordinate = this.apart ? page.array('coordinate', Float32Array) : uv;
     this.geometry = graphics.geometry(this.program, {
@@ -77,7 +77,7 @@ void main()
 
   get camera() { return this.unwrapped ? this.picture : this.mesh; }
 
-  // Whether what faces away is left out.
+  // Whether triangles that face away are hidden.
   get culled() { return Boolean(this.oneSided && !this.unwrapped); }
 
   shape() { return {u_camera: this.camera.matrix(), u_unwrapped: this.unwrapped, u_aspect: this.aspect}; }
@@ -93,7 +93,7 @@ void main()
   }
 }
 
-// Frames to compare with, each uploaded when it is first seen.
+// Original frames, each uploaded when it is first needed.
 class Originals {
   constructor(graphics, page) {
     const {manifest: {width, height, reference}} = page;
@@ -103,14 +103,14 @@ class Originals {
       this.frames ??= [];
       return this.frames[index] ??= graphics.plain(width, height, graphics.shared(), frame(index), graphics.gl.LINEAR);
     };
-    // Nine bits a channel and one exponent.
+    // Nine bits per channel and a shared exponent.
     this.texel = (index, column, row) => {
       const code = frame(index)[row * width + column];
       return [0, 9, 18].map((shift) => (code >> shift & 511) * 2 ** ((code >>> 27) - 24));
     };
   }
 
-  // The number of the stored frame that is nearest to a time.
+  // Index of the stored frame nearest to a time.
   nearest(time, period) {
     const apart = (t) => period ? Math.min(Math.abs(t - time) % period, period - Math.abs(t - time) % period) : Math.abs(t - time);
     return this.times.reduce((best, t, i) => apart(t) < apart(this.times[best]) ? i : best, 0);
