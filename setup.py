@@ -7,7 +7,7 @@ setup(
     packages=[*find_packages(include=["wlm*"]), "wlm.configs"],
     package_dir={"wlm.configs": "configs"},
     package_data={
-        "": ["native/*.cuh", "assets/*"],
+        "": ["native/*.cuh", "assets/*", "*.pyi"],
         "wlm": ["py.typed", "data/*.safetensors", "data/*.npz"],
         "wlm.configs": ["*.yaml"],
     },

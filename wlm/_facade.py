@@ -1,15 +1,20 @@
-"""Packages whose public names are imported when they are first used (PEP 562)."""
+"""Packages whose public names are imported when they are first used (PEP 562), and their stubs for type checkers.
+
+Type checkers read the stub `__init__.pyi` beside each `__init__.py`. `python -m wlm._facade`, run in a checkout, writes
+the stubs anew.
+"""
 
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
 def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Makes the `__getattr__` and `__dir__` of a package.
 
-    A public name must not be a submodule's: importing the submodule would put it in the name's place.
+    A public name must not be the name of a submodule, because importing the submodule would replace it.
 
     Args:
         package: The package's `__name__`.
@@ -25,8 +30,43 @@ def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(places[name])
         value = module if places[name] == f"{package}.{name}" else getattr(module, name)
-        # Found there directly from now on.
+        # Later accesses find the name without this function.
         setattr(sys.modules[package], name, value)
         return value
 
     return get, lambda: sorted({*vars(sys.modules[package]), *places})
+
+
+def stub(package: str, places: Mapping[str, str]) -> str:
+    """Writes the stub of a package.
+
+    Args:
+        package, places: Arguments of `facade`.
+    """
+    modules = {
+        name: place.removesuffix(f".{name}") if place == f"{package}.{name}" else place
+        for name, place in places.items()
+    }
+    names = sorted(places, key=lambda name: (modules[name], name))
+    lines = [f"from {modules[name]} import {name} as {name}" for name in names]
+    version = ["", "__version__: str"] if package == "wlm" else []
+    return "\n".join(["# Written by python -m wlm._facade from `_PLACES` of the package.", *lines, *version, ""])
+
+
+def packages(root: Path) -> dict[Path, str]:
+    """Finds the packages with a facade, and the text of the stub of each, by the path of the stub.
+
+    Args:
+        root: The folder of the package `wlm`.
+    """
+    found = {}
+    for path in sorted(root.rglob("__init__.py")):
+        if "facade(__name__" in path.read_text(encoding="utf-8"):
+            name = ".".join(path.relative_to(root.parent).parent.parts)
+            found[path.with_suffix(".pyi")] = stub(name, import_module(name)._PLACES)
+    return found
+
+
+if __name__ == "__main__":
+    for path, text in packages(Path(__file__).parent).items():
+        path.write_text(text, encoding="utf-8")

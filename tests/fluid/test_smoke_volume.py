@@ -130,13 +130,13 @@ def test_smoke_that_may_lie_on_its_side(tmp_path: Path):
     path = tmp_path / "a.nvdb"
     _nvdb(path, np.ones((8, 8, 24), np.float32))
     (warning,) = load_volume(path).warnings
-    assert "longest along z" in warning and "--up z" in warning
+    assert "longest along z" in warning and "--volume up=z" in warning
     turned = load_volume(path, up="z")
     assert not turned.warnings and turned.shape[1] == 24 and not load_volume(path, up="y").warnings
     (finding,) = inspect(path)
-    assert " --up z -o" in finding.command and len(finding.problems) == 1
+    assert " --volume up=z -o" in finding.command and len(finding.problems) == 1
     _nvdb(path, np.ones((8, 24, 8), np.float32))
-    assert not load_volume(path).warnings and "--up" not in inspect(path)[0].command
+    assert not load_volume(path).warnings and "--volume" not in inspect(path)[0].command
 
 
 def test_grid_on_its_device(device: str):

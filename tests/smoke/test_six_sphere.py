@@ -75,7 +75,8 @@ def test_wrong_arguments(device: str):
 
 def test_the_command(tmp_path):
     save_volume(tmp_path / "plume.npz", plume())
-    words = ("smoke", "bake", tmp_path / "plume.npz", "-o", tmp_path / "six.exr", "--resolution", 16, "--extinction", 8)
+    options = ("--resolution", 16, "--volume", "extinction=8")
+    words = ("smoke", "bake", tmp_path / "plume.npz", "-o", tmp_path / "six.exr", *options)
     call(*words, "--fit", "sphere", "--step", 1, "--albedo", 0.9)
     made = read_six_way(tmp_path / "six.exr").lightmaps
     call(*words, "--fit", "sphere", "--step", 1)

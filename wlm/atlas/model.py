@@ -86,70 +86,61 @@ _BUDGET, _SHARED_BUDGET = 0.17, 0.05
 
 
 class Profile(Settings):
-    """Settings of a compression.
-
-    Attributes:
-        name: Shown in reports.
-        method: "tiles" or "cascade", see the module. Several sheets or states always share tiles.
-        colour: Format of T_p: "half" floats, "rgb9e5", "bc6h" or "astc" (4x4); or, for tiles, "mixed": two textures,
-            RGB9E5 and BC6H, and each tile in one of them. Shared tiles are "rgb9e5" or "mixed".
-        budget: For tiles: bits of the textures as a fraction of all lightmaps' at 48 bits per texel, 1 - CR of eq. 9.
-            None: 0.17 for one lightmap, 0.05 for several.
-        tile: For tiles: texels of the lightmap along a tile, 3 to 15. A tile has up to one sample more per axis, and
-            with these it keeps every texel.
-        views: Random views of the scene from around, and as many from inside; a texel counts by the pixels that show
-            it.
-        unseen: For one lightmap: weight of texels that no view shows, as a fraction of the mean weight.
-        border: For one lightmap: factor on the weight within a texel of a chart's border, where an error is a seam.
-        relative: For one lightmap: how much of the weight is of the relative error, 0 to 1; the rest is of the error
-            in linear light.
-        mips: Whether smaller levels are stored for surfaces that are far away; for tiles their bits are part of the
-            budget.
-        fallback: For one lightmap: whether a plain smaller lightmap of as many bits replaces the result if its error
-            is no larger.
-        threshold: For the cascade: lambda of eq. 4; 0 shares no triangles.
-        colour_threshold: For the cascade: lambda_h of section 3.2.1.
-        max_radiance: For the cascade: triangles with a brighter texel are not shared, and lambda and lambda_h are
-            fractions of it (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright
-            lightmaps alike.
-        scale: For the cascade: epsilon, of the repacked lightmap (section 3.3.1).
-        colour_scale: For the cascade: epsilon_p, sides of T_p over those of the repacked lightmap.
-        lut_scale: For the cascade: epsilon_c, the same for T_c; 0: no T_c, method "plain".
-        space: For the cascade: T_p and T_c are tuned in random "views", or in "uv" at points of the mesh's surface.
-        steps: For the cascade: steps of Adam.
-        colour_rate: For the cascade: initial learning rate of T_p, in units of the lightmap's mean.
-        lut_rate: For the cascade: initial learning rate of T_c.
-        final_rate: For the cascade: learning rates of the last step as a fraction of the initial ones.
-        resolution: For the cascade: pixels along a side of a view.
-        gradient: For the cascade: weight of the image gradients' L1 in the loss beside the colours' L1 (section
-            3.3.3).
-    """
+    """Settings of a compression."""
 
     FILES: ClassVar[str] = "atlas"
 
     method: Literal["tiles", "cascade"] = "tiles"
+    """Method, tiles or cascade. Several sheets or states always share tiles."""
     colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"] = "half"
+    """Format of the colour texture T_p; for tiles also mixed, an RGB9E5 and a BC6H texture of which each tile uses one.
+    Shared tiles are rgb9e5 or mixed."""
     budget: float | None = Field(None, gt=0.0, le=2.0)
+    """For tiles: bits of the textures as a fraction of those of all lightmaps at 48 bits per texel. It is 1 - CR of
+    eq. 9; None: 0.17 for one lightmap, 0.05 for several."""
     tile: int = Field(7, ge=3, le=15)
+    """For tiles: texels of the lightmap along a tile. A tile has up to one sample more per axis, and with
+    these it keeps every texel."""
     views: int = Field(64, ge=1, le=4096)
+    """Random views of the scene from around, and as many from inside; a texel counts by the pixels that show it."""
     unseen: float = Field(0.05, gt=0.0, le=1.0)
+    """For one lightmap: weight of texels that no view shows, as a fraction of the mean weight."""
     border: float = Field(16.0, gt=0.0, le=100.0)
+    """For one lightmap: factor on the weight within a texel of a chart's border, where an error is a seam."""
     relative: float = Field(0.0, ge=0.0, le=1.0)
+    """For one lightmap: share of the weight that applies to the relative error; the rest applies to the error in
+    linear light."""
     mips: bool = False
+    """Store smaller levels for surfaces that are far away; for tiles their bits are part of the budget."""
     fallback: bool = True
+    """For one lightmap: replace the result by a plain smaller lightmap of as many bits if its error is no larger."""
     threshold: float = Field(0.03, ge=0.0, le=1.0)
+    """For the cascade: lambda of eq. 4; 0 shares no triangles."""
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
+    """For the cascade: lambda_h of section 3.2.1."""
     max_radiance: float | None = Field(2.0, gt=0.0)
+    """For the cascade: triangles with a brighter texel are not shared, and lambda and lambda_h are fractions of it
+    (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright lightmaps alike."""
     scale: float = Field(0.5, gt=0.0, le=1.0)
+    """For the cascade: epsilon, the scale of the repacked lightmap (section 3.3.1)."""
     colour_scale: float = Field(0.4, gt=0.0, le=1.0)
+    """For the cascade: epsilon_p, sides of T_p over those of the repacked lightmap."""
     lut_scale: float = Field(0.7, ge=0.0, le=1.0)
+    """For the cascade: epsilon_c, the same for T_c; 0: no T_c, method "plain"."""
     space: Literal["views", "uv"] = "views"
+    """For the cascade: T_p and T_c are tuned in random views, or in UV space at points of the surface of the mesh."""
     steps: int = Field(5000, ge=0)
+    """For the cascade: steps of Adam."""
     colour_rate: float = Field(5e-4, gt=0.0, lt=1.0)
+    """For the cascade: initial learning rate of T_p, in units of the lightmap's mean."""
     lut_rate: float = Field(5e-5, gt=0.0, lt=1.0)
+    """For the cascade: initial learning rate of T_c."""
     final_rate: float = Field(1.0, gt=0.0, le=1.0)
+    """For the cascade: learning rates of the last step as a fraction of the initial ones."""
     resolution: int = Field(2048, ge=16, le=8192)
+    """For the cascade: pixels along a side of a view."""
     gradient: float = Field(1.0, ge=0.0)
+    """For the cascade: weight of the image gradients' L1 in the loss beside the colours' L1 (section 3.3.3)."""
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
         """Replaces some settings, as `wlm.system.Settings.override`.

@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import atlas, bake, compare, doctor, inspect, smoke, verbs, view, web
+from wlm.cli import bake, compare, doctor, inspect, smoke, verbs, view, web
 from wlm.cli import probe_volume as probe
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
@@ -114,7 +114,6 @@ app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)
 app.command()(doctor.doctor)
-app.add_typer(atlas.app, name="atlas")
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")
 app.add_typer(bake.app, name="bake")

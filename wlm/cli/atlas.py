@@ -1,363 +1,264 @@
-"""`wlm atlas`: compress the lightmaps of a scene, decode them, score them, say what is in a file."""
+"""The verbs for lightmaps of meshes: compress, evaluate, decode, export, info."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from wlm.cli import models
 from wlm.cli.console import (
     check_output,
-    escape,
     exclusive,
-    note,
-    note_start,
+    note_warnings,
     number,
     quiet_warp,
     running,
     show,
-    show_json,
+    show_facts,
     table,
     write_json,
 )
 from wlm.cli.options import (
     AsJson,
-    CheckpointEveryIfKept,
+    CheckpointEvery,
     Device,
-    EngineOrRaw,
+    Engine,
     ExactShader,
+    ModelFile,
     PageFile,
+    Profile,
     ReportFile,
     Resume,
     Seed,
     ShaderLanguage,
     Trust,
     output_option,
-    seconds_between,
-    shader_of,
 )
+from wlm.cli.settings import with_settings
 from wlm.errors import WlmError
 
-app = typer.Typer(help="The lightmaps of a scene: a small colour texture, read through a small lookup texture.")
+if TYPE_CHECKING:
+    from wlm.atlas import AtlasModel, LightmappedScene, Report
 
-_File = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="A file that compress wrote.")]
-_Mesh = Annotated[Path, typer.Argument(metavar="MESH", help="A .glb, .gltf, .obj or .ply file.")]
+_VIEWS, _RESOLUTION = 50, 512  # as in wlm.atlas.evaluation, which takes long to import
+
+_Mesh = Annotated[Path, typer.Argument(metavar="MESH", help="Mesh or scene: .glb, .gltf or another mesh format.")]
 _Lights = Annotated[
     Path | None,
     typer.Argument(
-        metavar="LIGHTS",
-        help="Its lightmap: EXR, Radiance .hdr, KTX2, DDS, or PNG; or for a scene a folder, a .lmbake, or a .json that "
-        "lists all lightmaps; default the materials' lightmaps.",
+        metavar="LIGHTMAPS",
+        help="Lightmap (EXR, HDR, KTX2, DDS, PNG), a folder of them, a .lmbake, or a .json that lists them; default "
+        "those that the materials name.",
     ),
 ]
 _Mask = Annotated[
-    Path | None,
-    typer.Option(metavar="PNG", help="The texels that belong to a chart; default by the triangles."),
+    Path | None, typer.Option(metavar="PNG", help="Texels that belong to charts; default derived from the triangles.")
 ]
 _UvSet = Annotated[
-    int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the lightmap's UVs; default 1, else 0.")
+    int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the UVs of the lightmap; default 1, else 0.")
 ]
-_Node = Annotated[
-    str | None, typer.Option(help="The node that the lightmap belongs to; default the one that it fits best.")
+_Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
+_Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
+_Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is v = 1.")]
+_Views = Annotated[
+    int | None, typer.Option(min=1, max=4096, help=f"Cameras around the scene, and as many inside; default {_VIEWS}.")
 ]
-_Encoding = Annotated[str | None, typer.Option(help="The meaning of a PNG's bytes: linear, srgb, rgbm, dldr or rgbe.")]
-_Flip = Annotated[bool, typer.Option("--flip", help="The lightmap is upside down: its top row is v = 1.")]
+_Resolution = Annotated[
+    int | None, typer.Option(min=16, max=16384, help=f"Edge of a view in pixels; default {_RESOLUTION}.")
+]
 
 
-@app.command()
+@with_settings("wlm.atlas:Profile")
 @exclusive
 def compress(
-    mesh_path: _Mesh,
-    output: Annotated[Path, output_option("FILE.wlm", "The file to write.")],
-    lights_path: _Lights = None,
+    mesh: _Mesh,
+    output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
+    settings: dict[str, Any],
+    lightmaps: _Lights = None,
+    profile: Profile = "standard",
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
     encoding: _Encoding = None,
     flip: _Flip = False,
-    profile: Annotated[str, typer.Option(help="standard, bc6h, astc, cascade, paper, or a YAML file.")] = "standard",
-    budget: Annotated[
-        float | None, typer.Option(help="Bits of the textures as a fraction of the lightmaps' at 48 per texel.")
-    ] = None,
-    colour: Annotated[
-        str | None, typer.Option(help="Format of the colour texture: half, rgb9e5, bc6h, astc or mixed.")
-    ] = None,
-    mips: Annotated[
-        bool, typer.Option("--mips", help="Smaller levels for far surfaces, in 1.4% of the lightmap's bits.")
-    ] = False,
-    views: Annotated[
-        int | None, typer.Option(min=1, help="Random views; a texel counts by the pixels that show it.")
-    ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
-    checkpoint_every: CheckpointEveryIfKept = None,
+    checkpoint_every: CheckpointEvery = 30.0,
     trust: Trust = False,
 ) -> None:
-    """Compress the lightmaps of a mesh or scene into one file with their triangles.
+    """Compress the lightmaps of a mesh or a scene, in one state or several, into one file together with the triangles.
 
-    Long stages are kept in FILE.wlm.partial from time to time, and on Ctrl-C and SIGTERM; the same command with
-    --resume continues exactly.
+    Finished stages are saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with
+    --resume to continue exactly.
     """
-    from wlm.atlas.model import Profile
 
-    check_output(output, ".wlm")
-    settings = Profile.load(profile).override(
-        {"budget": budget, "colour": colour, "mips": mips or None, "views": views}, "--"
-    )
-    quiet_warp()
-    from wlm.atlas import codec
-    from wlm.atlas.data import load
-    from wlm.atlas.fit import compress, open_checkpoint
-    from wlm.interop import check_device
+    def load() -> "LightmappedScene":
+        from wlm.atlas import load
 
-    device = check_device(device)
-    reading = {"mask_path": mask, "uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
-    scene = load(mesh_path, lights_path, trust=trust, **reading)
-    for warning in scene.warnings:
-        note(f"warning: {warning}")
-    options = {"seed": seed, "device": device}
-    every = seconds_between(checkpoint_every)
-    checkpoint = open_checkpoint(output, scene, settings, resume=resume, every=every, **options)
-    note_start(checkpoint, resume, "at the first stage")
-    with running("compress", checkpoint.path) as progress:
-        model = compress(scene, settings, progress=progress, checkpoint=checkpoint, **options)
-        size = model.save(output)
-        checkpoint.remove()
-    geometry = codec.sizes(model)[1]
-    rows = table(str(output), ["", "value"])
-    rows.add_row("bytes", f"{size:,}")
-    rows.add_row("bytes of triangles and masks", f"{geometry:,}")
-    rows.add_row("bytes on a GPU", f"{-(-model.bits // 8):,}")
-    rows.add_row("method", model.method)
-    rows.add_row("lightmaps", f"{len(model.sheets)} in {len(model.states)} states")
-    rows.add_row("CR of the textures", f"{model.compression_ratio:.2%}")
-    rows.add_row("CR on disk", f"{model.disk_ratio(size - geometry):.2%}")
-    rows.add_row("seconds", f"{sum(model.report['seconds'].values()):.1f}")
-    show(rows)
-    for warning in model.report.get("lost light", ()):
-        note(f"warning: {warning}")
+        reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
+        return load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
+
+    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
+    _, model, facts = models.fit("atlas", load, output, profile, settings, **options)
+    show_facts(model.name, facts | _facts(model))
+    note_warnings(model.report.get("lost light", ()))
 
 
-@app.command()
 def evaluate(
-    file: _File,
-    mesh_path: _Mesh,
-    lights_path: _Lights = None,
+    file: ModelFile,
+    mesh: _Mesh,
+    lightmaps: _Lights = None,
+    views: _Views = None,
+    resolution: _Resolution = None,
+    json_path: ReportFile = None,
+    html_path: PageFile = None,
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
     encoding: _Encoding = None,
     flip: _Flip = False,
-    views: Annotated[
-        int | None,
-        typer.Option(min=1, max=4096, help="Cameras around the scene, and as many inside; default 50, or 24."),
-    ] = None,
-    resolution: Annotated[
-        int | None, typer.Option(min=16, max=16384, help="Pixels along a side of a view; default 512, or 256.")
-    ] = None,
-    json_path: ReportFile = None,
-    html_path: PageFile = None,
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
-    """Compare a file with the original lightmaps on views of the scene."""
+    """Compare compressed lightmaps with the originals on rendered views of the scene."""
     if json_path is not None:
         check_output(json_path, ".json")
     if html_path is not None:
         check_output(html_path, ".html")
     quiet_warp()
-    from wlm.atlas.data import load
-    from wlm.atlas.evaluation import VIEWS, evaluate
+    from wlm.atlas import evaluate, load
     from wlm.interop import check_device
     from wlm.system import load as load_model
 
+    device = check_device(device)
     model = load_model(file, "atlas")
     uv_set = model.stored.uv_set if uv_set is None else uv_set
-    reading = {"mask_path": mask, "uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
-    scene = load(mesh_path, lights_path, trust=trust, **reading)
-    options = {"views": views, "resolution": resolution, "device": check_device(device)}
+    reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
+    scene = load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
     with running("evaluate") as progress:
-        report = evaluate(model, scene, **options, progress=progress)
+        report = evaluate(model, scene, views=views, resolution=resolution, device=device, progress=progress)
     if not report.views:
-        raise WlmError(f"{file}: cannot be scored: no camera around the scene and no viewer inside sees a chart")
+        raise WlmError(f"{file}: cannot be scored: no camera sees its charts, neither from around nor from inside")
     if html_path is not None:
         from wlm.view.reports import atlas_report
 
-        atlas_report(html_path, model, scene, report, VIEWS if views is None else views)
+        atlas_report(html_path, model, scene, report, views or _VIEWS)
     if json_path is not None:
-        write_json(json_path, report.to_json() | options)
-    rows = table(f"{file}: {report.views} views, {len(model.states)} states", ["", "value"])
-    rows.add_row("bytes on a GPU", f"{report.gpu_bytes:,}")
-    rows.add_row("CR (eq. 9)", f"{report.cr:.2%}")
-    rows.add_row("CR on disk", f"{report.cr_disk:.2%}")
-    for label, name, form in _ROWS:
-        rows.add_row(label, number(getattr(report, name), form))
-    for state, value in zip(model.states, report.psnr_by_state, strict=True) if len(model.states) > 1 else ():
-        rows.add_row(f"PSNR dB, {escape(state)}", number(value, ".2f"))
-    show(rows)
+        write_json(json_path, report.to_json() | {"cameras": views, "resolution": resolution, "device": device})
+    _show_report(file, model, report)
 
 
-# Label in the table, attribute of a report, format.
-_ROWS = (
-    ("PSNR dB", "psnr", ".2f"),
-    ("peak", "peak", ".4g"),
-    ("brightest", "brightest", ".4g"),
-    ("PSNR dB, from around", "around_psnr", ".2f"),
-    ("PSNR dB, from inside", "inside_psnr", ".2f"),
-    ("PSNR dB, worst view", "psnr_worst", ".2f"),
-    ("worst view", "worst_view", "d"),
-    ("1 - SSIM", "one_minus_ssim", ".5f"),
-    ("error at seams / elsewhere", "seam_ratio", ".2f"),
-    ("PSNR dB of texels", "texel_psnr", ".2f"),
-    ("PSNR dB, tone mapped", "tone_psnr", ".2f"),
-    ("FLIP", "flip", ".4f"),
-)
-
-
-@app.command()
 def decode(
-    file: _File,
-    output: Annotated[Path, output_option("OUT", "A .exr; for a view also a .png.")],
-    sheet: Annotated[int, typer.Option(min=0, help="The number of the lightmap's sheet.")] = 0,
-    state: Annotated[float, typer.Option(min=0, help="The number of the state; 0.5 is between the first two.")] = 0.0,
+    file: ModelFile,
+    output: Annotated[Path, output_option("OUT", "A .exr; with --view also a .png.")],
+    sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap, as wlm info lists them.")] = 0,
+    state: Annotated[float, typer.Option(min=0.0, help="Number of the state; a fraction mixes two states.")] = 0.0,
     view: Annotated[
         int | None,
         typer.Option(min=0, help="Draw the scene from this camera of evaluate instead; those inside come last."),
     ] = None,
-    views: Annotated[
-        int | None, typer.Option(min=1, max=4096, help="With --view: cameras that evaluate has; default 50.")
-    ] = None,
-    resolution: Annotated[
-        int | None, typer.Option(min=16, max=16384, help="With --view: pixels along a side; default 512.")
-    ] = None,
+    views: _Views = None,
+    resolution: _Resolution = None,
     device: Device = "cpu",
 ) -> None:
-    """Rebuild a lightmap in its original layout, or draw a view of the scene. The inputs aren't needed."""
+    """Decode a lightmap in its original layout, or draw a view of the scene. The inputs are not needed."""
     check_output(output, ".exr", ".png")
     if view is None:
         if output.suffix.lower() == ".png":
-            raise WlmError(f"{output}: a lightmap is written as .exr; a .png needs --view")
+            raise WlmError(f"{output}: expected .exr for a lightmap; a .png needs --view")
         for option, value in (("views", views), ("resolution", resolution)):
             if value is not None:
-                raise WlmError(f"--{option}: expected with --view alone: a lightmap has its own size")
+                raise WlmError(f"--{option}: has no meaning without --view")
     quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.system import load
 
     model = load(file, "atlas")
-    if sheet >= len(model.sheets) or state > len(model.states) - 1:
-        raise WlmError(
-            f"{file}: expected a sheet below {len(model.sheets)} and a state up to {len(model.states) - 1}, got "
-            f"{sheet} and {state:g}"
-        )
+    for option, value, most in (("sheet", sheet, len(model.sheets)), ("state", state, len(model.states))):
+        if value > most - 1:
+            raise WlmError(f"--{option}: expected 0 to {most - 1}, got {value:g}")
     decoder = model.decoder(device)
     if view is None:
         picture, covered = decoder.lightmap(sheet, state), model.scene.sheets[sheet].mask
         write_exr(output, picture)
     else:
-        from wlm.atlas.evaluation import RESOLUTION, VIEWS
         from wlm.atlas.views import scene_views
         from wlm.view.atlas import draw
         from wlm.view.display import white_of
         from wlm.view.pictures import encode, save_png
 
-        cameras = scene_views(model.scene, VIEWS if views is None else views)
+        cameras = scene_views(model.scene, views or _VIEWS)
         if view >= len(cameras):
             raise WlmError(f"--view: expected 0 to {len(cameras) - 1}, got {view}")
-        side = RESOLUTION if resolution is None else resolution
+        side = resolution or _RESOLUTION
         pictures, covered = draw(model.scene, {"ours": decoder}, cameras[view], side, decoder.device, state)
         picture = pictures["ours"]
         if output.suffix.lower() == ".png":
             save_png(output, encode(picture, covered, white_of(picture[covered])))
         else:
             write_exr(output, picture)
-    rows = table(str(file), ["file", "size", "covered", "mean", "largest"])
+    facts = {"file": output, "size": f"{picture.shape[1]}x{picture.shape[0]}", "covered": f"{covered.mean():.1%}"}
     inside = picture[covered]
-    rows.add_row(
-        escape(str(output)),
-        f"{picture.shape[1]}x{picture.shape[0]}",
-        f"{covered.mean():.1%}",
-        number(float(inside.mean()) if inside.size else None, ".4g"),
-        number(float(inside.max()) if inside.size else None, ".4g"),
-    )
-    show(rows)
+    if inside.size:
+        facts |= {"mean": float(inside.mean()), "largest": float(inside.max())}
+    show_facts(str(file), facts)
 
 
-@app.command()
 def export(
-    file: _File,
-    output: Annotated[Path, output_option("OUT", "The folder to write to.")],
-    engine: EngineOrRaw = "raw",
+    file: ModelFile,
+    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
+    engine: Engine = None,
     shader: ShaderLanguage = None,
     exact: ExactShader = False,
+    device: Device = "cpu",
 ) -> None:
-    """Write what an engine needs of a file: textures, the mesh, a material or a shader."""
-    language = shader_of(engine, shader, exact)
-    quiet_warp()
-    from wlm.export import export
-    from wlm.system import load
-
-    kit = None if engine == "raw" else engine
-    paths = export(load(file, "atlas"), output, kit, shader=language, exact=exact)
-    rows = table(str(output), ["file", "bytes"])
-    for path in paths:
-        rows.add_row(escape(path.name), f"{path.stat().st_size:,}")
-    show(rows)
+    """Write the lightmaps for an engine: textures, the mesh and a shader, or with --engine a mesh with its material."""
+    models.export(file, output, engine, shader, exact, device)
 
 
-@app.command()
-def info(file: _File, as_json: AsJson = False) -> None:
-    """Say what a compressed lightmap holds, without decoding it."""
-    quiet_warp()
-    from wlm.formats.artifact import read_artifact
-    from wlm.system import load, plain
+def info(file: ModelFile, as_json: AsJson = False) -> None:
+    """Show what a file of mesh lightmaps contains."""
+    models.describe(file, "atlas", None, as_json, _facts)
 
-    model, artifact = load(file, "atlas"), read_artifact(file, "atlas")
-    own = artifact.file_bytes - sum(artifact.parts.get(name, 0) for name in ("mesh", "mask"))
-    pages = [("colour texture", model.texels), ("second texture", model.block_texels)]
-    facts = {
-        "name": model.name,
+
+def _facts(model: "AtlasModel") -> dict[str, Any]:
+    pages, height, width = model.texels.shape[:3]
+    return {
         "method": model.method,
-        "colour": model.colour,
+        "lightmaps": [f"{each.width}x{each.height}" for each in model.sheets],
         "states": list(model.states),
-        "sheets": [{"name": each.name, "size": [each.width, each.height]} for each in model.sheets],
-        "levels": len(model.levels),
-        "separate": bool(model.later),
-        "bytes": artifact.file_bytes,
-        "gpu_bytes": -(-model.bits // 8),
-        "lut_size": list(model.lut.shape[1::-1]),
-        **{name.replace(" ", "_"): list(texels.shape[2::-1]) for name, texels in pages},
-        "new_uvs": len(model.uv),
-        "cr": model.compression_ratio,
-        "cr_disk": model.disk_ratio(own),
-        "source": model.source,
-        "parts": {"header": artifact.header_bytes} | artifact.parts,
-        "found": plain(model.report),
-        "profile": model.profile.model_dump(mode="json"),
+        "colour_texture": f"{width}x{height}, {pages} page{'s' if pages > 1 else ''}",
+        "colour_format": model.colour,
+        "lookup_texture": "x".join(map(str, model.lut.shape[1::-1])) if model.lut.size else "none",
+        "UVs": f"new, for {len(model.uv):,} triangles" if len(model.uv) else "those of the mesh",
+        "smaller_levels": model.mips,
+        "GPU_bytes": -(-model.bits // 8),
+        "saved_GPU_bytes": f"{model.compression_ratio:.2%}",
     }
-    if as_json:
-        show_json(facts)
-        return
-    rows = table(str(file), ["", "value"])
-    for name in ("name", "method", "colour", "source"):
-        rows.add_row(name, escape(facts[name]))
-    rows.add_row("states", escape(", ".join(model.states)))
-    rows.add_row("sheets", f"{len(model.sheets):,}")
-    if model.method == "shared":
-        rows.add_row("tiles", "separate for each state" if model.later else "shared by the states")
-    rows.add_row("first lightmap", "x".join(map(str, facts["sheets"][0]["size"])))
-    for name, texels in pages:
-        if texels.size:
-            count, height, width, _ = texels.shape
-            rows.add_row(name, f"{width}x{height}" + (f", {count} pages" if count > 1 else ""))
-    rows.add_row("lookup texture", "x".join(map(str, facts["lut_size"])) if model.lut.size else "none")
-    rows.add_row("UVs", f"new, of {len(model.uv):,} triangles" if len(model.uv) else "the mesh's own")
-    for name in ("bytes", "gpu_bytes"):
-        rows.add_row(name.replace("_", " ").replace("gpu", "GPU"), f"{facts[name]:,}")
-    rows.add_row("CR of the textures", f"{facts['cr']:.2%}")
-    rows.add_row("CR on disk", f"{facts['cr_disk']:.2%}")
-    rows.add_row("profile", escape(model.profile.name))
-    rows.add_section()
-    for part, count in facts["parts"].items():
-        rows.add_row(f"bytes of {part}", f"{count:,}")
+
+
+def _show_report(file: Path, model: "AtlasModel", report: "Report") -> None:
+    rows = table(f"{file}: {report.views} views", ["", "value"])
+    for label, value in (
+        ("GPU bytes", f"{report.gpu_bytes:,}"),
+        ("GPU bytes saved", f"{report.cr:.2%}"),
+        ("bytes on disk, without the mesh", f"{report.bytes:,}"),
+        ("PSNR of the views, dB", number(report.psnr, ".2f")),
+        ("  from around, dB", number(report.around_psnr, ".2f")),
+        ("  from inside, dB", number(report.inside_psnr, ".2f")),
+        (f"  worst, view {report.worst_view}, dB", number(report.psnr_worst, ".2f")),
+        ("PSNR tone mapped, dB", number(report.tone_psnr, ".2f")),
+        ("PSNR of the texels, dB", number(report.texel_psnr, ".2f")),
+        ("1 - SSIM", number(report.one_minus_ssim, ".5f")),
+        ("FLIP", number(report.flip, ".4f")),
+        ("error at seams relative to elsewhere", number(report.seam_ratio, ".2f")),
+        ("range of the reference", number(report.peak, ".4g")),
+        ("brightest reference", number(report.brightest, ".4g")),
+    ):
+        rows.add_row(label, value)
+    if len(model.states) > 1:
+        rows.add_section()
+        for state, value in zip(model.states, report.psnr_by_state, strict=True):
+            rows.add_row(f"PSNR, {state}, dB", number(value, ".2f"))
     show(rows)

@@ -260,7 +260,7 @@ def info(
             sheets.append(vars(sheet) | _sheet(own) | listed)
         return _facts(model) | {"times": model.times.tolist(), "sheets": sheets}
 
-    model = models.describe(file, device, as_json, facts)
+    model = models.describe(file, "lightmap", device, as_json, facts)
     if not as_json:
         _show_sheets(model)
         for sheet, own in model.sheets.items() if tiles else ():

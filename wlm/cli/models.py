@@ -93,11 +93,15 @@ def export(
     show_files(output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given))
 
 
-def describe(file: Path, device: str, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]) -> Any:
+def describe(
+    file: Path, system: str, device: str | None, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]
+) -> Any:
     """Shows what a file contains: its settings, its sizes, and the facts of its system.
 
     Args:
-        file, device, as_json: Values of the options.
+        file, as_json: Values of the options.
+        system: Name of the system that must have written the file.
+        device: Device whose memory is shown; None for none.
         facts: Returns the facts of a model as JSON values by name.
 
     Returns:
@@ -107,10 +111,12 @@ def describe(file: Path, device: str, as_json: bool, facts: Callable[[Any], Mapp
     from wlm.formats.artifact import read_artifact
     from wlm.system import load
 
-    artifact, model = read_artifact(file), load(file)
-    decoder = model.decoder(device)
+    artifact, model = read_artifact(file, system), load(file, system)
     shown = {"name": model.name, "system": artifact.system, **facts(model), "source": model.source}
-    shown |= {"bytes_on_disk": artifact.file_bytes, "device": decoder.device, "bytes_on_device": decoder.device_bytes}
+    shown["bytes_on_disk"] = artifact.file_bytes
+    if device is not None:
+        decoder = model.decoder(device)
+        shown |= {"device": decoder.device, "bytes_on_device": decoder.device_bytes}
     parts = {"header": artifact.header_bytes} | artifact.parts
     if as_json:
         show_json(shown | {"parts": parts, "profile": model.profile.model_dump(mode="json")})

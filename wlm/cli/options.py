@@ -5,8 +5,6 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from wlm.errors import WlmError
-
 Device = Annotated[str, typer.Option(help='Device that computes: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed; one seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run with the same output.")]
@@ -55,29 +53,3 @@ Key = Annotated[str | None, typer.Option(help="Array of a probe file that has se
 def output_option(metavar: str, help_text: str) -> Any:
     """Makes the option `--output` (`-o`) for an annotated path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)
-
-
-EngineOrRaw = Annotated[
-    Literal["raw", "three", "godot", "unity", "unreal"],
-    typer.Option(help="Whose folder: raw is textures, floats and a shader for any."),
-]
-CheckpointEveryIfKept = Annotated[float | None, CheckpointEvery.__metadata__[0]]
-
-
-def shader_of(engine: str, shader: str | None, exact: bool = False) -> str:
-    """Returns the language of a raw export's shader.
-
-    Raises:
-        WlmError: One is given, or --exact, for an engine that has its own.
-    """
-    for option, given in (("shader", shader), ("exact", exact)):
-        if given and engine != "raw":
-            raise WlmError(f"--{option}: means nothing with --engine {engine}, which has its own shaders")
-    return shader or "glsl"
-
-
-def seconds_between(checkpoint_every: float | None) -> float:
-    """Returns the seconds between two saves, where none may be given."""
-    from wlm.formats.checkpoint import EVERY
-
-    return EVERY if checkpoint_every is None else checkpoint_every

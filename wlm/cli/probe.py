@@ -226,7 +226,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
             **model.content.facts(),
         }
 
-    models.describe(file, device, as_json, facts)
+    models.describe(file, "probe", device, as_json, facts)
 
 
 def own_positions(model: "ProbeModel", original: Path | None) -> "np.ndarray | None":

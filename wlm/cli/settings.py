@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 _PANEL = "Settings; default: as the profile says"
-_SENTENCE_END = re.compile(r"(?<=[.;:])\s+(?=[A-Z\"`0-9])")
+_SENTENCE_END = re.compile(r"(?<=\.)(?<!eq\.)\s+(?=[A-Z\"`])")
 _LIMITS = {"ge": "at least {}", "gt": "above {}", "le": "at most {}", "lt": "below {}", "multiple_of": "multiple of {}"}
 
 

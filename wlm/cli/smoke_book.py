@@ -37,10 +37,14 @@ _Cells = Annotated[
 _From = Annotated[
     str | None,
     typer.Option(
-        "--from", metavar="LAYOUT", help="Layout of that flip book: unity (default), o3de, o3de-tlrb or embergen."
+        "--from",
+        metavar="LAYOUT",
+        help="Layout of the flip book given by --with: unity (default), o3de, o3de-tlrb or embergen.",
     ),
 ]
-_Straight = Annotated[bool, typer.Option("--straight", help="That flip book has straight (not premultiplied) alpha.")]
+_Straight = Annotated[
+    bool, typer.Option("--straight", help="The flip book given by --with has straight (not premultiplied) alpha.")
+]
 
 
 def register(app: typer.Typer) -> None:

@@ -6,7 +6,7 @@ an alternative in its mapping `INSTEAD`.
 """
 
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -38,7 +38,7 @@ class Verb(TyperCommand):
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         words, system = _without_system(args)
         if system is None:
-            first = first_argument(words, _value_options(str(self.name)))
+            first = first_argument(words, _options(str(self.name)))
             system = None if first is None else self.detect(Path(first))
         if system is None:
             return super().make_context(info_name, args, parent, **extra)
@@ -96,26 +96,26 @@ def variant(verb: str, system: str) -> Any:
     return command_of(verb, function)
 
 
-def first_argument(words: Sequence[str], value_options: set[str]) -> str | None:
+def first_argument(words: Sequence[str], options: Mapping[str, bool]) -> str | None:
     """Finds the first argument of a command line, the first word that is neither an option nor its value.
 
     Args:
         words: The command line after the verb.
-        value_options: Options that take a value. The values of other options, which are generated from settings, are
-            recognised because they name no file.
+        options: For each known option whether it takes a value. A word after another option, which is generated from a
+            setting, is its value unless it names an existing file or folder.
 
     Returns:
-        The first such word that names an existing file or folder, else the first such word, else None.
+        The word, or None.
     """
-    found, is_value = [], False
+    value: bool | None = False  # whether the next word is a value; None: unless it names a file
     for word in words:
-        if is_value:
-            is_value = False
-        elif word.startswith("-"):
-            is_value = word in value_options
+        if word.startswith("-"):
+            value = options.get(word, None if "=" not in word else False)
+        elif value is False or (value is None and Path(word).exists()):
+            return word
         else:
-            found.append(word)
-    return next((word for word in found if Path(word).exists()), found[0] if found else None)
+            value = False
+    return None
 
 
 def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
@@ -135,13 +135,13 @@ def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
     return words, system
 
 
-def _value_options(verb: str) -> set[str]:
-    return {name for function in functions(verb).values() for name in _own_value_options(function)}
-
-
-def _own_value_options(function: Callable[..., None]) -> Iterator[str]:
-    for name, parameter in inspect.signature(function).parameters.items():
-        kind, *notes = get_args(parameter.annotation) or (parameter.annotation,)
-        for note in notes:
-            if isinstance(note, OptionInfo) and kind is not bool:
-                yield from note.param_decls or (f"--{name.replace('_', '-')}",)
+def _options(verb: str) -> dict[str, bool]:
+    """Returns for each explicit option of a verb whether it takes a value."""
+    found = {}
+    for function in functions(verb).values():
+        for name, parameter in inspect.signature(function).parameters.items():
+            kind, *notes = get_args(parameter.annotation) or (parameter.annotation,)
+            for note in notes:
+                if isinstance(note, OptionInfo):
+                    found |= dict.fromkeys(note.param_decls or (f"--{name.replace('_', '-')}",), kind is not bool)
+    return found

@@ -248,7 +248,7 @@ def load_volume(
         heat = None if volume.temperature is None else volume.temperature.to(device)
         volume = replace(volume, density=volume.density.to(device), temperature=heat)
         if not told and is_long_along_z(volume):
-            warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--up z)"
+            warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
     if voxel is None:
         return volume

@@ -76,7 +76,7 @@ class Profile(Settings):
     static_budget_db: float = Field(60.0, gt=0.0)
     """Lowest PSNR in dB with which a tile is stored as one pattern that only changes in brightness."""
     frames: Literal["auto", "never", "always"] = "auto"
-    """Which tiles are stored as BC7 at each time instead of maps and a network. "auto": those that take no more bytes
+    """Tiles that are stored as BC7 at each time instead of maps and a network. "auto": those that take no more bytes
     of GPU memory that way."""
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Lists of the Gaussians that each of a grid of equal cubes may feel (gaussian-probe-compression, section 3.2).
+"""Lists of the Gaussians that may reach each cube of a grid (gaussian-probe-compression, section 3.2).
 
 Count the cubes of each Gaussian, add the counts up, write the pairs (cube, Gaussian), sort them by cube, and find where
 each cube's begin. The sort keeps equal keys in order, so a cube lists its Gaussians by rising number and a sum over a
@@ -47,7 +47,7 @@ _BOX, _SPHERE, _EXACT = (wp.constant(TESTS.index(test)) for test in ("box", "sph
 
 @wp.struct
 class Cubes:
-    """A grid of cubes with a list of Gaussians each; cube (i, j, k) is number `(i * counts[1] + j) * counts[2] + k`.
+    """A grid of cubes with lists of Gaussians; cube (i, j, k) has the index `(i * counts[1] + j) * counts[2] + k`.
 
     Attributes:
         low: Lowest corner of the grid.
@@ -90,7 +90,7 @@ def _number(cubes: Cubes, cell: wp.vec3i) -> int:
 
 @wp.func
 def cube_of(cubes: Cubes, x: wp.vec3) -> int:
-    """The cube that a point lies in, or the nearest one; any for a point that is NaN, which no Gaussian reaches."""
+    """Returns the cube that contains a point, or the nearest one; any cube for NaN, which no Gaussian reaches."""
     return _number(cubes, _cell(cubes, x))
 
 
@@ -101,7 +101,7 @@ def _place_margin(cubes: Cubes) -> float:
 
 @wp.func
 def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
-    """First and last cell, along each axis, of the cubes that meet the box of all within `reach` of `centre`.
+    """Returns the first and last cube along each axis that meet the box of half side `reach` around `centre`.
 
     All cells where these aren't numbers: what can't be told here is tested again at each point.
     """
@@ -119,7 +119,7 @@ def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
 
 @wp.func
 def _on_edge(p: wp.vec3d, q: wp.vec3d, low: wp.float64, high: wp.float64) -> wp.float64:
-    """Least |p + t q|^2 for low <= t <= high."""
+    """Returns the least |p + t q|^2 for low <= t <= high."""
     t = wp.clamp(-wp.dot(p, q) / wp.dot(q, q), low, high)
     return wp.length_sq(p + t * q)
 
@@ -134,7 +134,7 @@ def _on_face(
     r_low: wp.float64,
     r_high: wp.float64,
 ) -> wp.float64:
-    """Least |p + s q + t r|^2 for s between q_low and q_high, and t likewise."""
+    """Returns the least |p + s q + t r|^2 for s between q_low and q_high, and t likewise."""
     across = r - (wp.dot(q, r) / wp.dot(q, q)) * q
     t = -wp.dot(p, across) / wp.dot(across, across)
     s = -wp.dot(p + t * r, q) / wp.dot(q, q)
@@ -152,7 +152,7 @@ def _on_face(
 
 @wp.func
 def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
-    """Least |W d|^2 for d in a box, exact but for rounding.
+    """Returns the least |W d|^2 for d in a box, exact except for rounding.
 
     A convex function's least point in a convex set, where its least point of all lies outside, is on the set's border,
     and there on a face that has the two on different sides: were it not, a step towards the least point of all would
@@ -186,7 +186,7 @@ def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
 
 @wp.func
 def _limit(shape: Shape, test: int) -> float:
-    """What a test compares with: the squared radius of a sphere, or for an ellipsoid the squared cut."""
+    """Returns the bound of a test: the squared radius of a sphere, or the squared cut of an ellipsoid."""
     if shape.radius > 0.0:
         return shape.radius
     w = shape.whiten
@@ -210,7 +210,7 @@ def _span_of(cubes: Cubes, shape: Shape, limit: float, test: int):
 
 @wp.func
 def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i, test: int) -> bool:
-    """Whether a cube of the span also passes the test."""
+    """Returns whether a cube of the span also passes the test."""
     if test == _BOX or not wp.isfinite(shape.reach):
         return True
     pad = _place_margin(cubes)
@@ -305,7 +305,7 @@ def _find_starts(
 
 
 def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
-    """Sorts pairs by their first number, keeping the order of equals.
+    """Sorts pairs by their first number, in a stable order.
 
     Args:
         keys: int [2 * count], numbers of cubes; the second half is room to work in.
@@ -319,7 +319,7 @@ def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
 
 
 def build(shapes, low, high, size: float | None = None, *, test: str = "box") -> Cubes:
-    """Makes the lists of a grid over a box.
+    """Builds the lists of a grid over a box.
 
     Without a size the cubes begin a quarter as wide as the median Gaussian reaches along its widest axis, and double
     until there are no more than 8 cubes and 256 pairs to test a Gaussian (4,096 more of either are always allowed).
@@ -373,7 +373,7 @@ def build(shapes, low, high, size: float | None = None, *, test: str = "box") ->
 
 
 def everything(count: int, device) -> Cubes:
-    """One cube that lists all Gaussians, for sums without lists.
+    """Returns one cube that lists all Gaussians, for sums without lists.
 
     Args:
         count: K.
@@ -396,7 +396,7 @@ def _grid(corners: np.ndarray, size: float) -> Cubes:
 
 
 def _tested(shapes, cubes: Cubes, kind: int) -> int:
-    """Pairs that a test is made of."""
+    """Returns the pairs of cubes and Gaussians to test."""
     counts = wp.empty(shapes.shape[0], dtype=wp.int64, device=shapes.device)
     wp.launch(_candidates, counts.shape, inputs=[shapes, cubes, kind], outputs=[counts], device=shapes.device)
     return int(counts.numpy().sum())

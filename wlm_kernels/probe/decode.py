@@ -138,7 +138,7 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
-    """The network of a block of points, from the parts of their sums."""
+    """Returns the code of the network for a block of points, from the partial sums of their latents."""
     snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)

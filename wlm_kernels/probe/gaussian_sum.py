@@ -62,7 +62,7 @@ def _cubes_of(
 
 @dataclass(frozen=True)
 class _Kernels:
-    """Of one latent length."""
+    """The kernels of one latent length."""
 
     forward: Any
     backward: Any
@@ -208,7 +208,7 @@ def sum(rows, shapes, cubes, x, f, cut: float) -> None:
 
 
 def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """The gradient of `sum` by its rows.
+    """Computes the gradient of `sum` with respect to its rows.
 
     Args:
         rows, shapes, cubes, x, cut: As for `sum`.
@@ -228,7 +228,7 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
 
 
 def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """The gradient of `sum` by its points.
+    """Computes the gradient of `sum` with respect to its points.
 
     Args:
         rows, shapes, cubes, x, grad_f, cut: As for `backward`.

@@ -122,7 +122,7 @@ def _reaches(shape: Shape, x: wp.vec3, d2: float, cut: float) -> bool:
 
 @wp.func
 def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
-    """Whether the box round what a Gaussian reaches meets another box.
+    """Returns whether the bounding box of a Gaussian's support meets another box.
 
     Args:
         shape: The Gaussian.

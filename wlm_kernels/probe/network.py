@@ -26,27 +26,27 @@ CPU_LANES = 2
 
 
 def padded(outputs: int) -> int:
-    """Numbers in a row of the last layer."""
+    """Returns the length of a padded row of the last layer."""
     return -(-outputs // 4) * 4
 
 
 def most_outputs(latent: int, hidden: int) -> int:
-    """The most outputs with which the fewest probes of a block still fit its shared memory on CUDA."""
+    """Returns the most outputs with which the fewest probes of a block still fit its shared memory on CUDA."""
     rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
     return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
 
 
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
-    """Probes that a block of threads takes on CUDA: as many as fit its shared memory, 64 at most.
+    """Returns the probes per block of threads on CUDA: as many as fit its shared memory, 64 at most.
 
-    Above `most_outputs` none fit, and the kernels are for the CPU alone, where the number means nothing.
+    Above `most_outputs` none fit: the kernels then run on the CPU only, where the number has no meaning.
     """
     rows = latent + 3 + 2 * hidden + padded(outputs)
     return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """CUDA code for the forward pass of a block of `THREADS` threads: the beginning of a body, see its file."""
+    """Returns CUDA code for the forward pass of a block of `THREADS` threads: the start of a body, see its file."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
@@ -72,19 +72,19 @@ class NetworkKernels:
 
     @property
     def size(self) -> int:
-        """Numbers in the weights' array."""
+        """Length of the array of weights."""
         return (self.latent + 4) * self.hidden + (self.hidden + 1) * (self.hidden + padded(self.outputs))
 
     def parts(self, probes: int) -> int:
-        """Parts of the gradient that a launch over so many probes writes."""
+        """Returns the number of partial gradients that a launch over a number of probes writes."""
         return CPU_LANES if self.device_kind == "cpu" else probes // self.probes
 
     def load(self, device) -> None:
-        """Compiles it for a device now."""
+        """Compiles the kernels for a device now."""
         self._kernel.module.load(wp.get_device(device))
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
-        """The loss, sum over live probes and numbers of weight * error^2, and its gradients.
+        """Computes the loss, the sum over live probes and numbers of weight * error^2, and its gradients.
 
         Args:
             groups: `step.Groups`.

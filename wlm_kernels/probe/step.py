@@ -51,7 +51,7 @@ class Groups:
 #endif
 """)
 def next_bit(bits: wp.uint32) -> int:
-    """Place of the lowest bit that is set; `bits` must not be 0."""
+    """Returns the index of the lowest set bit; `bits` must not be 0."""
     ...
 
 
@@ -63,7 +63,7 @@ def next_bit(bits: wp.uint32) -> int:
 #endif
 """)
 def _ballot(bit: int) -> wp.uint32:
-    """A word of the bits of the 32 threads of a warp."""
+    """Returns a word with a bit for each of the 32 threads of a warp."""
     ...
 
 
@@ -125,7 +125,7 @@ def _touch_cuda(
 
 
 def count_step(control) -> None:
-    """Adds one to `control`, int [1], the number of the step."""
+    """Adds one to `control`, int [1], the index of the step."""
     wp.launch(_count_step, 1, outputs=[control], device=control.device)
 
 
@@ -158,7 +158,7 @@ class StepKernels:
     _update: Any
 
     def load(self, device) -> None:
-        """Compiles them for a device now."""
+        """Compiles the kernels for a device now."""
         for kernel in (self._shapes, self._features, self._collect, self._update, _count_step):
             kernel.module.load(wp.get_device(device))
 
@@ -183,7 +183,7 @@ class StepKernels:
         )
 
     def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
-        """The Gaussians' sum at each probe.
+        """Computes the sum of the Gaussians at each probe.
 
         Args:
             groups, shapes, used, by_group, cut: As above.
@@ -222,7 +222,7 @@ class StepKernels:
         )
 
     def update(self, optimiser, rows, used, shapes, sums, moments, net, net_moments, partial) -> None:
-        """One step of Adan for the Gaussians and of Adam for the network.
+        """Takes a step of Adan or Adam for the Gaussians and of Adam for the network.
 
         Args:
             optimiser: `optimiser.Optimiser`.
@@ -405,7 +405,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 
 def _block_sum(vec_sums, numbers: int):
-    """The sum of a vector over a CUDA block, in a fixed order, into row k of an array."""
+    """Sums a vector over a CUDA block in a fixed order into row k of an array."""
 
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...

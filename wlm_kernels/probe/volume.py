@@ -1,4 +1,4 @@
-"""Nested grids of blocks round a viewer: reading the light at any point, through a page table.
+"""Reading light at any point from nested grids of blocks around a viewer, through a page table.
 
 A block of level l is the cell `[b s, (b + 1) s)` of a grid of cubes of side s_l, named by its integer coordinates b;
 its D numbers stand for its centre. Level l keeps the window of `side` blocks along each axis that starts at base_l.
@@ -146,7 +146,7 @@ def _read(
 
 
 def unscroll(pool, pages, bases, side: int, out, valid) -> None:
-    """Puts the blocks into the windows' own order: row `((l * side + x) * side + y) * side + z` is base_l + (x, y, z).
+    """Copies the blocks in window order: row `((l * side + x) * side + y) * side + z` is base_l + (x, y, z).
 
     Args:
         pool: float [R, D].

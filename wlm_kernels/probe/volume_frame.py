@@ -1,16 +1,16 @@
-"""A frame of the cascaded volume on its device: which blocks are new, what fills them, and where they are kept.
+"""A frame of the cascaded volume on its device: finding new blocks, their probes, and their rows of the pool.
 
-The launches of a frame, whose sizes never change, so that a graph can hold them:
+The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 
-1. `look` takes the new windows; `scroll` finds for each slot the block that it now stands for, whether a probe is near
-   that block, and whether the pool still has it. What it hasn't waits, and is counted by its distance to the viewer.
-2. `choose` finds the distance within which enough blocks wait, gathers those and ranks them: the nearest are decoded,
-   in sides of their own and with what is behind the viewer as if it were twice as far; of two as near the finer one,
-   then the one of the lower slot.
-3. `allocate` gives each a row of the pool: the least recently used one of a group of rows that no other takes from.
+1. `look` takes the new windows; `scroll` finds for each slot its block, whether a probe is near that block, and whether
+   the pool still has it. Other blocks wait, and are counted by their distance to the viewer.
+2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
+   decoded, by distances in units of their own side, doubled behind the viewer; of two equal ones the finer block, then
+   the one of the lower slot.
+3. `allocate` gives each block a row of the pool: the least recently used row of a group that no other block takes from.
    Groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
-5. `combine` makes the block's light of theirs, at most half of their range beyond them.
+5. `combine` mixes the light of these probes, extrapolated by at most half of their range.
 """
 
 import numpy as np
@@ -18,12 +18,12 @@ import warp as wp
 
 from wlm_kernels.probe.volume import wrap
 
-PROBES = 16  # that decide a block
-HALVES = 64  # of a block's reach: four half sides along each axis
-BINS = 4096  # of the distance, a cube of 16
-TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 of them, and over 256
-GROUP = 64  # rows of the pool, of which one is chosen
-MOST = 4096  # blocks that are ranked
+PROBES = 16  # most probes that contribute to a block
+HALVES = 64  # cells of a block's reach: four half sides along each axis
+BINS = 4096  # bins of the distance, a cube of 16
+TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 bins, and over 256
+GROUP = 64  # rows of the pool from which one is chosen
+MOST = 4096  # most blocks that are ranked
 QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
 """Counters of a frame; the last is that of `choose`."""
 
@@ -52,7 +52,7 @@ Views = wp.types.matrix(shape=(LEVELS, 4), dtype=float)
 
 @wp.struct
 class Index:
-    """Probes by cell, and the blocks that have one near; see `wlm.probe.volume.index`.
+    """Probes sorted by cell, and the blocks near probes; see `wlm.probe.volume.index`.
 
     Attributes:
         key: [N], rising.
@@ -77,7 +77,7 @@ class Index:
 
 @wp.struct
 class Windows:
-    """What each level's window holds; S slots.
+    """The slots of each level's window, S in all.
 
     Attributes:
         bases: [L].
@@ -100,7 +100,7 @@ class Windows:
 
 @wp.struct
 class Pool:
-    """The rows in which blocks lie, R of them, in use or kept for their return.
+    """The R rows of the pool, in use or cached.
 
     Attributes:
         stamp: [R], the last frame in which the row's block was in a window; -1 for a row without one.
@@ -115,7 +115,7 @@ class Pool:
 
 @wp.struct
 class Work:
-    """What one launch of a frame leaves for the next; B blocks are decoded at most.
+    """Scratch arrays between the launches of a frame, which decodes at most B blocks.
 
     Attributes:
         clock: [1], the frame's number.
@@ -172,7 +172,7 @@ def morton(cell: wp.vec3i) -> wp.int64:
 
 @wp.func
 def _lower(keys: wp.array1d[wp.int64], first: int, last: int, key: wp.int64) -> int:
-    """The first of keys[first:last], which rise, that is no less than a key; `last` where none is."""
+    """Returns the first index of rising keys[first:last] whose key is not below a given key, or `last`."""
     low = first
     high = last
     while low < high:
@@ -199,7 +199,7 @@ def _find(index: Index, level: int, block: wp.vec3i) -> int:
 
 @wp.func
 def _rank_of(away: wp.vec3, forward: wp.vec3) -> float:
-    """The squared distance in sides; of what lies behind the viewer as if it were twice as far."""
+    """Returns the squared distance in sides, of a block behind the viewer as if it were twice as far."""
     squared = wp.length_sq(away)
     if squared > 0.0:
         squared += 1.5 * squared * (wp.length(forward) - wp.dot(away, forward) / wp.sqrt(squared))
@@ -273,7 +273,7 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
 
 @wp.func
 def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
-    """Of 16 counts the first with which a sum reaches the budget, or the last; and the sum before it."""
+    """Returns the first of 16 counts with which a sum reaches the budget, or the last one; and the sum before it."""
     counts = vec16i()
     for i in range(16):  # unrolled, so that all are under way at once
         counts[i] = histogram[first + i]
@@ -415,7 +415,7 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
 
 
 class Look:
-    """Takes a frame's windows and number; what changes from frame to frame is in the arguments of this launch alone.
+    """Takes the windows and the index of a frame; only the arguments of this launch change from frame to frame.
 
     Made once for a volume, since packing all arguments anew takes longer than the launch.
 
@@ -431,7 +431,7 @@ class Look:
         self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
 
     def __call__(self, bases: np.ndarray, views: np.ndarray, forward: np.ndarray, frame: int) -> None:
-        """Launches it on the current stream.
+        """Launches the kernel on the current stream.
 
         Args:
             bases: Whole numbers [L, 3], first block of each window, in the index's numbers.
@@ -448,7 +448,7 @@ class Look:
 
 
 def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
-    """Finds what each slot stands for, and what waits."""
+    """Finds the block of each slot, and the blocks that wait."""
     inputs = [index, windows, pool, side, work]
     wp.launch(_scroll, windows.held.shape, inputs=inputs, device=work.clock.device)
 
@@ -462,7 +462,7 @@ def choose(windows: Windows, side: int, work: Work) -> None:
 
 
 def allocate(windows: Windows, pool: Pool, work: Work) -> None:
-    """Gives the chosen blocks their rows; one that gets none, where its group is all in use, goes on waiting."""
+    """Gives the chosen blocks their rows; a block whose group has no free row goes on waiting."""
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
     wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
 
@@ -474,7 +474,7 @@ def search(index: Index, windows: Windows, side: int, work: Work) -> None:
 
 
 def combine(work: Work, light: wp.array, pool: wp.array) -> None:
-    """Writes the blocks' light.
+    """Writes the light of the blocks.
 
     Args:
         work: With the weights.
@@ -485,10 +485,10 @@ def combine(work: Work, light: wp.array, pool: wp.array) -> None:
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Rows [M, D] of an array [N, D] by their numbers [M]."""
+    """Copies rows [M, D] of an array [N, D] by their indices [M]."""
     wp.launch(_take_rows, out.shape, inputs=[values, numbers, out], device=out.device)
 
 
 def take_points(points: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Points [M] of an array [N] by their numbers [M]."""
+    """Copies points [M] of an array [N] by their indices [M]."""
     wp.launch(_take_points, out.shape, inputs=[points, numbers, out], device=out.device)

@@ -34,7 +34,7 @@ _Square = wp.types.matrix(shape=(PROBES, PROBES), dtype=float)
 
 @wp.func
 def _overlap(x: float, y: float) -> float:
-    """A(x) A(y)^T along one axis, in sides, with blocks at whole numbers."""
+    """Returns A(x) A(y)^T along one axis, in sides, with blocks at integers."""
     low = wp.floor(x)
     other = wp.floor(y)
     a = x - low
@@ -50,7 +50,7 @@ def _overlap(x: float, y: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _pick(index: Index, windows: Windows, side: int, work: Work):
-    """One probe of a block a thread."""
+    """Picks the probes of a block, one per thread."""
     k, i = wp.tid()
     total = int(0)
     for j in range(_HALVES):
@@ -86,7 +86,7 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
 
 @wp.kernel(enable_backward=False)
 def _relate(work: Work):
-    """The covariance of one probe with those before it, itself and the block, a thread."""
+    """Computes the covariance of one probe with those before it, itself and the block, one probe per thread."""
     k, i = wp.tid()
     if i < work.picked[k]:
         x = work.places[k, i]
@@ -106,7 +106,7 @@ def _relate(work: Work):
 
 @wp.kernel(enable_backward=False)
 def _weigh(work: Work):
-    """The weights of one block a thread, by Cholesky's decomposition; entries of rows that aren't known yet are 0."""
+    """Computes the weights of one block per thread by Cholesky decomposition; entries of unknown rows are 0."""
     k = wp.tid()
     count = work.picked[k]
     lower = _Square()

@@ -27,24 +27,21 @@ _Range = tuple[_Positive, _Positive]
 
 
 class NetworkSettings(BaseModel):
-    """Shape of the network.
+    """Shape of the network."""
 
-    Attributes:
-        width: Channels of the first level. Each further level has twice the channels at half the resolution.
-        levels: Levels of the U-Net, the lowest included.
-        adapters: Whether each of the four groups of planes has its own NAFBlock; otherwise all planes share one.
-        guide: Kind of the guiding map.
-        stem: Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the
-            network at half the resolution, for a quarter of the work.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     width: int = Field(16, ge=8, le=64, multiple_of=8)
+    """Channels of the first level. Each further level has twice the channels at half the resolution."""
     levels: int = Field(5, ge=2, le=6)
+    """Levels of the U-Net, the lowest included."""
     adapters: bool = True
+    """Whether each of the four groups of planes has its own NAFBlock; otherwise all planes share one."""
     guide: GuideKind = "paper"
+    """Kind of the guiding map."""
     stem: Literal[1, 2] = 1
+    """Edge in pixels of the squares that the first convolution takes as one pixel. The paper's is 1; 2 runs the network
+    at half the resolution, for a quarter of the work."""
 
     @property
     def channels(self) -> int:
@@ -58,74 +55,71 @@ class NetworkSettings(BaseModel):
 
 
 class DatasetSettings(BaseModel):
-    """Settings of the samples. Lengths are shares of the box's edge; times are multiples of the time to cross it.
+    """Settings of the samples. Lengths are shares of the box's edge; times are multiples of the time to cross it."""
 
-    Attributes:
-        cells: Velocity cells along each edge of the box.
-        least_cells: Fewest cells of a training sequence. The number is drawn log-uniformly between this and `cells`:
-            coarse grids give smooth smoke, in which the steps of a guiding map miss less. None: always `cells`, as in
-            validation.
-        refine: Density voxels along the edge of a cell.
-        substeps: Air steps per smoke step; even, for CUDA graphs.
-        resolution: Pixels along an image's edges.
-        frames: Frame pairs taken from a sequence.
-        views, arc: Number of fixed views, spread evenly over `arc` degrees; the paper has 9 over 90.
-        views_a_frame: Random views of each training pair.
-        elevation: Largest angle of a random view above or below the horizontal, degrees.
-        zoom: Smallest and largest edge of a random view's image.
-        guide: Kind of guiding map.
-        guide_step: Ray step h of the guiding map; the paper's is 10 of 400 voxels.
-        guide_spacing: Distance between the nodes of the lattice of light from the sides, for guide `six`; None:
-            `guide_step`.
-        jitter: Share of a step by which a pixel's samples are shifted.
-        surface: Smoke whose density would have this optical depth across the whole box counts as a surface.
-        reference_step: Step of the march that renders the target lightmaps, in voxels.
-        extinction: Optical depth of density 1 across the box.
-        density_scales: Smallest and largest random factor on the extinction.
-        sequences: Number of sequences per round.
-        hot: Share of sequences with emission.
-        moving: Share of the sequences with obstacles in which one obstacle moves; these wait for the device each step.
-        warmup: Mean time before a sequence's first pair.
-        interval: Time between the two frames of a pair, rounded to whole steps.
-        apart: Time between two pairs.
-        least_coverage: Share of the image that must show smoke; frames below it count as almost empty.
-        kept_empty: Share of almost empty frames that are kept.
-        validation_sequences, validation_seed: Size and seed of the validation set, which selects the best network.
-        test_seed: Seed of a test set of the same size, which takes no part in model selection.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     cells: int = Field(50, ge=16, le=512)
+    """Velocity cells along each edge of the box."""
     least_cells: int | None = Field(None, ge=16, le=512)
+    """Fewest cells of a training sequence. The number is drawn log-uniformly between this and `cells`: coarse grids
+    give smooth smoke, in which the steps of a guiding map miss less. None: always `cells`, as in validation."""
     refine: int = Field(4, ge=1, le=16)
+    """Density voxels along the edge of a cell."""
     substeps: int = Field(4, ge=2, le=16, multiple_of=2)
+    """Air steps per smoke step; even, for CUDA graphs."""
     resolution: int = Field(256, ge=8, le=4096)
+    """Pixels along an image's edges."""
     frames: int = Field(8, ge=1, le=1000)
+    """Frame pairs taken from a sequence."""
     views: int = Field(9, ge=1, le=360)
+    """Number of fixed views, spread evenly over `arc` degrees; the paper has 9 over 90."""
     arc: float = Field(90.0, gt=0.0, le=360.0)
+    """Angle over which the fixed views are spread, degrees."""
     views_a_frame: int = Field(3, ge=1, le=64)
+    """Random views of each training pair."""
     elevation: float = Field(20.0, ge=0.0, le=89.0)
+    """Largest angle of a random view above or below the horizontal, degrees."""
     zoom: _Range = (0.65, 1.2)
+    """Smallest and largest edge of a random view's image."""
     guide: GuideKind = "paper"
+    """Kind of guiding map."""
     guide_step: _Positive = 1.0 / 40.0
+    """Ray step h of the guiding map; the paper's is 10 of 400 voxels."""
     guide_spacing: _Positive | None = None
+    """Distance between the nodes of the lattice of light from the sides, for guide `six`; None: `guide_step`."""
     jitter: _Share = 1.0
+    """Share of a step by which a pixel's samples are shifted."""
     surface: float = Field(4.0, ge=0.0)
+    """Smoke whose density would have this optical depth across the whole box counts as a surface."""
     reference_step: _Positive = 1.0
+    """Step of the march that renders the target lightmaps, in voxels."""
     extinction: _Positive = 25.0
+    """Optical depth of density 1 across the box."""
     density_scales: _Range = (0.5, 2.0)
+    """Smallest and largest random factor on the extinction."""
     sequences: int = Field(14, ge=1, le=10000)
+    """Number of sequences per round."""
     hot: _Share = 0.25
+    """Share of sequences with emission."""
     moving: _Share = 0.1
+    """Share of the sequences with obstacles in which one obstacle moves; these wait for the device each step."""
     warmup: float = Field(1.3, ge=0.0, le=100.0)
+    """Mean time before a sequence's first pair."""
     interval: _Positive = 0.01
+    """Time between the two frames of a pair, rounded to whole steps."""
     apart: float = Field(0.12, ge=0.0, le=100.0)
+    """Time between two pairs."""
     least_coverage: _Share = 0.02
+    """Share of the image that must show smoke; frames below it count as almost empty."""
     kept_empty: _Share = 0.05
+    """Share of almost empty frames that are kept."""
     validation_sequences: int = Field(4, ge=1, le=1000)
+    """Number of sequences of the validation set, which selects the best network."""
     validation_seed: int = Field(2026, ge=0)
+    """Seed of the validation set."""
     test_seed: int = Field(2027, ge=0)
+    """Seed of a test set of the same size, which takes no part in model selection."""
 
     @model_validator(mode="after")
     def _check(self) -> "DatasetSettings":
@@ -171,36 +165,33 @@ class DatasetSettings(BaseModel):
 
 
 class TrainSettings(BaseModel):
-    """Settings of the optimisation.
+    """Settings of the optimisation."""
 
-    Attributes:
-        rounds: Number of pools of samples, one after the other.
-        steps: Steps per round.
-        batch: Frames per step; with a temporal loss, twice the number of pairs.
-        rate: Adam's highest learning rate; the paper's is 1e-3.
-        floor: Share of `rate` at the end of half a cosine.
-        warmup: Steps over which the rate rises from 0.
-        average: Decay of the running mean of the weights, which is what is validated and saved.
-        half: Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32.
-        crop: Edge in pixels of the random crop, which contains smoke, that a step trains on; None: whole images.
-        validate_every: Rounds between validations; the last round is always validated.
-        temporal: Weight of the temporal loss relative to the reconstruction (eq. 10, for which the paper gives no
-            numbers); above 0 a batch is half as many pairs of frames.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     rounds: int = Field(20, ge=1)
+    """Number of pools of samples, one after the other."""
     steps: int = Field(1000, ge=1)
+    """Steps per round."""
     batch: int = Field(12, ge=2, multiple_of=2)
+    """Frames per step; with a temporal loss, twice the number of pairs."""
     rate: float = Field(1e-3, gt=0.0, le=1.0)
+    """Adam's highest learning rate; the paper's is 1e-3."""
     floor: float = Field(0.01, ge=0.0, le=1.0)
+    """Share of `rate` at the end of half a cosine."""
     warmup: int = Field(100, ge=0)
+    """Steps over which the rate rises from 0."""
     average: float = Field(0.999, ge=0.0, lt=1.0)
+    """Decay of the running mean of the weights, which is what is validated and saved."""
     half: bool = True
+    """Whether CUDA computes in bfloat16 where that is safe; the CPU always uses float32."""
     crop: int | None = Field(None, ge=16, multiple_of=16)
+    """Edge in pixels of the random crop, which contains smoke, that a step trains on; None: whole images."""
     validate_every: int = Field(1, ge=1)
+    """Rounds between validations; the last round is always validated."""
     temporal: float = Field(0.0, ge=0.0)
+    """Weight of the temporal loss relative to the reconstruction (eq. 10, for which the paper gives no numbers); above
+    0 a batch is half as many pairs of frames."""
 
     @property
     def total(self) -> int:
@@ -219,20 +210,16 @@ class TrainSettings(BaseModel):
 
 
 class Profile(Settings):
-    """A profile, a file `configs/smoke-network-*.yaml`.
-
-    Attributes:
-        name: Shown in reports.
-        network: Shape of the network.
-        training: Settings of the optimisation.
-        dataset: Settings of the samples.
-    """
+    """Settings of a training, a file `configs/smoke-network-*.yaml`."""
 
     FILES: ClassVar[str] = "smoke-network"
 
     network: NetworkSettings = NetworkSettings()
+    """Shape of the network."""
     training: TrainSettings = TrainSettings()
+    """Settings of the optimisation."""
     dataset: DatasetSettings = DatasetSettings()
+    """Settings of the samples."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -1,0 +1,7 @@
+# Written by python -m wlm._facade from `_PLACES` of the package.
+from wlm.export.engines.kit import ENGINES as ENGINES
+from wlm.export.page.pages import make_page as make_page
+from wlm.export.page.pages import write_page as write_page
+from wlm.export.shading import LANGUAGES as LANGUAGES
+from wlm.export.shading import translate as translate
+from wlm.export.writing import export as export

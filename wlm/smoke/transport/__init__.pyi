@@ -1,0 +1,13 @@
+# Written by python -m wlm._facade from `_PLACES` of the package.
+from wlm.smoke.transport.lighting import LitSmoke as LitSmoke
+from wlm.smoke.transport.lighting import fine_march as fine_march
+from wlm.smoke.transport.lighting import light_smoke as light_smoke
+from wlm.smoke.transport.lights import Environment as Environment
+from wlm.smoke.transport.lights import PointLight as PointLight
+from wlm.smoke.transport.orders import OrdersModel as OrdersModel
+from wlm.smoke.transport.orders import ScatteredSmoke as ScatteredSmoke
+from wlm.smoke.transport.orders import load_orders as load_orders
+from wlm.smoke.transport.orders import scatter as scatter
+from wlm.smoke.transport.sphere import bake_sphere as bake_sphere
+from wlm.smoke.transport.tracing import Transport as Transport
+from wlm.smoke.transport.tracing import trace as trace
