@@ -68,21 +68,21 @@ def test_the_command(tmp_path):
     """Of lightmaps that were baked before, and of the frames themselves; the shader has the scale."""
     folder = write_frames(tmp_path / "a", obstacles=[SPHERE]).path
     call("smoke", "bake", folder, "-o", tmp_path / "six", "--step", 1, "--resolution", 16)
-    text = call("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "b.png", "--depth", folder, "--shader")
+    text = call("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "b.png", "--depth", folder)
+    call("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "b", "--depth", folder)
     page = np.asarray(Image.open(tmp_path / "b_depth.png"))
     assert page.shape == (32, 32, 3) and (page[16:, 16:] == 127).all() and (page[..., 0] == page[..., 2]).all()
     frames = load_frames(folder)
     cameras = [bake(frames.load(n), facing(plume(), size=16, extent=1.32), estimate=False) for n in (1, 2, 3)]
     scale = float(frames_depth(frames, (1, 2, 3), cameras).abs().max())
-    shader = (tmp_path / "b.glsl").read_text()
-    assert "of a frame's height" in text and "float wlm_smoke_depth(" in shader and "vec4 wlm_smoke_point(" in shader
+    shader = (tmp_path / "b" / "smoke.glsl").read_text()
+    assert "frame heights" in text and "float wlm_smoke_depth(" in shader and "vec4 wlm_smoke_point(" in shader
     assert int(np.abs(page.astype(int) - 127).max()) in (127, 128) and 0.0 < scale < 0.5
-    call("smoke", "flipbook", folder, "-o", tmp_path / "c.exr", "--depth", folder, "--resolution", 16)
-    assert (tmp_path / "c_depth.exr").is_file()
-    call("smoke", "flipbook", folder, "-o", tmp_path / "d.png", "--resolution", 16, "--shader")
-    assert "wlm_smoke_depth" not in (tmp_path / "d.glsl").read_text() and not (tmp_path / "d_depth.png").exists()
+    call("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "d")
+    assert "wlm_smoke_depth" not in (tmp_path / "d" / "smoke.glsl").read_text()
+    assert not (tmp_path / "d" / "depth.png").exists()
     line = fails("smoke", "flipbook", tmp_path / "six", "-o", tmp_path / "e.png", "--depth", tmp_path / "none")
-    assert "none: expected the flip book's smoke, found none" in line
+    assert "none: expected the smoke of the flip book, found none" in line
     with pytest.raises(WlmError, match=r"expected frame_0099.npz, of the flip book's frame 1"):
         frames_depth(frames, (99,), cameras[:1])
     book = ("--with", tmp_path / "b_2.png", "--cells", "2x2", "--depth", folder)
