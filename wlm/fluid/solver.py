@@ -213,7 +213,7 @@ class Solver:
         if bricks:
             rings = advection_places.rings_for(_SOUND * substeps * refinement)
             self._bricks = advection_places.make_bricks(self._box, rings, threshold, str(self.device))
-        self._settings = {
+        settings = {
             "lattice": list(lattice.shape),
             "refinement": refinement,
             "scheme": scheme,
@@ -229,7 +229,7 @@ class Solver:
             "threshold": threshold,
         }
         # In JSON's types, which have no tuples, as they are read back.
-        self._settings: dict[str, Any] = json.loads(json.dumps(self._settings))
+        self._settings: dict[str, Any] = json.loads(json.dumps(settings))
         self._done = 0
 
     # Running.

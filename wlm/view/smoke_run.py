@@ -86,7 +86,7 @@ class SixWays(Lighting):
     stage = "lightmaps"
 
     @property
-    def in_graph(self) -> bool:
+    def in_graph(self) -> bool:  # type: ignore[override]
         return self.network is None
 
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay:

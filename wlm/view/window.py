@@ -47,6 +47,8 @@ class Window:
         sliders: The sliders by name.
     """
 
+    _played: float
+
     def __init__(
         self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
     ) -> None:

@@ -73,7 +73,7 @@ def make_page(
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters
-    given = {"mesh": mesh, "original": original, "key": key}
+    given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key}
     given = {name: value for name, value in given.items() if value is not None}
     check_options(Path(files[0]), tuple(given), tuple(known))
     # These have defaults for every kind.

@@ -1,6 +1,7 @@
 """Translates exported shaders from GLSL into the shading languages of engines."""
 
 from collections.abc import Iterable
+from typing import Any
 
 from wlm.errors import WlmError
 from wlm.export.shading.heads import decided
@@ -16,7 +17,7 @@ LANGUAGES = ("glsl", "glsl-es", "hlsl", "msl", "wgsl")
 ENDINGS = {"glsl": ".glsl", "glsl-es": ".glsl", "hlsl": ".hlsl", "msl": ".metal", "wgsl": ".wgsl"}
 """Endings of shader files by language."""
 
-_WRITERS = {"hlsl": HlslWriter, "msl": MetalWriter, "wgsl": WgslWriter}
+_WRITERS: dict[str, Any] = {"hlsl": HlslWriter, "msl": MetalWriter, "wgsl": WgslWriter}
 _VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "msl": "Metal 2 and later", "wgsl": "WGSL"}
 _PRECISIONS = "".join(
     f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D", "usampler2D", "sampler2DArray")

@@ -10,7 +10,7 @@ of the groups of numbers are such that a bit is worth about as much in each grou
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -78,7 +78,8 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
 
 
 def _with_numbers(model: ProbeModel, whole: WholeNumbers) -> ProbeModel:
-    return replace(model, content=replace(model.content, whole=whole, **whole.codes()))
+    content: Any = model.content
+    return replace(model, content=replace(content, whole=whole, **whole.codes()))
 
 
 def _error(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> float:
