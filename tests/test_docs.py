@@ -1,20 +1,16 @@
 """The documents: their figures are those of the benchmarks, and the pages of results those that the command makes.
 
-A document states figures of `benchmarks/` in a comment right above a paragraph, a list or a table, a source on each
-line and its figures in the order of the text::
+`docs/figures.json` lists the sources of figures for each document::
 
-    <!-- figures
-    nvidia-h200/lightmap/city/ours/M: psnr | bpp .1f
-    nvidia-h200/lightmap/city/ours/M - nvidia-h200/lightmap/city/ours/L: psnr .0f
-    -->
-    Profile M has 45.98 dB at 0.7 bits a texel, 2 dB more than L.
+    {"lightmap.md": [
+        {"text": "Profile M has", "figures": [["nvidia-h200/lightmap/city/ours/M", "psnr", "bpp .1f"]]},
+        {"text": "| city", "table": ["nvidia-h200/atlas/AntiqueCamera day/ours", "psnr", "bytes"]}]}
 
-A source is a file, then system, scene, method and option of a row; `FILE/SET/METHOD` of a report of ``wlm smoke
-evaluate --json`; `FILE.csv/STEP` of a training's curve. ` - ` between two sources is their difference, ` / ``
-their ratio. A figure has the format of `benchmarks.figures` unless another follows its name. Above a table of all rows
-whose source begins alike one line is enough; its first columns are the rest of the source::
-
-    <!-- table nvidia-h200/atlas/AntiqueCamera day/ours: psnr | bytes -->
+`text` is the start of a paragraph, list or table; `after`, if given, a text before it. Figures are in the order of
+the text. A source is a file of `benchmarks/`, then system, scene, method and option of a row; `FILE/SET/METHOD` of a
+report; or `FILE.csv/STEP` of a training's curve. ` - ` between two sources is their difference, ` / ` their ratio. A
+figure has the format of `benchmarks.figures` unless another follows its name. A `table` has all rows whose source
+begins alike; its first columns are the rest of the source.
 """
 
 import csv
@@ -30,8 +26,7 @@ from benchmarks import FIGURES, pages, read_json
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-STATED = re.compile(r"<!-- figures\n((?:[^\n>]+: [^\n>]+\n)+)-->\n((?:.+\n)+)")
-TABLE = re.compile(r"<!-- table ([^:\n]+): ([^:\n]+) -->\n\|.*\n\|[-:| ]*\n((?:\|.*\n)+)")
+STATED = json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8"))
 
 
 @functools.cache
@@ -58,27 +53,41 @@ def text_of(value: float, figure: str, form: str = "") -> str:
     return FIGURES[figure].text(value, form) if figure in FIGURES else format(value, form)
 
 
+def paragraph_of(text: str, entry: dict) -> str:
+    """The paragraph, list or table of an entry, up to the next empty line."""
+    start = text.index(entry["after"]) if "after" in entry else 0
+    match = re.compile(rf"^{re.escape(entry['text'])}(?:.*\n)+?(?=\n|\Z)", re.M).search(text, start)
+    assert match, f"no paragraph begins with {entry['text']!r}"
+    return match[0]
+
+
+def test_every_entry_is_of_a_document():
+    assert STATED.keys() <= {path.name for path in DOCUMENTS}
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_figures_are_those_of_the_benchmarks(document):
     text = document.read_text(encoding="utf-8")
-    assert text.count("<!--") == len(STATED.findall(text)) + len(TABLE.findall(text)), "a comment that states nothing"
-    for lines, paragraph in STATED.findall(text):
+    assert "<!--" not in text, "sources of figures belong into docs/figures.json"
+    for entry in STATED.get(document.name, []):
+        paragraph = paragraph_of(text, entry)
         start = 0
-        for source, figures in (line.split(": ", 1) for line in lines.splitlines()):
-            for figure in figures.split(" | "):
+        for source, *figures in entry.get("figures", []):
+            for figure in figures:
                 number = expected(source, *figure.split())
                 match = re.compile(rf"(?<![\w.,]){re.escape(number)}(?![\w]|[.,]\d)").search(paragraph, start)
                 assert match, f"{source}: {figure}: expected {number} in {paragraph[start:]!r}"
                 start = match.end()
-    for source, figures, table in TABLE.findall(text):
-        file, slash, method = source.partition("/")
-        lines = []
-        for key, row in sources(file).items():
-            if key.startswith(method + slash):
-                numbers = ((row.get(figure.split()[0]), figure.split()) for figure in figures.split(" | "))
-                cells = ("" if number is None else text_of(number, *figure) for number, figure in numbers)
-                lines.append(f"| {' | '.join([*key.removeprefix(method + slash).split('/'), *cells])} |")
-        assert table.splitlines() == lines
+        if "table" in entry:
+            source, *figures = entry["table"]
+            file, slash, method = source.partition("/")
+            lines = []
+            for key, row in sources(file).items():
+                if key.startswith(method + slash):
+                    numbers = ((row.get(figure.split()[0]), figure.split()) for figure in figures)
+                    cells = ("" if number is None else text_of(number, *figure) for number, figure in numbers)
+                    lines.append(f"| {' | '.join([*key.removeprefix(method + slash).split('/'), *cells])} |")
+            assert paragraph.splitlines()[2:] == lines
 
 
 def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):

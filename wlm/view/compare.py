@@ -1,4 +1,4 @@
-"""Two models of one input beside each other: their bytes, settings and scores, and how far apart they decode."""
+"""Comparison of two models of one input: bytes, settings, scores, and the PSNR between their decoded light."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from wlm.view.document import Document
 
 _Path = str | os.PathLike[str]
 
-_GAIN = 8.0  # of differences in pictures
-_SIDE = 300  # of a picture, in the page's pixels
+_GAIN = 8.0  # factor on differences in pictures
+_SIDE = 300  # width of a picture in CSS pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +31,15 @@ class Comparison:
     """Two models, A and B.
 
     Attributes:
-        names: Of the files or folders, with their folders where they are alike.
-        system: Of both.
+        names: Names of the files; whole paths if the names are equal.
+        system: System of both models.
         bytes: Sizes of the files.
-        parts: Bytes of each part, the largest first, 0 where a file has none.
-        settings: Those that differ; None where a profile has none of the name.
-        apart: dB, PSNR of B with A as the reference; 120 where both decode alike.
-        scores: Of each against the original, by name; empty without one.
-        pictures: Linear light of A and B, and of the original if it is given, where A and B are furthest apart.
-        where: Of what the pictures are.
+        parts: Bytes of each part, the largest first; 0 if a file lacks it.
+        settings: Settings that differ; None if a profile lacks one.
+        apart: PSNR of B with A as the reference, dB; 120 if both decode to the same light.
+        scores: Scores of each model against the original by name; empty without an original.
+        pictures: Linear light of A, B and the original, if given, where A and B differ most.
+        where: Description of the pictures.
     """
 
     names: tuple[str, str]
@@ -54,11 +54,11 @@ class Comparison:
 
     @property
     def headings(self) -> tuple[str, str]:
-        """Of the columns of A and of B."""
+        """Headings of the columns of A and B."""
         return f"A: {self.names[0]}", f"B: {self.names[1]}"
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """The figures as text: what, of A, of B."""
+        """Rows of the table as text: name, value of A, value of B."""
         rows = [("bytes", *(f"{size:,}" for size in self.bytes))]
         rows += [(name, *(_number(value) for value in pair)) for name, pair in self.scores.items()]
         rows += [("PSNR of B against A, dB", "", f"{self.apart:.2f}")]
@@ -67,10 +67,10 @@ class Comparison:
         return rows + [(f"bytes of {name}", *(f"{size:,}" for size in pair)) for name, pair in self.parts.items()]
 
     def write(self, path: str | os.PathLike[str]) -> int:
-        """Writes the comparison as a page, `.html`; returns its bytes.
+        """Writes the comparison as an HTML file; returns its size in bytes.
 
         Raises:
-            WlmError: The file can't be written.
+            WlmError: The file cannot be written.
         """
         page = Document(" and ".join(self.names))
         page.table("", ("", *self.headings), self.rows())
@@ -99,13 +99,13 @@ def compare(
 
     Args:
         first, second: Two `.wlm` of lightmaps, probes or atlases.
-        original: What was compressed: a lightmap set, a probe file, or the lightmap of an atlas; None: no scores.
-        key: Of a probe file with several arrays, the one that was compressed.
-        device: Where both are decoded.
+        original: The input that was compressed (lightmap set, probe file or lightmap of an atlas); None: no scores.
+        key: Array of a probe file with several.
+        device: Device that decodes both.
         progress: Called about twice a second.
 
     Raises:
-        WlmError: A file can't be read, they are of different systems or sizes, or nothing of theirs can be compared.
+        WlmError: A file cannot be read, the systems or sizes differ, or the models have nothing to compare.
     """
     paths = Path(first), Path(second)
     models = load(paths[0]), load(paths[1])
@@ -122,7 +122,7 @@ def compare(
 
 
 def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
-    """What all systems have."""
+    """Attributes of a comparison that all systems have."""
     parts = [read_artifact(path).parts for path in paths]
     profiles = [model.profile.model_dump(mode="json") for model in models]
     names = list(dict.fromkeys([*profiles[0], *profiles[1]]))
@@ -151,7 +151,7 @@ def _lightmaps(
         frames.append([decoder.frame(time) for decoder in decoders])
         if meter.due(len(frames)):
             meter.report(len(frames))
-    # A frame of one colour has no range to measure against.
+    # A frame of one colour has no range, and so no PSNR.
     by_time = [psnr(a, b) for a, b in frames]
     by_time = np.where(np.isnan(by_time), PSNR_CAP_DB, by_time)
     furthest = int(np.argmin(by_time))
@@ -241,7 +241,7 @@ def _atlases(
 
 
 def _stage(progress: OnProgress | None, name: str) -> OnProgress | None:
-    """Reports the progress of one of the two as a stage of its own."""
+    """Reports the progress of one of the two models as a separate stage."""
     if progress is None:
         return None
     return lambda report: progress(replace(report, stage=f"{report.stage} {name}"))

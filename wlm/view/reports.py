@@ -1,4 +1,4 @@
-"""The systems' reports as pages: what `evaluate --html` writes."""
+"""HTML reports of the systems' evaluations, which `evaluate --html` writes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from wlm.view.display import Display, white_of
 from wlm.view.document import Document
 
 _WORST_TILES, _WORST_PROBES = 3, 10
-_GAIN = 8.0  # of errors in pictures
-_SIDE, _SMALL_SIDE = 300, 220  # of pictures, three or four in a row, in the page's pixels
-_LIT_FROM = (1.0, 1.0, 1.0)  # smoke, in the camera's axes
-_BEHIND = (0.1, 0.12, 0.15)  # smoke
+_GAIN = 8.0  # factor on errors in pictures
+_SIDE, _SMALL_SIDE = 300, 220  # widths of pictures in CSS pixels, for three or four in a row
+_LIT_FROM = (1.0, 1.0, 1.0)  # direction to the light of smoke, in the camera's axes
+_BEHIND = (0.1, 0.12, 0.15)  # background of smoke
 
 
 def lightmap_report(
@@ -47,10 +47,10 @@ def lightmap_report(
         model, lightmaps, report: As they were given to `wlm.lightmap.evaluate` and came from it.
 
     Returns:
-        The page's bytes.
+        Size of the page in bytes.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     light = report.light
     kinds = ", ".join(f"{count} {kind}" for kind, count in light.kinds.items() if count)
@@ -66,7 +66,7 @@ def lightmap_report(
     page = _begin(model.name, report.profile, report.warnings, rows)
     by_time = {"texels": light.psnr_by_time}
     if np.isfinite(light.seen_by_time).any():
-        page.table("As it is seen", ("", "", "worst"), _seen_rows(light))
+        page.table("Scores as rendered", ("", "", "worst"), _seen_rows(light))
         by_time["seen"] = light.seen_by_time
     page.lines("PSNR by hour, mean of the tiles", "dB", report.times, by_time)
     if np.isfinite(light.flip_by_time).any():
@@ -129,10 +129,10 @@ def atlas_report(
         views: The cameras that were asked for.
 
     Returns:
-        The page's bytes.
+        Size of the page in bytes.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     unseen = "No camera around the mesh and no viewer inside sees it: the scores of views are missing."
     rows = [
@@ -171,10 +171,10 @@ def probe_report(path: str | os.PathLike[str], model: ProbeModel, probes: ProbeS
         model, probes, report: As they were given to `wlm.probe.evaluate` and came from it.
 
     Returns:
-        The page's bytes.
+        Size of the page in bytes.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     rows = [
         ("PSNR of coefficients", _number(report.psnr, ".2f", "dB")),
@@ -210,10 +210,10 @@ def smoke_report(path: str | os.PathLike[str], name: str, model: SmokeModel, com
         model, comparisons: As they were given to `wlm.smoke.evaluation.compare` and came from it.
 
     Returns:
-        The page's bytes.
+        Size of the page in bytes.
 
     Raises:
-        WlmError: The file can't be written.
+        WlmError: The file cannot be written.
     """
     rows = [
         ("parameters", f"{parameter_count(model.network):,}"),
@@ -238,12 +238,12 @@ def smoke_report(path: str | os.PathLike[str], name: str, model: SmokeModel, com
 
 
 def _smoke(page: Document, comparison: Comparison) -> None:
-    """What a comparison's scores are made of."""
+    """Adds the plots of a comparison's scores."""
     name = comparison.name
     planes = {method: score.planes for method, score in comparison.methods.items()}
     page.points(f"{name}: PSNR by light, of opacity and of emission", "dB", PLANES, planes)
     frames = len(next(iter(comparison.images.values())))
-    # A volume has one frame, twice.
+    # A single volume counts as two equal frames.
     if frames > 2:
         means = {method: _means(images) for method, images in comparison.images.items()}
         page.lines(f"{name}: PSNR by frame, mean of the views", "dB", np.arange(1.0, frames + 1), means)
@@ -255,7 +255,7 @@ def _smoke(page: Document, comparison: Comparison) -> None:
 
 
 def _means(rows: np.ndarray) -> np.ndarray:
-    """Means of the numbers in each row; NaN where a row has none."""
+    """Means of the finite numbers in each row; NaN for a row without any."""
     count = np.isfinite(rows).sum(1)
     return np.where(count > 0, np.nansum(rows, 1) / np.maximum(count, 1), np.nan)
 
@@ -276,7 +276,7 @@ def _worst_image(page: Document, comparison: Comparison, example: Example) -> No
 
 
 def _begin(name: str, profile: str, warnings: Sequence[str], rows: Sequence[tuple[str, str]]) -> Document:
-    """A page with its title, warnings and summary."""
+    """Starts a report with title, warnings and summary."""
     page = Document(f"{name}: {profile}")
     for warning in warnings:
         page.text(warning, warning=True)
@@ -287,7 +287,7 @@ def _begin(name: str, profile: str, warnings: Sequence[str], rows: Sequence[tupl
 def _beside(
     page: Document, heading: str, name: str, original: np.ndarray, others: Mapping[str, np.ndarray], mask: np.ndarray
 ) -> None:
-    """Adds pictures of linear light [H, W, 3] where a mask [H, W] holds: an original, others, and their errors."""
+    """Adds pictures of linear light [H, W, 3] inside a mask [H, W]: an original, others, and their errors."""
     display = Display(1.0 / white_of(original[mask]))
     lights = {key: np.where(mask[..., None], light, 0.0) for key, light in {name: original, **others}.items()}
     pictures = {key: display.picture(light) for key, light in lights.items()}

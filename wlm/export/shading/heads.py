@@ -5,14 +5,14 @@ from collections.abc import Collection
 
 _GAP = r"\s*(?://\s*)?"
 _REST = r"(?:[^.]|\.(?!\s))*\."  # the rest of a sentence, to its full stop
-_FOR_GLSL = re.compile(rf"For GLSL [^;]*;{_GAP}include it below #version[^.:]*\.")
-_CHOICE = re.compile(rf"Where (WLM_\w+) is defined ([^;]*);{_GAP}else ([^.]*)\.")
+_FOR_GLSL = re.compile(rf"For GLSL [^;]*;{_GAP}include{_GAP}it{_GAP}below{_GAP}#version[^.:]*\.")
+_CHOICE = re.compile(rf"(?:Where|If) (WLM_\w+) is defined,?{_GAP}([^;.]*);{_GAP}(?:else|otherwise) ([^.]*)\.")
 _IF = re.compile(rf"\s(?://\s*)?If (WLM_\w+)\(\w\) is defined,{_REST}")
 # Clauses; the last pattern is a whole sentence.
 _MACROS = (
-    re.compile(rf",{_GAP}unless (?:[^.]|\.(?!\s))*? before this file(?:[^.]|\.(?!\s))*(?=\.)"),
+    re.compile(rf",{_GAP}unless (?:[^.]|\.(?!\s))*? before{_GAP}this{_GAP}file(?:[^.]|\.(?!\s))*(?=\.)"),
     re.compile(rf",{_GAP}or{_GAP}define WLM_[^.]*? before{_GAP}this{_GAP}file(?=\.)"),
-    re.compile(rf"\s(?://\s*)?For{_GAP}a{_GAP}uniform block, [^.]*? before this file{_REST}"),
+    re.compile(rf"\s(?://\s*)?For{_GAP}a{_GAP}uniform block, [^.]*? before{_GAP}this{_GAP}file{_REST}"),
 )
 
 
