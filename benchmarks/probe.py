@@ -14,22 +14,26 @@ Rows of each set, by method:
   size. The list of dead probes counts for them too; nobody stores positions.
 - "held out": the first profile: light at every fifth probe from a fit to the others, and the light half-way between
   probes; with that of the uncompressed others by two simple rules.
-- "volume" and "views" of `benchmarks.probe_volume`, the first profile: light through the cascaded volume along a walk,
-  and pictures under it.
+- "volume", the first profile: a walk with the cascaded volume, filled from the original probes ("lossless") and from
+  each model. Figures are means and 95th percentiles over frames, each timed until the device has finished it. The PSNR
+  is that of readings at probes near the viewer against the input; beside it are the PSNR of the decoded probes at the
+  same samples, and that of readings farther away. The walk starts with an empty volume: the time of its first frame,
+  and the frames until no block waits. RMS and RMSE of the light refer to the probes that filled the volume.
+- "views", the first profile: pictures of balls at the probes, compared as displayed, see `wlm.probe.views`.
 
 A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
 graph, so that gaps between launches do not count; the rivals decode on the CPU.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from benchmarks.plot import Panel
-from benchmarks.probe_volume import view_rows, volume_rows
 from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rivals.rival import Rival
@@ -45,8 +49,10 @@ from wlm.probe.fit import compress
 from wlm.probe.gaussian.decode import GaussianDecoder, Points
 from wlm.probe.gaussian.model import CUT
 from wlm.probe.gaussian.trainer import CODE_BITS, FINAL_RATE
-from wlm.probe.model import Profile
-from wlm.probe.views import VIEWS
+from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.views import VIEWS, score_views
+from wlm.probe.volume.light import Light, StoredLight
+from wlm.probe.volume.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; rows of other methods are about the first."""
@@ -393,3 +399,74 @@ def _in_given_order(points: Points) -> None:
     x[points.order] = points.x.numpy()
     points.x = wp.array(x, dtype=wp.vec3, device=points.x.device)
     points.order = np.arange(len(x))
+
+
+def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
+    """Walks with the original probes and with each model, each from an empty volume.
+
+    Args:
+        bench: Benchmark of the set, on the device of the volume.
+        probes: The original probes.
+        models: Models by the names of their rows.
+        frames: Frames of the walk, at least one; None: each frame moves the viewer by a tenth of a block.
+    """
+    rows = []
+    lights: dict[str, Light] = {"lossless": StoredLight(probes.values, bench.device)}
+    for name, model in models.items():
+        lights[name] = model.decoder(bench.device).light(probes.position)
+    for name, light in lights.items():
+        bench.note(f"the volume, {name}")
+        walked = score_volume(probes, light, frames=frames)
+        spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
+        rows.append(
+            bench.row(
+                "volume",
+                f"{name}, walk of {walked['frames']} frames",
+                f"the finest blocks are {walked['block']:.3g} units wide",
+                frames=walked["frames"],
+                first_ms=walked["first_ms"],
+                frames_first=walked["first_frames"],
+                memory=walked["memory_bytes"] / 2**20,
+                psnr=walked["psnr"],
+                light_psnr=walked["light_psnr"],
+                far_psnr=walked["far_psnr"],
+                **_light(walked),
+                **{key: value["mean"] for key, value in spread.items()},
+                **{f"{key}_p95": value["p95"] for key, value in spread.items()},
+            )
+        )
+    return rows
+
+
+def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> list[Row]:
+    """Scores pictures of balls under each kind of light.
+
+    Args:
+        bench: Benchmark of the set, on the device of the decode.
+        probes: The original probes.
+        model: A model of them.
+        views: Number of pictures, at least one.
+    """
+    bench.note(f"{views} views of balls")
+    decoded = model.decoder(bench.device).decode_probes(probes.position)
+    try:
+        scores = score_views(probes, decoded, views=views, device=bench.device)
+    except WlmError as error:  # no spherical harmonics
+        return [bench.missing_row("views", "balls", error)]
+    return [
+        bench.row(
+            "views",
+            f"{score.drawn}, {score.light}",
+            f"{score.views} views under the original probes and under these",
+            psnr=score.psnr,
+            ssim=score.ssim,
+            flip=score.flip,
+        )
+        for score in scores
+    ]
+
+
+def _light(figures: dict[str, Any]) -> dict[str, float | None]:
+    """Returns figures of the light at a walk's samples; None where no probe is near the viewer."""
+    names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
+    return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}

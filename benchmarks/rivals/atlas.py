@@ -15,8 +15,7 @@ lightmaps of 512² at a share of 0.17, 1.5 dB above Lanczos and 2.0 dB above a b
 import functools
 import math
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -24,8 +23,7 @@ import torch
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
-from wlm.atlas.evaluation import Score, compare
-from wlm.atlas.model import COLOUR_BITS, SOURCE_BITS, TEXELS, AtlasModel
+from wlm.atlas.model import COLOUR_BITS, SOURCE_BITS, TEXELS
 from wlm.atlas.resize import resized
 from wlm.atlas.views import Points
 from wlm.formats import hdr_blocks
@@ -39,26 +37,6 @@ _EXTRA = "baselines"
 def share_of(rival: Rival, scene: LightmappedScene) -> float:
     """The bits of a rival over the lightmap's at 48 per texel."""
     return rival.bytes * 8 / (scene.texels * SOURCE_BITS)
-
-
-def evaluate_rivals(
-    model: AtlasModel, scene: LightmappedScene, names: Sequence[str] = ("downsampling",), **options: Any
-) -> list[tuple[Rival, Score]]:
-    """Scores rivals of as many bits as a model.
-
-    Args:
-        model: The model whose bits are the budget.
-        scene: The scene with its original lightmap.
-        names: Keys of `RIVALS`.
-        options: As for `wlm.atlas.evaluation.compare`.
-
-    Raises:
-        WlmError, ValueError: As `compare` or the rival.
-    """
-    # Half a bit more, so that rounding takes none away.
-    rivals = [RIVALS[name](scene, (model.bits + 0.5) / (scene.texels * SOURCE_BITS)) for name in names]
-    scores = compare(scene, {rival.name: rival.decoded for rival in rivals}, **options)
-    return [(rival, scores[rival.name]) for rival in rivals]
 
 
 def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) -> Rival:

@@ -21,10 +21,7 @@ import numpy as np
 from benchmarks.rivals import probe_mbd, probe_pca
 from benchmarks.rivals.rival import Rival, measure
 from wlm.errors import WlmError
-from wlm.probe.data import ProbeSet
 from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
-from wlm.probe.evaluation import Report, score
-from wlm.system import Meter, OnProgress
 
 # Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
 WEIGHT_BITS = (4, 5, 6, 8, 10, None)
@@ -161,41 +158,6 @@ def at_bytes(
     if best is None:
         raise WlmError(f"probes: {name}: nothing fits into {budget_bytes} bytes for {len(values)} probes")
     return best
-
-
-def evaluate_rivals(
-    probes: ProbeSet,
-    budget_bytes: int,
-    names: Sequence[str] = (),
-    *,
-    progress: OnProgress | None = None,
-    skipped: Callable[[WlmError], None] | None = None,
-) -> list[tuple[Rival, Report]]:
-    """Scores the rivals at one size.
-
-    Args:
-        probes: The input.
-        budget_bytes: The largest size, that of our file.
-        names: Keys of `RIVALS`; none: all.
-        progress: Called after each rival.
-        skipped: Called for a rival that can't be that small, or that can't hold such probes, with the reason.
-
-    Returns:
-        The others, with their reports.
-    """
-    names = names or tuple(RIVALS)
-    meter = Meter(progress, "baselines", len(names))
-    results = []
-    for done, name in enumerate(names, 1):
-        try:
-            rival = at_bytes(name, probes.position, probes.values, budget_bytes)
-        except WlmError as error:
-            if skipped is not None:
-                skipped(error)
-        else:
-            results.append((rival, score(rival.decoded, probes, rival.bytes)))
-        meter.report(done)
-    return results
 
 
 def _search(

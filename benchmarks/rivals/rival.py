@@ -42,11 +42,6 @@ class Rival:
     size: tuple[int, int] | None = None
     disk_bytes: int | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """What a report says of it besides its score."""
-        names = ("name", "option", "encode_seconds", "decode_seconds")
-        return {name: getattr(self, name) for name in names}
-
 
 def measure(
     name: str,
