@@ -49,14 +49,14 @@ ABLATION = {
     "not tuned": {"steps": 0},
     "ASTC": {"colour": "astc"},
 }
-"""By the row's name, the settings that are changed."""
+"""The changed settings of each row."""
 
 SWEEPS = {
     "scale": (0.3, 0.4, 0.5, 0.6, 0.7),
     "colour_scale": (0.2, 0.3, 0.4, 0.5, 0.6, 0.8),
     "lut_scale": (0.3, 0.5, 0.6, 0.7, 0.8, 1.0),
 }
-"""By the setting, its values."""
+"""The values of each swept setting."""
 
 _SEED = 0
 _QUICK = {"steps": 200, "resolution": 256}
@@ -115,7 +115,7 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Fits the variants of a profile, scored in so many views of so many pixels a side; the rest as for `run`."""
+    """Fits the variants of a profile and scores them in a number of square views; the rest as for `run`."""
     chosen = choose(profile, only)
     of = f", ablation of {profile.name}"
     first = Bench("atlas", device, progress)

@@ -46,10 +46,10 @@ PROFILES = ("standard",)
 """Profiles of a run."""
 
 LEAST_TEXELS = 16
-"""Of an object, at the size that is asked for."""
+"""The smallest number of texels of an object, at the requested size."""
 
 _GAP = 2  # texels between charts: a bilinear read of one meets none of the next
-_SAME_PLACE = 1e-5  # of the scene's size
+_SAME_PLACE = 1e-5  # distance of equal positions, over the size of the scene
 _SEED = 1  # seed of the views of the parts' weights
 
 

@@ -7,7 +7,7 @@ from benchmarks.figures import FIGURES
 from benchmarks.rows import Row, Run
 
 _LEAST_DB = 0.05
-_LEAST_TIME = 0.05  # of the old time
+_LEAST_TIME = 0.05  # share of the old time
 _SPREAD = "_spread"
 
 

@@ -49,12 +49,12 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade
         "share_of_float32": Figure("of float32", "%", ".2f"),
         "psnr": Figure("PSNR", "dB", ".2f"),
-        "gain": Figure("gain", "dB", "+.3f"),  # of a PSNR over another method's
+        "gain": Figure("gain", "dB", "+.3f"),  # PSNR minus the PSNR of another method
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
         "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.display`
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
-        "nearest_psnr": Figure("nearest", "dB", ".2f"),  # of uncompressed probes, as the next one
+        "nearest_psnr": Figure("nearest", "dB", ".2f"),  # interpolation of uncompressed probes, as the next figure
         "distance_psnr": Figure("by distance", "dB", ".2f"),
         "half_way_psnr": Figure("half-way", "dB", ".2f"),
         "coarse_psnr": Figure("coarse march", "dB", ".2f"),
@@ -78,7 +78,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "still_light_rms": Figure("without jitter", "%", ".3g"),
         "transparency_rms": Figure("transparency RMS", form=".3g"),
         "bias": Figure("bias", "%", "+.1f"),
-        "rms": Figure("RMS", "%", ".3g"),  # of a difference, over that of the exact values
+        "rms": Figure("RMS", "%", ".3g"),  # RMS difference over the RMS of the exact values
         "worst_rms": Figure("worst light's RMS", "%", ".3g"),
         "halving_rms": Figure("RMS by halving", "%", ".3g"),
         "finest_rms": Figure("RMS from the finest", "%", ".3g"),
@@ -86,8 +86,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "mass_drift": Figure("mass drift", form=".2g"),
         "smoke_gained": Figure("smoke gained", "%", "+.2g"),
         "max_error": Figure("largest error", form=".2g"),
-        "error_999": Figure("99.9% within", form=".2g"),  # of points, against the float64 decode
-        "flicker": Figure("flicker", "levels", ".3g"),  # of 255
+        "error_999": Figure("99.9% within", form=".2g"),  # error of all but 0.1% of the points, against float64
+        "flicker": Figure("flicker", "levels", ".3g"),  # levels of 255
         "flicker_ratio": Figure("over the reference's", form=".3f"),
     },
     "Time": {
@@ -107,12 +107,12 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "speedup": Figure("speedup", form=".2f"),
         "frame_rate": Figure("frames/s", form=".3g"),
     },
-    "Stages": {  # of an atlas' compression
+    "Stages": {  # seconds of each stage of the compression of an atlas
         "weights_seconds": Figure("weights", "s", ".2g"),
-        "tiles_seconds": Figure("tiles", "s", ".2g"),  # of a scene, as the next but one
+        "tiles_seconds": Figure("tiles", "s", ".2g"),  # scenes only
         "curves_seconds": Figure("curves", "s", ".2g"),
         "balance_seconds": Figure("balance", "s", ".2g"),
-        "apart_seconds": Figure("apart", "s", ".2g"),  # of a scene, the tiles of each state by themselves
+        "apart_seconds": Figure("apart", "s", ".2g"),  # scenes only: tiles of each state apart
         "allocate_seconds": Figure("allocate", "s", ".2g"),
         "solve_seconds": Figure("solve", "s", ".2g"),
         "cluster_seconds": Figure("cluster", "s", ".2g"),

@@ -73,8 +73,8 @@ PANELS = (Panel("decode_ms"), Panel("bpp"), Panel("disk_bpp"))
 _QUICK_TILE_STEPS = 8_000
 _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
-_FULL_TILES = 64  # of 1024 x 1024
-_PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # of the fit in plain torch: enough for its time
+_FULL_TILES = 64  # tiles of a lightmap of 1024 x 1024
+_PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # steps of the fit in plain torch that are timed
 _LOADS = 50  # tiles that are unpacked for the time of one
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
@@ -223,7 +223,7 @@ class _LightmapBench(Bench):
         self.grid = TileGrid.of(*self.lightmaps.mask.shape)
         places = np.linspace(0, len(self.times) - 1, min(_ERROR_TIMES, len(self.times))).round().astype(int)
         self.error_times = [self.times[i] for i in places]
-        """Those at which the float64 path is run too."""
+        """Times that are also decoded by the float64 path."""
         self.scored = {"times": len(lightmaps.times), "times_scored": len(chosen)}
         whole = len(chosen) == len(lightmaps.times)
         self.scored_at = "" if whole else f"scored at {_hours(self.times)}; "

@@ -17,7 +17,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import VECTORS, Camera
 
-_FILTER = "RTLightmap"  # of one image without normals or albedo, in linear light
+_FILTER = "RTLightmap"  # filter for one image in linear light without normals or albedo
 _NEVER = 100  # bounces after which Russian roulette begins
 _LLVM = 19  # older versions can't compile Mitsuba's kernels, and end the process
 
@@ -47,7 +47,7 @@ def choose_variant() -> str:
 
 
 class PathTracer:
-    """Images of smoke under one of the six lights at a time.
+    """Renders images of smoke under one of the six lights at a time.
 
     Attributes:
         variant: Mitsuba's.
@@ -166,7 +166,7 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def denoiser_device(device: str) -> str:
-    """Where Open Image Denoise computes for pictures on a device: there, or "cpu" where it doesn't know the device."""
+    """Returns the device on which Open Image Denoise works for pictures on a device: the same, or "cpu"."""
     import pyoidn
 
     try:

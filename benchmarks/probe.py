@@ -55,7 +55,7 @@ from wlm.probe.volume.light import Light, StoredLight
 from wlm.probe.volume.walk import score_volume
 
 PROFILES = ("standard", "compact", "paper")
-"""Profiles of a run; rows of other methods are about the first."""
+"""Profiles of a run; the rows of other methods measure the first."""
 
 SHARES = (1, 2, 3, 5, 7, 10)
 """Sizes of the rivals in a full run, in per cent of float32."""
@@ -67,7 +67,7 @@ _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 # A quick fit is worth this many steps of one probe, however many probes there are: some seconds on two CPU cores.
 _QUICK_PROBE_STEPS = 600_000
 _QUICK_FRAMES = 60
-_DENSE_STEPS = 10  # of the fit in plain torch, where it isn't run to its end
+_DENSE_STEPS = 10  # steps of the fit in plain torch, where it is not run to its end
 _CUTS = (2.5, 2.0)
 _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     # The paper's own rival: clusters of places, nothing but half floats.
@@ -80,7 +80,7 @@ _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
 _QUICK_SHARES = (5,)
 
 PANELS = (Panel("bpp", "psnr", ("ours", "pca", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
-"""What a plot of the rows shows: quality against size, and a decode's error against its time."""
+"""The panels of a plot of the rows: quality against size, and the error of a decode against its time."""
 
 
 def run(
@@ -205,7 +205,7 @@ class ProbeBench(Bench):
         return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """What a fit costs and yields; and its decode, to be timed."""
+        """Returns the row of a fit, and its decode, which is timed later."""
         model, decoder = fit.model, GaussianDecoder(fit.model, self.device)
         points = decoder.points(self.position)
         report, errors = self._decode(decoder, points, decode64(model, self.position), fit.bytes)
@@ -225,7 +225,7 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.run(points))
 
     def component_row(self) -> tuple[Row, Callable[[], object]]:
-        """Size and errors of principal components, and their decode, to be timed."""
+        """Returns the row of principal components, and their decode, which is timed later."""
         self.note("principal components")
         fit = self.fit("pca", lambda: compress(self.probes, "pca"))
         decoder = fit.model.decoder(self.device)
@@ -244,7 +244,7 @@ class ProbeBench(Bench):
         return row, self.replay(reader.run)
 
     def held_out_row(self, fit: Fit) -> Row:
-        """The light where no probe was compressed."""
+        """Returns the row of the light at probes that were left out of the compression."""
         self.note(f"{fit.option}: fitting four fifths of the probes")
         held = held_out(fit.model, self.probes, device=self.device)
         decoder = fit.model.decoder(self.device, position=self.probes.position)
@@ -261,7 +261,7 @@ class ProbeBench(Bench):
         )
 
     def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
-        """The ways to decode a model."""
+        """Returns a row and a decode for each way to decode a model."""
         model = fit.model
         spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
         exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
@@ -298,7 +298,7 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.run(points))
 
     def fit_rows(self, fit: Fit) -> list[Row]:
-        """The speed of the fit alone, and of the same fit in plain torch."""
+        """Returns the rows of the speed of the fit, and of the same fit in plain torch."""
         p, model = fit.model.profile, fit.model
         step_ms = 1e3 * fit.fit_seconds / p.steps
         option = f"{fit.option} {p.steps:,} steps"

@@ -101,7 +101,7 @@ def _table(
 
 
 def _section(run: Run, path: str | os.PathLike[str]) -> str:
-    """The command that measures a run again, into its file, what it was measured with, and its rows."""
+    """Writes the section of a run: the command that repeats it, the environment, and its rows."""
     environment = run.environment
     cuda = f", CUDA {environment['cuda']}" if environment.get("cuda") else ""
     return (
@@ -112,5 +112,5 @@ def _section(run: Run, path: str | os.PathLike[str]) -> str:
 
 
 def _order(run: Run) -> tuple[str, list[str]]:
-    """By system and scenes, so that a part stays in its place when it is measured again."""
+    """Returns a sort key of system and scenes, so that a section keeps its position when it is measured again."""
     return run.rows[0].system, sorted({row.scene for row in run.rows})

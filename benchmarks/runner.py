@@ -1,4 +1,4 @@
-"""What every benchmark does: report progress, fit and store models, time calls in turns, and make rows."""
+"""The base of all benchmarks: it reports progress, fits and stores models, times calls in turns, and makes rows."""
 
 import tempfile
 import time
@@ -25,9 +25,9 @@ class Fit:
     """A model that was fitted, written and read back.
 
     Attributes:
-        option: What its row is called.
-        model: As loaded from the file.
-        fitted: As it was before.
+        option: The option of its row.
+        model: The model as loaded from the file.
+        fitted: The model before it was written.
         bytes: Size of the file.
         fit_seconds, write_seconds: Wall-clock times.
     """
@@ -41,15 +41,15 @@ class Fit:
 
     @property
     def seconds(self) -> float:
-        """Of both."""
+        """Seconds of the fit and the writing."""
         return self.fit_seconds + self.write_seconds
 
 
 class Bench:
-    """One system on one device, and the scene that its rows are about.
+    """A benchmark of one system on one device and one scene.
 
     Attributes:
-        system, scene: Of the rows.
+        system, scene: System and scene of the rows.
         device: "cpu" or "cuda:0".
         mode: How a replayed call runs on this device, for the notes of a row.
     """
@@ -69,17 +69,17 @@ class Bench:
         """Checks the device.
 
         Args:
-            system: Of the rows.
+            system: System of the rows.
             device: "cpu" or "cuda:0".
             progress: None for no lines of progress.
-            scene: Of the rows; progress begins with it.
-            clock: The figure that a timing is.
+            scene: Scene of the rows; lines of progress begin with it.
+            clock: Name of the figure of a timing.
             warmup: Calls before the first that is timed; None: 1 on the CPU, 5 on CUDA.
             repeats: Samples of each time; None: 5 on the CPU, where a sample is long, 30 on CUDA.
-            few: Samples of what takes long.
+            few: Samples of long calls.
 
         Raises:
-            WlmError: No such device.
+            WlmError: The device does not exist.
         """
         self.system, self.scene, self.device = system, scene, check_device(device)
         self._progress, self._clock = progress, clock
@@ -109,23 +109,23 @@ class Bench:
 
         Args:
             method, option, notes: As in `Row`.
-            scene: Another one than the bench's.
+            scene: A scene in place of the scene of the benchmark.
             timing, calls: As for `Row.with_timing`.
-            figures: By name.
+            figures: Figures by name.
         """
         row = Row(self.system, self.scene if scene is None else scene, method, option, figures, notes)
         return row if timing is None else row.with_timing(timing, self._clock, calls)
 
     def missing_row(self, method: str, option: str, error: Exception) -> Row:
-        """Makes the row of what can't be measured: a package isn't installed, or nothing fits the size."""
+        """Makes the row of a case that cannot be measured: a package is not installed, or nothing fits the size."""
         return self.row(method, option, f"not measured: {error}")
 
     def fit(self, option: str, compress: Callable[[], Model]) -> Fit:
         """Fits a model, saves it and loads it again.
 
         Args:
-            option: What its row is called.
-            compress: Fits it; everything that it needs has been compiled.
+            option: The option of its row.
+            compress: Fits the model; its kernels must be compiled already.
         """
         start = time.perf_counter()
         model = compress()
@@ -167,7 +167,8 @@ def expect_alone(option: str, others: Mapping[str, object]) -> None:
 def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
     """Compares a decode with the float64 decode of the same model.
 
-    A point that rounding puts across a border, of a tile or of a Gaussian's reach, has an error far beyond all others.
+    Rounding can move a point across the border of a tile or of the support of a Gaussian; the error of such a point is
+    far above all others.
 
     Args:
         decoded: [N, C].
@@ -185,10 +186,10 @@ def demo_data(name: str, option: str) -> Path:
 
     Args:
         name: Its path in `demos/data`.
-        option: The option that names other data.
+        option: The command line option that names other data.
 
     Raises:
-        WlmError: This is no checkout.
+        WlmError: The data are missing, because the package is not in a checkout.
     """
     path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / name
     if not path.exists():

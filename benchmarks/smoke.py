@@ -14,7 +14,7 @@ The methods, each a table of its own:
   greatest value the peak.
 - "six ways": the fine march, with its own estimate of its error by halving its step.
 - "weights": six lightmaps weighted for twelve lights against a march to each.
-- "frame": the stages of a frame of the scene `jet-sphere`, but for the network that turns the guide into lightmaps,
+- "frame": the stages of a frame of the scene `jet-sphere`, except the network that turns the guide into lightmaps,
   which `smoke_network` measures; the march that it replaces is beside it.
 
 A largest error has the unit of what is compared: cells a step, light, or density. Times are of the calls that a user
@@ -58,9 +58,9 @@ from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
-"""What a plot shows: PSNR and error of guiding maps and of the fine march against their time."""
+"""The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
 
-_SPEED = 0.1  # of the inlet, cells a step
+_SPEED = 0.1  # speed of the inlet in cells per step
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
 _RATIO = 4
@@ -75,7 +75,7 @@ _PASSES = {"semi-lagrangian": 2, "maccormack": 2 + 3}
 _CLOUD = "cloud"
 _DEPTH = 8.0  # optical, through the cloud's box at density 1
 _OCTAVES = range(2, 7)
-_GAIN = 0.6  # of an octave over the one before
+_GAIN = 0.6  # amplitude of an octave over that of the octave before
 _HALF_GUIDE = (5, 10, 20)  # steps at which 16 bits are looked at
 _HALF_SIX = 0.5
 _PLUME = 14.0  # the plume's extinction, over its box
@@ -91,7 +91,7 @@ class Sizes:
     """Grids, steps and repeats."""
 
     lattice: int  # cells along an edge of the large lattice
-    small: int  # and of the small one
+    small: int  # cells along an edge of the small lattice
     chunk: int  # steps of a lattice that are timed as one
     compared: tuple[int, ...]  # steps after which velocities of 16 and 32 bits are compared
     drift: int  # steps after which the drift of the mass is measured
@@ -101,11 +101,11 @@ class Sizes:
     resolution: int  # pixels along an edge of its image
     exact: float  # step in voxels of the march that guiding maps are compared with
     guide_shared: tuple[float, ...]  # steps of guiding maps whose pixels share marches to the lights
-    guide_alone: tuple[float, ...]  # and of those with one for each pixel
+    guide_alone: tuple[float, ...]  # steps of guiding maps with marches for each pixel
     six: tuple[float, ...]  # steps of the six-way march; the shortest is last
     plume: int  # pixels along an edge of the image of the plume
-    scale: float  # of the scene's cells
-    frames: int  # of the scene before the one that is timed
+    scale: float  # factor on the number of cells of the scene
+    frames: int  # frames of the scene before the timed frame
     warmup: int  # calls before the first that is timed
     repeats: int  # samples of a time
     few: int  # samples of a time that is long
@@ -174,12 +174,12 @@ class SmokeBench(Bench):
         self.sizes, self.bandwidth = sizes, math.nan
 
     def of_copy(self, bytes_moved: float, ms: float) -> float:
-        """The share of a copy's bandwidth that so many bytes in so many milliseconds are."""
+        """Returns the bandwidth of a number of bytes in a time in milliseconds, over the bandwidth of a copy."""
         return bytes_moved / (1e-3 * ms) / self.bandwidth
 
 
 def lattice_rows(bench: SmokeBench) -> list[Row]:
-    """A copy, and steps of lattices in the same run: with each kind of boundary, storage and operator."""
+    """Measures a copy, and steps of lattices with each kind of boundary, storage and operator in the same run."""
     bench.note("lattice")
     cells, small = bench.sizes.lattice, bench.sizes.small
     cases = {
@@ -221,7 +221,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
 
 
 def storage_rows(bench: SmokeBench) -> list[Row]:
-    """The error of 16 bits against 32, and the mass of both."""
+    """Measures the error of 16 bits against 32, and the drift of the mass of both."""
     bench.note("lattice: 16 bits against 32")
     sizes = bench.sizes
     exact, half = (_jet(bench, sizes.small, storage=storage) for storage in ("float32", "float16"))
@@ -275,7 +275,7 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
 
 
 def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
-    """Bricks of smoke: a step's time by the share of the box that has some."""
+    """Measures a step in bricks by the share of the box that has smoke."""
     bench.note("advection: bricks")
     n, rows = bench.sizes.coarse, []
     edge = _RATIO * n
@@ -458,7 +458,7 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
 
 
 def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
-    """A billowing column: octaves of noise, cut off. The random numbers are the CPU's, so that all devices agree.
+    """Makes a billowing column of octaves of noise. The random numbers come from the CPU, so that all devices agree.
 
     Args:
         n: Voxels along an edge.
@@ -667,7 +667,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
 def _drawn(
     scene: Scene, volume: DensityVolume, camera: Camera, time: float, device: str
 ) -> dict[str, Callable[[], object]]:
-    """What lights a frame, by its name: pictures with shadows and obstacles, and light that is found by diffusion."""
+    """Returns calls that light a frame, by name: pictures with shadows and obstacles, and light by diffusion."""
     lights = [settings.light() for settings in scene.lights]
     parts = {"background": scene.background, "obstacles": scene.obstacles}
     drawing = Drawing(camera, lights, albedo=scene.smoke.albedo, **parts, device=device)
@@ -725,7 +725,7 @@ def _relative(values: torch.Tensor, exact: torch.Tensor) -> float:
 
 
 def _psnr(coarse: Guide, fine: Guide) -> float:
-    """Of the light, whose greatest value is the peak."""
+    """Returns the PSNR of the light; the peak is its greatest value."""
     return psnr_from_mse(_rms(coarse.light - fine.light) ** 2, float(fine.light.max()))
 
 

@@ -64,7 +64,7 @@ from wlm.smoke.simulation import make_solver, volume_of
 from wlm_kernels.smoke.settings import March
 
 PANELS = (Panel("time_ms", "psnr"),)
-"""What a plot of `plotted` rows shows."""
+"""The panels of a plot of `plotted` rows."""
 
 _TABLE = "time against error"
 _LONG = 5.0  # voxels: six-way marches with no longer steps take long
@@ -75,8 +75,8 @@ EXACT = 0.5
 
 _DRAWN = 64  # scenes, of which the first one of each kind is taken
 _TURN = 20.0  # degrees by which the camera is off the box's axis
-_EXTENT = 1.1  # of the image over the box's edge
-_EARLY = 0.35  # of the time before the first frame, where the smoke's source soon stops
+_EXTENT = 1.1  # extent of the image over the edge of the box
+_EARLY = 0.35  # factor on the time before the first frame, where the source of the smoke soon stops
 _LIGHTS = (
     LightSettings(toward=(1.0, 0.8, 0.6), irradiance=(11.0, 10.3, 9.4)),
     LightSettings(toward=(-1.0, 0.3, 0.5), irradiance=(1.6, 2.2, 3.2)),
@@ -91,13 +91,13 @@ _DENOISED = "denoised"
 class NetworkSizes:
     """Grids, steps and repeats."""
 
-    cells: int  # of the air along the box's edge
+    cells: int  # cells of the air along the edge of the box
     refine: int  # voxels along a cell's edge
     resolution: int  # pixels along an image's edge
-    kinds: tuple[str, ...]  # of scenes, one scene of each
-    frames: int  # of each scene
+    kinds: tuple[str, ...]  # kinds of scenes, one scene of each
+    frames: int  # frames of each scene
     six: tuple[float, ...]  # steps in voxels of the fine march
-    coarse: tuple[float, ...]  # and of the coarse one, whose nodes are as far apart
+    coarse: tuple[float, ...]  # steps of the coarse march, and the distances of its nodes
     swept: tuple[tuple[float, float], ...]  # steps of the coarse march and distances of its nodes
     turns: tuple[float, ...]  # degrees between the camera and the one that a flip book was baked from
     scales: tuple[float, ...]  # factors on the density
@@ -164,7 +164,7 @@ class Frame:
 
     @property
     def smoke(self) -> tuple[DensityVolume, DensityVolume]:
-        """Both, in order."""
+        """The earlier and the later frame."""
         return self.earlier, self.later
 
     def scaled(self, factor: float) -> "Frame":
@@ -175,7 +175,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A network, and how its guiding maps are made.
+    """A network with the settings of its guiding maps.
 
     Attributes:
         name: In tables.
@@ -392,7 +392,7 @@ def run_rows(
 
 
 def error_rows(bench: NetworkBench) -> list[Row]:
-    """Time and error of marches by their steps, and of networks."""
+    """Measures time and error of marches by their steps, and of networks."""
     bench.note(_TABLE)
     marches = {f"six ways, step {step:g}": _six(step) for step in bench.sizes.six}
     steps_of = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
@@ -402,7 +402,7 @@ def error_rows(bench: NetworkBench) -> list[Row]:
     reference = f"six ways, step {EXACT:g}"
     notes = {reference: "the reference"}
     calls = {name: _on_all(bench, method) for name, method in marches.items()}
-    chains: dict[str, Callable[[], object]] = {}  # of the graphs that each network has already
+    chains: dict[str, Callable[[], object]] = {}  # replays of the graphs of each network
     for subject in bench.subjects:
         for half in (True, False) if bench.device != "cpu" else (False,):
             name = f"{subject.name}, {'fp16' if half else 'fp32'}"
@@ -442,7 +442,7 @@ def error_rows(bench: NetworkBench) -> list[Row]:
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
-    """The rows that a plot shows, with the first part of their option as the method."""
+    """Returns the rows that a plot shows, with the first part of their option as the method."""
     points = []
     for row in rows:
         if row.method == _TABLE:
@@ -493,7 +493,7 @@ def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
 
 
 def frame_rows(bench: NetworkBench) -> list[Row]:
-    """The parts of a frame: guiding map, network and decoding of each network, shading, and the simulation."""
+    """Measures the parts of a frame: guiding map, network and decoding of each network, shading, and the simulation."""
     bench.note("frame")
     count, size = len(bench.frames), bench.sizes.resolution
     half = bench.device != "cpu"
@@ -532,7 +532,7 @@ def frame_rows(bench: NetworkBench) -> list[Row]:
 
 
 def profile_rows(bench: NetworkBench) -> list[Row]:
-    """The time of each profile's network alone."""
+    """Measures the time of the network of each profile."""
     bench.note("profiles")
     size, cuda = bench.sizes.profile, bench.device != "cpu"
     settings = {name: Profile.load(name).network for name in profile_names(Profile.FILES)}
@@ -555,7 +555,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
 
 
 def density_rows(bench: NetworkBench) -> list[Row]:
-    """The networks and the coarse march on thinner and denser smoke, and how much they flicker."""
+    """Scores the networks and the coarse march on thinner and denser smoke, with their flicker."""
     bench.note("density")
     size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape).step
     rows = []
@@ -615,7 +615,7 @@ def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Call
 
 
 def flipbook_rows(bench: NetworkBench) -> list[Row]:
-    """A flip book baked from the first camera, under cameras that turn away from it."""
+    """Scores a flip book baked from the first camera, under cameras that turn away from it."""
     bench.note("flip book")
     frames = bench.frames[:: bench.sizes.frames]  # one of each scene
     baked = [bake(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
@@ -645,7 +645,7 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
 
 
 def traced_rows(bench: NetworkBench) -> list[Row]:
-    """All six lightmaps by Mitsuba on the CPU, with and without a denoiser; no rows without the extra `bake`."""
+    """Measures six lightmaps by Mitsuba on the CPU, with and without a denoiser; no rows without the extra `bake`."""
     if not has_tracer():
         bench.note("path tracing: left out, mitsuba is not installed: wlm[bake]")
         return []

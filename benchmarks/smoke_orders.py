@@ -70,9 +70,9 @@ METHOD, GRIDS, PHASES, INSIDE = "all orders", "gain by grid", "phase functions",
 
 ALBEDOS = (0.9, 1.0)
 
-_SEED = 8  # of views that nothing was fitted to
+_SEED = 8  # seed of views that are not in the training
 _LIGHTS = 3
-_POWERS = 3  # of the cosine between light and camera, by which octaves are fitted
+_POWERS = 3  # powers of the cosine between light and camera in the fit of octaves
 _FOUR_PI = 4.0 * math.pi
 _KEPT = 40  # orders that an albedo below 1 is made of: at 0.9 what is left out is less than a thousandth
 _CURVE = 1.16  # as the mix's fit weighs errors
@@ -252,7 +252,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
 
 
 def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
-    """What makes a picture of a shot at an albedo, float32 [H, W, 3], with nothing to be fitted first."""
+    """Returns functions that make a picture of a shot at an albedo, float32 [H, W, 3], without any fit."""
     ways = {
         "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
         "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
@@ -388,7 +388,7 @@ def _plume(sizes: OrdersSizes, number: int, device: str) -> Shot:
 
 
 def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
-    """Two frames in turn from each of some sides."""
+    """Simulates a jet and returns two consecutive frames from each of some sides."""
     bench.note("jet: simulates")
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     solver = make_solver(scene, device=bench.device)
@@ -413,12 +413,12 @@ def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
 
 
 def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) -> list[Row]:
-    """The rows.
+    """Makes the rows of "gain by grid".
 
     Args:
         bench: The benchmark.
-        sizes: What is measured.
-        model: None: the one that comes with wlm.
+        sizes: Grids, pictures and samples.
+        model: The mix; None: the one that comes with wlm.
     """
     model = (load_orders() if model is None else model).to(bench.device)
     rows = []
@@ -434,7 +434,7 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
 
 
 def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> Iterator[tuple[float, float]]:
-    """Of each light at each albedo the PSNR of diffusion and of the mix."""
+    """Yields the PSNR of diffusion and of the mix for each light at each albedo."""
     for number, (density, extinction) in enumerate(_smoke(device, sizes, cells)):
         random = np.random.default_rng([cells, number])
         volume = DensityVolume(density, extinction, 1.0 / cells)
@@ -464,11 +464,11 @@ def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Te
 
 
 def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, cells: int = _CELLS) -> list[Row]:
-    """The rows.
+    """Makes the rows of "phase functions" and "light in smoke".
 
     Args:
         bench: The benchmark.
-        views: Of each phase function.
+        views: Views of each phase function.
         samples: Paths a pixel of a reference.
         cells: Voxels along an edge of smoke with light in it.
     """
@@ -502,7 +502,7 @@ def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> t
 
 
 def _inside(device: str, samples: int, cells: int) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """What is lit, traced, found, and found of light scattered once, [H, W]."""
+    """Yields the option of each case, and its pictures by tracing, by the mix and by single scattering, [H, W]."""
     random = np.random.default_rng(_SEED)
     plume = make_plume(cells, seed=11, hot=False).density.to(device)
     for name, density in (("plume", plume), ("cloud", make_cloud(cells, device))):

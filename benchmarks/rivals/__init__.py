@@ -1,4 +1,4 @@
-"""What the systems are compared with, one module a system. Block codecs need the extra `baselines`.
+"""The rivals of each system. Block codecs need the extra `baselines`.
 
 Each module has `RIVALS`, the methods by name, and they are scored by the system's evaluation: a method makes a
 `Rival` of an input, and `evaluate_rivals` scores it. The rivals of smoke make no file: each is what

@@ -1,4 +1,4 @@
-"""What compressed lightmaps over time are compared with, each tuned as well as ours is.
+"""Rivals of compressed lightmaps over time, each tuned as carefully as our method.
 
 `RIVALS` has them by name: block codecs that engines ship (`lightmap_blocks`), principal components over the hours
 (`lightmap_pca`), neural texture compression (`lightmap_ntc`), and a video codec (`lightmap_video`). `bytes` are those
@@ -86,7 +86,7 @@ RIVALS: dict[str, Method] = {
 """All methods by name."""
 
 FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
-"""Those of a quick look, which need no GPU."""
+"""Rivals of a quick run, which need no GPU."""
 
 _FEW_FITTED = ("ntc-medium",)
 

@@ -37,14 +37,14 @@ NETWORK_TEXELS = 1024
 
 _HIDDEN = 64
 _FINE_BITS, _COARSE_BITS = 4, 8
-_TURNS = (1, 2)  # of the place in a cell
+_TURNS = (1, 2)  # periods per cell of the position encoding
 _CENTRE = math.sqrt(12.0)  # latents that are uniform in [0, 1] have mean 0 and variance 1 as inputs
-_FREEZE_FROM = 0.95  # of the steps
+_FREEZE_FROM = 0.95  # share of the steps
 _LATENT_RATE, _NETWORK_RATE = 5e-2, 2e-2  # Adam's first
-_BETAS = (0.9, 0.99)  # of Adam; a latent is sampled every few steps alone, and its gradient shrinks during a fit
-_TUNE_RATE = 1e-3  # of the network when latents are frozen; falls to a hundredth
-_LAST = 0.02  # of the network's rate before that, as a share of the first
-_RING_WEIGHT = 0.25  # of the squared error of texels that only filtered reads take in
+_BETAS = (0.9, 0.99)  # betas of Adam; a latent is sampled every few steps alone, and its gradient shrinks during a fit
+_TUNE_RATE = 1e-3  # learning rate of the network when latents are frozen; falls to a hundredth
+_LAST = 0.02  # last learning rate of the network before that, as a share of the first
+_RING_WEIGHT = 0.25  # weight of the squared error of texels that only filtered reads take in
 _LEAST_CODE, _LEAST_WEIGHT = 1e-3, 0.02  # black texels count a little
 _CHUNK = 1 << 14  # texels decoded at once
 

@@ -26,7 +26,7 @@ from wlm.lightmap.tiles import TILE
 from wlm.texels import fill_gaps
 
 _BC4_BLOCK = 4
-_MOST_LEVELS = 255  # of a map in bytes
+_MOST_LEVELS = 255  # levels of a map in bytes
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ _BLOCK = 4  # texels along a BC7 block's side
 _ENCODED = 4  # numbers of gamma(t)
 _CENTRE = math.sqrt(12.0)
 _MOMENTUM = 0.9  # Adam's decay of gradients
-_LEAST = 0.02  # of a colour over its scale, where errors are weighted by it: keeps black texels in the fit
+_LEAST = 0.02  # smallest colour, over its scale, that weights an error: it keeps black texels in the fit
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a compressed probe set is compared with: the PCA family, a moving basis, and an engine's 8-bit packing.
+"""Rivals of a compressed probe set: the PCA family, a moving basis, and the 8-bit packing of an engine.
 
 Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a `Rival` whose
 `decoded` is float32 [N, D], read from the byte string that `bytes` counts (gaussian-probe-compression, sections 2.2
@@ -102,7 +102,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
 
     The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
     have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,
-    but for the rounding of L0; a coefficient over an ambient of zero or less decodes to zero, and an ambient above
+    except for the rounding of L0; a coefficient over an ambient of zero or less decodes to zero, and an ambient above
     65,024 (64,512 in blue) becomes that. Ambient and ratios are rounded to nearest; the ratio is that to the ambient
     as it is decoded, which costs nothing and is closer than the engine's own ratio.
 
@@ -250,7 +250,7 @@ RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], 
     "moving_basis": _moving_at,
     "unreal": _unreal_at,
 }
-"""By name, each as `at_bytes` calls it: positions, values, bytes and the bits to try, to the best `Rival`."""
+"""Rivals by name: functions of positions, values, bytes and the bits to try that return the best `Rival`."""
 
 
 def _pca(
@@ -288,7 +288,7 @@ def _unreal_bands(width: int) -> int:
 def _checked(
     position: np.ndarray, values: np.ndarray, components: int = 1, bits: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both as float64, the values as float32 holds them."""
+    """Checks both and returns them as float64, with the values rounded to float32."""
     position = np.asarray(position, np.float64)
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is refused as that
         values = np.asarray(values).astype(np.float32).astype(np.float64)

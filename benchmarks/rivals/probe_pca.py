@@ -279,7 +279,7 @@ def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bi
 
 
 def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
-    """Reads `count` numbers of so many bits each, int64."""
+    """Reads `count` numbers of `bits` bits each, int64."""
     return unpack_bits(np.frombuffer(data, np.uint8), [bits], count)[:, 0].astype(np.int64)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-_ROUNDS = 20  # of k-means
-_SMALLEST = 1e-4  # of the box: first scales are no smaller
+_ROUNDS = 20  # rounds of k-means
+_SMALLEST = 1e-4  # smallest first scale, over the size of the box
 _FIRST_LATENT = 0.1  # spread of the first latents
 _CENTRE_BITS = 16
 _QUANTISE_FROM = 5 / 6  # share of the steps after which the Gaussians are used on the levels of a file

@@ -1,4 +1,4 @@
-"""What the network's lightmaps are compared with: a flip book that was baked from one side."""
+"""Rivals of the lightmaps of the network: the coarse march, and a flip book that was baked from one side."""
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ def coarse(pool: Pool, part: slice) -> torch.Tensor:
 
 
 def flip_book(held_out: HeldOut) -> Entry:
-    """What a flip book baked from the first view shows in the others: that view's own planes, as `billboard` does.
+    """Shows the planes of the first view in the other views, as a flip book baked from that view does.
 
     Returns:
         It, with the samples of the other views, none where there is one view.
@@ -47,7 +47,7 @@ RIVALS: dict[str, Contender] = {
     COARSE: lambda held_out: Entry(held_out.kept, held_out.pool("six"), coarse),
     FLIP_BOOK: flip_book,
 }
-"""What `wlm smoke evaluate` compares a network with."""
+"""Rivals of a network in `wlm.smoke.evaluate`, by name."""
 
 
 def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:

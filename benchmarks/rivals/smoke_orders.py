@@ -1,4 +1,4 @@
-"""What light of all orders is compared with: octaves of light scattered once, a linear filter, diffusion alone.
+"""Rivals of light of all orders: octaves of light scattered once, a linear filter, and diffusion alone.
 
 Octaves: Wrenninge et al. 2013, "Oz: the great and volumetric"; light scattered more often is light scattered once in
 thinner smoke. Filter: light that is scattered on comes out blurred, so planes blurred at several scales have most of
@@ -20,7 +20,7 @@ from wlm.smoke.transport.orders import make_inputs, orders_march
 from wlm_kernels.smoke.orders import THINNEST
 
 CLASSIC = ((0.5, 0.5), (0.25, 0.25))
-"""Of the second and the third octave the light, and the extinction on the way to it, over the first's."""
+"""Light and extinction towards the light of the second and the third octave, over those of the first."""
 
 FITTED = tuple((seen, shadow) for shadow in (1.0, 0.5, 0.25, 0.1, 0.04) for seen in (1.0, 0.4, 0.15))
 """Extinctions along the camera's rays and on the way to the light, over the smoke's own, of octaves to be fitted."""
@@ -32,7 +32,7 @@ _REACH = 3.0  # standard deviations
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """A picture by three octaves, float32 [H, W, 3]."""
+    """Makes a picture by three octaves, float32 [H, W, 3]."""
     march = orders_march(volume)
     picture = light_smoke(volume, camera, lights, march).shade(albedo=(albedo,) * 3)
     for share, shadow in CLASSIC:
@@ -42,7 +42,7 @@ def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
 
 def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """Pictures by each of `FITTED` alone, at albedo 1, float32 [O, H, W, 3]."""
+    """Makes a picture by each octave of `FITTED` alone, at albedo 1, float32 [O, H, W, 3]."""
     march = orders_march(volume)
     made = []
     for seen, shadow in FITTED:
@@ -59,7 +59,7 @@ def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], alb
 
 
 def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """What a linear filter mixes for each light of irradiance 4 pi, float32 [L, P, H, W].
+    """Makes the planes that a linear filter mixes for each light of irradiance 4 pi, float32 [L, P, H, W].
 
     Light of the light itself and of the opposite one, from all around, opacity, its square and optical depth: as they
     are and blurred, and all of it times opacity.
@@ -82,7 +82,7 @@ def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
 
 def _blurred(planes: torch.Tensor, sigma: float) -> torch.Tensor:
-    """By a Gaussian of so many pixels, black outside, [L, P, H, W]."""
+    """Blurs planes [L, P, H, W] by a Gaussian with a standard deviation in pixels; outside is black."""
     reach = max(1, round(_REACH * sigma))
     away = torch.arange(-reach, reach + 1, device=planes.device) / max(sigma, 1e-3)
     weights = torch.exp(-0.5 * away**2)
