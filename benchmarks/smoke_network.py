@@ -313,7 +313,7 @@ class Pipeline:
             encoded.copy_(render_guide(frame.later, self.camera, kind, look))
 
         def decoded() -> SixWay:
-            return decode_lightmaps(planes, hot=hot and self.decoder.emission)
+            return decode_lightmaps(planes, hot=hot)
 
         return {
             "guide": self._bench.replay(guided),
@@ -475,7 +475,7 @@ def _network(pipeline: Pipeline) -> _Method:
     def lightmaps(volume: DensityVolume, camera: Camera, seed: int) -> SixWay:
         look = pipeline.subject.settings.look(volume.shape, seed)
         planes = decoder(render_guide(volume, camera, decoder.guide, look))
-        return decode_lightmaps(planes, hot=decoder.emission and volume.temperature is not None)
+        return decode_lightmaps(planes, hot=volume.temperature is not None)
 
     return lightmaps
 
