@@ -1,9 +1,14 @@
-"""The command line `python -m benchmarks`: measurements, reports, plots and comparisons of results."""
+"""The command line `python -m benchmarks`: measurements, reports, plots and comparisons of results.
+
+Each measuring command calls `run` of the module of its name, with the options of `_COMMANDS` as keyword arguments.
+"""
 
 import importlib
+import inspect
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,7 +18,7 @@ from wlm.cli.options import Device, output_option
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from benchmarks import Row
 
@@ -26,266 +31,164 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-_Quick = Annotated[bool, typer.Option("--quick", help="Run fewer steps and rows, in minutes on a CPU.")]
-_SmallGrids = Annotated[bool, typer.Option("--quick", help="Use small grids, for a minute on a CPU.")]
-_RowsFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE.json", help="Write the rows and the environment to this file.")
-]
-_Profiles = Annotated[
-    list[str] | None, typer.Option("--profile", metavar="NAME", help="Profiles to measure. Repeatable; default: all.")
-]
-_Rivals = Annotated[bool, typer.Option("--rivals/--no-rivals", help="Measure the rivals too, in minutes on a CPU.")]
-_RivalsAt = Annotated[
-    Path | None,
-    typer.Option("--rivals-at", metavar="FILE.json", help="Measure only the rivals, at our sizes in this result file."),
-]
-_Set = Annotated[Path | None, typer.Option("--set", metavar="SET", help="A lightmap set. Default: the demo's.")]
-_Only = Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="Rows to measure. Repeatable.")]
-_Steps = Annotated[int | None, typer.Option(min=1, help="Steps of each fit. Default: the profile's.")]
-_Meshes = Annotated[
-    Path | None,
-    typer.Option(
-        "--meshes", metavar="DIR", help="A folder of folders, each with a .glb, its .exr lightmaps and maybe mask.png."
+
+def _option(kind: Any, flag: str, text: str, **more: Any) -> Any:
+    """Makes the annotation of an option."""
+    return Annotated[kind, typer.Option(flag, help=text, **more)]
+
+
+_PROFILE = "The profile or YAML file to vary."
+# The annotation and the default of each option, by the name of its argument.
+_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "quick": (_option(bool, "--quick", "Measure fewer and smaller cases, in minutes on a CPU."), False),
+    "device": (Device, "cpu"),
+    "set_path": (_option(Path | None, "--set", "A lightmap set. Default: the demo's.", metavar="SET"), None),
+    "profiles": (_option(list[str] | None, "--profile", "A profile or YAML file. Repeatable.", metavar="NAME"), None),
+    "profile": (_option(str, "--profile", _PROFILE, metavar="NAME"), "paper"),
+    "rivals": (_option(bool, "--rivals/--no-rivals", "Measure the rivals too, in minutes on a CPU."), True),
+    "rivals_only": (_option(bool, "--rivals-only", "Measure only the rivals."), False),
+    "rival_names": (_option(list[str] | None, "--rival", "Measure only this rival. Repeatable.", metavar="NAME"), None),
+    "rivals_at": (
+        _option(Path | None, "--rivals-at", "Measure only the rivals, at our sizes in this file.", metavar="FILE.json"),
+        None,
     ),
-]
-_Mesh = Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help="One mesh in place of --meshes.")]
-_Lightmaps = Annotated[
-    list[Path] | None, typer.Option("--lightmap", metavar="FILE.exr", help="A lightmap of --mesh. Repeatable.")
-]
-_Mask = Annotated[Path | None, typer.Option("--mask", metavar="FILE.png", help="The mask of --lightmap.")]
+    "probes_path": (_option(Path | None, "--probes", "Light probes. Default: the demo's.", metavar="FILE"), None),
+    "keys": (_option(list[str] | None, "--key", "An array of the file. Repeatable."), None),
+    "volume_only": (_option(bool, "--volume-only", "Measure only the volume."), False),
+    "meshes_path": (
+        _option(Path | None, "--meshes", "Folders, each with a .glb, .exr lightmaps, maybe mask.png.", metavar="DIR"),
+        None,
+    ),
+    "mesh_path": (_option(Path | None, "--mesh", "One mesh in place of --meshes.", metavar="FILE"), None),
+    "lightmap_paths": (
+        _option(list[Path] | None, "--lightmap", "A lightmap of --mesh. Repeatable.", metavar="FILE.exr"),
+        None,
+    ),
+    "mask_path": (_option(Path | None, "--mask", "The mask of --lightmap.", metavar="FILE.png"), None),
+    "scene_path": (_option(Path, "--set", "A lightmap set that names its mesh.", metavar="SET"), ...),
+    "hours": (_option(list[float] | None, "--hour", "An hour to measure. Repeatable; default: all."), None),
+    "side": (_option(int | None, "--side", "Texels of the longer side, a divisor of it.", min=1), None),
+    "budget": (_option(float | None, "--budget", "A budget in place of the profile's."), None),
+    "parts": (_option(bool, "--parts/--no-parts", "Measure each object and state alone at equal bits, too."), True),
+    "steps": (_option(int | None, "--steps", "Steps of each fit. Default: the profile's.", min=1), None),
+    "only": (_option(list[str] | None, "--only", "A row to measure. Repeatable; default: all.", metavar="ROW"), None),
+    "networks": (
+        _option(list[Path] | None, "--network", "A trained network. Default: ours. Repeatable.", metavar="FILE"),
+        None,
+    ),
+    "json_path": (
+        _option(Path | None, "--json", "Write the rows and the environment to this file.", metavar="FILE.json"),
+        None,
+    ),
+}
+_MESHES = ("meshes_path", "mesh_path", "lightmap_paths", "mask_path")
+# The help text and the options of each measuring command, in the order in which result files state them.
+_COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "lightmap": (
+        "Measure lightmaps over time: PSNR, bits per texel and decode time of profiles and their rivals.",
+        ("rivals_only", "rival_names", "quick", "profiles", "rivals", "device", "set_path"),
+    ),
+    "lightmap-ablation": (
+        "Measure lightmaps over time with other feature maps of the same size, and without block simulation.",
+        ("quick", "device", "set_path", "steps", "only"),
+    ),
+    "probe": (
+        "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
+        ("volume_only", "rivals_at", "quick", "rivals", "device", "probes_path", "keys"),
+    ),
+    "atlas": (
+        "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
+        ("rivals_at", "quick", "rivals", "device", *_MESHES, "profiles"),
+    ),
+    "atlas-scene": (
+        "Measure scenes: PSNR of all objects and hours in one model, and of each alone in as many bits.",
+        ("scene_path", "hours", "side", "profiles", "budget", "parts", "quick", "device"),
+    ),
+    "atlas-ablation": (
+        "Measure lightmaps of meshes: the cascade without its parts, and with textures of other sizes.",
+        ("quick", "profile", "device", *_MESHES, "steps", "only"),
+    ),
+    "smoke": (
+        "Measure smoke: the solver beside a copy, advection, guiding maps, six-way lightmaps and whole frames.",
+        ("quick", "device"),
+    ),
+    "smoke-orders": (
+        "Measure smoke with light of all orders: PSNR, FLIP, flicker and time of our method and its rivals.",
+        ("quick", "device"),
+    ),
+    "smoke-network": (
+        "Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing.",
+        ("quick", "device", "networks", "profiles"),
+    ),
+}
+# Options with which a run replaces only the rows that it measures in a result file.
+_PARTIAL = ("profiles", "rival_names", "only", "volume_only")
+
+
+def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:
+    def command(**values: Any) -> None:
+        _measure(name, values)
+
+    parameters = []
+    for option in (*options, "json_path"):
+        annotation, default = _OPTIONS[option]
+        default = inspect.Parameter.empty if default is ... else default
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(option, kind, default=default, annotation=annotation))
+    # typer reads both.
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    app.command(name, help=summary)(command)
+
+
+def _measure(name: str, values: dict[str, Any]) -> None:
+    """Checks the output and the device before long work, measures, writes the result file and prints the rows."""
+    from benchmarks import describe_environment, read_runs, tables, write_json
+    from wlm.interop import check_device
+
+    json_path = values.pop("json_path")
+    if json_path is not None:
+        check_output(json_path, ".json")
+        if json_path.exists():
+            read_runs(json_path)  # rows of other systems stay in the file, so it must be readable
+    quiet_warp()
+    values["device"] = device = check_device(values["device"])
+    words = shlex.join(["python", "-m", "benchmarks", name, *_words(values)])
+
+    def write(rows: "Sequence[Row]") -> None:
+        if json_path is not None:
+            partial = any(values.get(option) for option in _PARTIAL)
+            write_json(json_path, rows, describe_environment(device, words), partial=partial)
+
+    run = importlib.import_module(f"benchmarks.{name.replace('-', '_')}").run
+    # An ablation is written row by row, so that an interrupted run keeps its rows.
+    extra = {"done": write} if name.endswith("ablation") else {}
+    rows = run(**values, progress=note, **extra)
+    write(rows)
+    show_text(tables(rows))
+
+
+def _words(values: Mapping[str, Any]) -> list[str]:
+    """Returns the options that differ from their defaults, and every option with a value, as words of a command."""
+    words = []
+    for option, value in values.items():
+        # typer keeps the first argument of `typer.Option`, which is the flag in an `Annotated`, as `default`.
+        flag = "--device" if option == "device" else _OPTIONS[option][0].__metadata__[0].default
+        if "/" in flag:
+            words += [] if value else [flag.partition("/")[2]]
+        elif value is True:
+            words.append(flag)
+        else:
+            for item in value if isinstance(value, list) else [value] if value not in (None, False) else []:
+                words += [flag, Path(str(item)).name]
+    return words
+
+
+for _name, (_summary, _options) in _COMMANDS.items():
+    _add_command(_name, _summary, _options)
+
+
 _Results = Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="Files that --json wrote.")]
-
-
-@app.command()
-def lightmap(
-    quick: _Quick = False,
-    device: Device = "cpu",
-    set_path: _Set = None,
-    profiles: _Profiles = None,
-    rivals: _Rivals = True,
-    rivals_only: Annotated[bool, typer.Option("--rivals-only", help="Measure only the rivals.")] = False,
-    rival_names: Annotated[
-        list[str] | None, typer.Option("--rival", metavar="NAME", help="Measure only this rival. Repeatable.")
-    ] = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure lightmaps over time: PSNR, bits per texel and decode time of profiles, block codecs, PCA and AV1."""
-    device = _prepare(device, json_path)
-    from benchmarks.lightmap import run, run_rivals
-
-    common = {"quick": quick, "device": device, "set_path": set_path, "progress": note}
-    if rivals_only or rival_names:
-        if not rivals or profiles:
-            raise WlmError("--rivals-only: expected without --no-rivals and --profile")
-        rows = run_rivals(names=rival_names, **common)
-        options = {"rivals_only": rivals_only, "rival": rival_names}
-    else:
-        rows = run(names=profiles, rivals=rivals, **common)
-        options = {"profile": profiles, "no_rivals": not rivals}
-    partial = bool(profiles or rival_names)
-    scene = set_path and rows[0].scene
-    _finish(rows, device, json_path, "lightmap", partial=partial, quick=quick, **options, device=device, set=scene)
-
-
-@app.command("lightmap-ablation")
-def lightmap_ablation(
-    quick: _Quick = False,
-    device: Device = "cpu",
-    set_path: _Set = None,
-    steps: _Steps = None,
-    only: _Only = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure lightmaps over time with other feature maps of the same size, and without block simulation."""
-    device = _prepare(device, json_path)
-    from benchmarks.lightmap_ablation import run
-
-    options = {"quick": quick, "device": device, "set": set_path, "steps": steps, "only": only}
-    done = _writer(device, json_path, "lightmap-ablation", **options)
-    rows = run(only or (), quick=quick, device=device, set_path=set_path, steps=steps, progress=note, done=done)
-    _finish(rows, device, None, "lightmap-ablation")
-
-
-@app.command()
-def probe(
-    quick: _Quick = False,
-    device: Device = "cpu",
-    probes_path: Annotated[
-        Path | None, typer.Option("--probes", metavar="FILE", help="Light probes. Default: the demo's.")
-    ] = None,
-    keys: Annotated[list[str] | None, typer.Option("--key", help="An array of the file. Repeatable.")] = None,
-    rivals: _Rivals = True,
-    rivals_at: _RivalsAt = None,
-    volume_only: Annotated[bool, typer.Option("--volume-only", help="Measure only the volume.")] = False,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure light probes: PSNR, size and decode time of the profiles, their decoders and the PCA family."""
-    device = _prepare(device, json_path)
-    from benchmarks.probe import run, run_rivals, run_volume
-
-    common = {"probes_path": probes_path, "keys": keys or (), "progress": note}
-    options: dict[str, object] = {"quick": quick, "no_rivals": not rivals, "device": device}
-    if volume_only:
-        if quick or not rivals or rivals_at is not None:
-            raise WlmError("--volume-only: expected without --quick, --no-rivals and --rivals-at")
-        rows, options = run_volume(device=device, **common), {"volume_only": True, "device": device}
-    elif rivals_at is not None:
-        if quick or not rivals or device != "cpu":
-            raise WlmError("--rivals-at: expected without --quick, --no-rivals and --device: the rivals need no GPU")
-        rows, options = run_rivals(**common), {"rivals_at": rivals_at}
-    else:
-        rows = run(quick=quick, device=device, rivals=rivals, **common)
-    _finish(rows, device, json_path, "probe", partial=volume_only, **options, probes=probes_path, key=keys)
-
-
-@app.command()
-def atlas(
-    quick: _Quick = False,
-    device: Device = "cpu",
-    meshes_path: _Meshes = None,
-    mesh_path: _Mesh = None,
-    lightmap_paths: _Lightmaps = None,
-    mask_path: _Mask = None,
-    profiles: _Profiles = None,
-    rivals: _Rivals = True,
-    rivals_at: _RivalsAt = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles, smaller lightmaps, block codecs."""
-    device = _prepare(device, json_path)
-    from benchmarks.atlas import run, run_rivals
-    from benchmarks.atlas_inputs import load
-
-    lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
-    files = {"meshes": meshes_path, "mesh": mesh_path, "lightmap": lightmap_paths, "mask": mask_path}
-    if rivals_at is not None:
-        if quick or not rivals or profiles or device != "cpu":
-            raise WlmError("--rivals-at: expected without --quick, --profile, --no-rivals and --device")
-        rows = run_rivals(rivals_at, lightmaps, progress=note)
-        _finish(rows, device, json_path, "atlas", rivals_at=rivals_at, **files)
-        return
-    rows = run(lightmaps, profiles or (), quick=quick, device=device, rivals=rivals, progress=note)
-    options = {"quick": quick, "no_rivals": not rivals, "device": device, **files, "profile": profiles}
-    _finish(rows, device, json_path, "atlas", **options)
-
-
-@app.command("atlas-scene")
-def atlas_scene(
-    set_path: Annotated[Path, typer.Option("--set", metavar="SET", help="A lightmap set with a mesh to cut.")],
-    hours: Annotated[list[float] | None, typer.Option("--hour", help="A state. Repeatable; default: all.")] = None,
-    side: Annotated[int | None, typer.Option(min=1, help="Texels of the longer side, a divisor of it.")] = None,
-    profiles: _Profiles = None,
-    budget: Annotated[float | None, typer.Option(help="A budget in place of the profile's.")] = None,
-    parts: Annotated[
-        bool, typer.Option("--parts/--no-parts", help="Measure each object and state alone at equal bits, too.")
-    ] = True,
-    quick: Annotated[bool, typer.Option("--quick", help="Use few small views, for a CPU.")] = False,
-    device: Device = "cpu",
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure scenes: PSNR of all objects and hours in one model, and of each alone in as many bits."""
-    device = _prepare(device, json_path)
-    from benchmarks.atlas_scene import run
-    from benchmarks.scene_inputs import load
-
-    scene = load(set_path, hours or (), side)
-    views = {"views": 8, "resolution": 128} if quick else {}
-    rows = run(scene, profiles or (), budget=budget, device=device, parts=parts, **views, progress=note)
-    options = {"set": set_path, "hour": hours, "side": side, "profile": profiles, "budget": budget}
-    _finish(rows, device, json_path, "atlas-scene", **options, no_parts=not parts, quick=quick, device=device)
-
-
-@app.command("atlas-ablation")
-def atlas_ablation(
-    profile: Annotated[str, typer.Option(metavar="NAME", help="The cascade profile or YAML file to vary.")] = "paper",
-    quick: _Quick = False,
-    device: Device = "cpu",
-    meshes_path: _Meshes = None,
-    mesh_path: _Mesh = None,
-    lightmap_paths: _Lightmaps = None,
-    mask_path: _Mask = None,
-    steps: _Steps = None,
-    only: _Only = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure lightmaps of meshes: the cascade without its parts, and with textures of other sizes."""
-    device = _prepare(device, json_path)
-    from benchmarks.atlas_ablation import choose, run
-    from benchmarks.atlas_inputs import load
-    from wlm.atlas.model import Profile
-
-    choose(Profile.load(profile), only or ())  # a misspelt name fails before the meshes are read
-    lightmaps = load(meshes_path, mesh_path, lightmap_paths or (), mask_path)
-    files = {"meshes": meshes_path, "mesh": mesh_path, "lightmap": lightmap_paths, "mask": mask_path}
-    options = {"quick": quick, "profile": Path(profile), "device": device, **files, "steps": steps, "only": only}
-    done = _writer(device, json_path, "atlas-ablation", partial=bool(only), **options)
-    rows = run(lightmaps, profile, only or (), quick=quick, device=device, steps=steps, progress=note, done=done)
-    _finish(rows, device, json_path, "atlas-ablation", partial=bool(only), **options)
-
-
-@app.command()
-def smoke(quick: _SmallGrids = False, device: Device = "cpu", json_path: _RowsFile = None) -> None:
-    """Measure smoke: the lattice beside a copy, advection, guiding maps, six-way lightmaps and whole frames."""
-    device = _prepare(device, json_path)
-    from benchmarks.smoke import run
-
-    rows = run(quick=quick, device=device, progress=note)
-    _finish(rows, device, json_path, "smoke", quick=quick, device=device)
-
-
-@app.command("smoke-orders")
-def smoke_orders(quick: _SmallGrids = False, device: Device = "cpu", json_path: _RowsFile = None) -> None:
-    """Measure smoke with light of all orders: PSNR, FLIP, flicker and time, ours and the rivals'."""
-    device = _prepare(device, json_path)
-    from benchmarks.smoke_orders import run
-
-    rows = run(quick=quick, device=device, progress=note)
-    _finish(rows, device, json_path, "smoke-orders", quick=quick, device=device)
-
-
-@app.command("smoke-network")
-def smoke_network(
-    quick: _SmallGrids = False,
-    device: Device = "cpu",
-    networks: Annotated[
-        list[Path] | None,
-        typer.Option("--network", metavar="FILE", help="A trained network. Default: the one in wlm. Repeatable."),
-    ] = None,
-    profiles: Annotated[
-        list[str] | None,
-        typer.Option("--profile", metavar="NAME", help="A profile or YAML file to time untrained. Repeatable."),
-    ] = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing."""
-    device = _prepare(device, json_path)
-    from benchmarks.smoke_network import run
-    from wlm.smoke.codec import shipped
-
-    rows = run(networks or ([] if profiles else [shipped()]), profiles or (), quick=quick, device=device, progress=note)
-    options = {"network": networks, "profile": [Path(name) for name in profiles or ()]}
-    _finish(rows, device, json_path, "smoke-network", quick=quick, device=device, **options)
-
-
-@app.command("smoke-ablation")
-def smoke_ablation(
-    profile: Annotated[str, typer.Option(metavar="NAME", help="The profile or YAML file to vary.")] = "fast",
-    quick: Annotated[bool, typer.Option("--quick", help="Use small images and few steps, for a CPU.")] = False,
-    device: Device = "cpu",
-    rounds: Annotated[int | None, typer.Option(min=1, help="Rounds of each training, with new samples.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each round.")] = None,
-    only: _Only = None,
-    json_path: _RowsFile = None,
-) -> None:
-    """Measure neural six-way lightmaps: short trainings with one setting of a profile changed at a time."""
-    device = _prepare(device, json_path)
-    from benchmarks.smoke_ablation import run
-
-    lengths = {"rounds": rounds, "steps": steps}
-    options = {"quick": quick, "profile": Path(profile), "device": device, **lengths, "only": only}
-    done = _writer(device, json_path, "smoke-ablation", **options)
-    rows = run(profile, only or (), quick=quick, device=device, **lengths, progress=note, done=done)
-    _finish(rows, device, None, "smoke-ablation")
 
 
 @app.command()
@@ -348,53 +251,3 @@ def compare(
     note(f"{len(changes)} figures compared with {old}: {len(worse)} are worse")
     if worse:
         raise typer.Exit(1)
-
-
-def _prepare(device: str, json_path: Path | None) -> str:
-    """Checks the output and the device before long work, and returns the device's name."""
-    from benchmarks import read_runs
-    from wlm.interop import check_device
-
-    if json_path is not None:
-        check_output(json_path, ".json")
-        if json_path.exists():
-            read_runs(json_path)  # rows of other systems stay in the file, so it must be readable
-    quiet_warp()
-    return check_device(device)
-
-
-def _writer(
-    measured_on: str, json_path: Path | None, name: str, *, partial: bool = False, **options: object
-) -> "Callable[[Sequence[Row]], None]":
-    """Returns a function that writes the rows measured so far, so that an interrupted run keeps them."""
-    from benchmarks import describe_environment, write_json
-
-    words = ["python", "-m", "benchmarks", name]
-    for option, value in options.items():
-        for item in value if isinstance(value, list) else [value]:
-            if item is not None and item is not False:
-                words.append(f"--{option.replace('_', '-')}")
-                if item is not True:
-                    words.append(shlex.quote(item.name if isinstance(item, Path) else str(item)))
-
-    def write(rows: "Sequence[Row]") -> None:
-        if json_path is not None:
-            write_json(json_path, rows, describe_environment(measured_on, " ".join(words)), partial=partial)
-
-    return write
-
-
-def _finish(
-    rows: "Sequence[Row]",
-    measured_on: str,
-    json_path: Path | None,
-    name: str,
-    *,
-    partial: bool = False,
-    **options: object,
-) -> None:
-    """Writes the result file with the command that makes it again, and prints the rows as tables."""
-    from benchmarks import tables
-
-    _writer(measured_on, json_path, name, partial=partial, **options)(rows)
-    show_text(tables(rows))

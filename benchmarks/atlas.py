@@ -1,4 +1,4 @@
-"""The atlas system against smaller and carved lightmaps, block codecs and single-colour merging: size, speed and error.
+"""The atlas system against smaller lightmaps and block codecs: size, speed and error.
 
 For each lightmap of each mesh these kinds of rows:
 
@@ -6,9 +6,9 @@ For each lightmap of each mesh these kinds of rows:
   from around, and the time to read a million random points of its surface. In a full run also the first profile at the
   bits of the first cascade, and at CRs of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
-- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at those of the others.
-  Single-colour merging has its own size instead, as in table 1 of lightmap-uv-clustering-cascade. Bits are those
-  of its eq. 9, which leave out UVs and headers; a rival's bytes are these bits alone, it has no file.
+- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at the bits of the
+  others. Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers. A rival has no
+  file, so its bytes are these bits.
 - method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
   surface; the time is that of the tuning alone.
 
@@ -24,21 +24,22 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import torch
 import warp as wp
 
-from benchmarks.atlas_inputs import Lightmap
 from benchmarks.plot import Panel
-from benchmarks.rivals.atlas import OWN_SIZE, RIVALS, share_of
+from benchmarks.rivals.atlas import RIVALS, share_of
 from benchmarks.rivals.rival import Rival
 from benchmarks.rows import MEAN, Row, read_json
-from benchmarks.runner import Bench, Note, exact_errors
+from benchmarks.runner import Bench, Note, demo_data, exact_errors, expect_alone
 from wlm import interop
 from wlm.atlas.codec import sizes
-from wlm.atlas.data import Sheet, from_arrays
+from wlm.atlas.data import LightmappedScene, Sheet, from_arrays
+from wlm.atlas.data import load as load_scene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import Sampler, compare
 from wlm.atlas.exact import decode64
@@ -55,10 +56,8 @@ _RIVALS = {
     "BC6H": "bc6h",
     "BC6H, our encoder": "bc6h own",
     "ASTC": "astc",
-    "carving": "carving",
 }
-_METHODS = (*_RIVALS, *OWN_SIZE)
-_OWN = "its own size"  # the option of rivals without a budget
+_METHODS = tuple(_RIVALS)
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
 _HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # bits of rivals that run alone
 _FIRST = "downsampling"  # the rival of every run
@@ -80,40 +79,64 @@ PANELS = (Panel("bpp", "psnr", ("ours", _FIRST, "BC6H", "ASTC")), Panel("decode_
 and a decode's error against its time."""
 
 
+@dataclass(frozen=True, eq=False)
+class Lightmap:
+    """A lightmap of a mesh.
+
+    Attributes:
+        scene: The scene of its rows.
+        lit: The mesh and the lightmap.
+    """
+
+    scene: str
+    lit: LightmappedScene
+
+
 def run(
-    lightmaps: Sequence[Lightmap],
-    names: Sequence[str] = (),
     *,
     quick: bool,
     device: str,
+    meshes_path: str | os.PathLike[str] | None = None,
+    mesh_path: str | os.PathLike[str] | None = None,
+    lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
+    mask_path: str | os.PathLike[str] | None = None,
+    profiles: Sequence[str] | None = None,
     rivals: bool = True,
+    rivals_at: str | os.PathLike[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the atlas system.
 
     Args:
-        lightmaps: At least one, as `benchmarks.atlas_inputs.load` reads them.
-        names: Profiles; none: `PROFILES`.
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
-            two CPU cores with the demo's mesh. The cascade's error is that of an unfinished fit.
+            two CPU cores with the demo's mesh. The cascade's fit is not finished, so its error is large.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        rivals: With block codecs, carving and single-colour merging, which take minutes on the CPU: `run_rivals` has
-            them alone. Downsampling is always there.
+        meshes_path, mesh_path, lightmap_paths, mask_path: As for `read_lightmaps`.
+        profiles: Profiles; none: `PROFILES`.
+        rivals: Whether to measure block codecs, which take minutes on the CPU. Downsampling is always measured.
+        rivals_at: Measure only the rivals, on the CPU, at the bits of our tiles in this result file.
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, lightmap by lightmap in the order of the module's list.
+        The rows, lightmap by lightmap in the order of the module's list, and their means.
 
     Raises:
-        WlmError: A profile or the device isn't there, or a compression failed.
+        WlmError: A file, a profile or the device does not exist, options contradict each other, the result file has no
+            row of a lightmap, or a compression failed.
     """
-    profiles = [Profile.load(name) for name in names or PROFILES]
+    device = interop.check_device(device)
+    loaded = [Profile.load(name) for name in profiles or PROFILES]
+    lightmaps = read_lightmaps(meshes_path, mesh_path, lightmap_paths or (), mask_path)
+    if rivals_at is not None:
+        others = {"--quick": quick, "--profile": profiles, "--no-rivals": not rivals, "--device": device != "cpu"}
+        expect_alone("--rivals-at", others)
+        return rival_rows(rivals_at, lightmaps, progress=progress)
     if quick:
-        profiles = [p.model_copy(update=_QUICK_CASCADE) if p.method == "cascade" else p for p in profiles]
+        loaded = [each.model_copy(update=_QUICK_CASCADE) if each.method == "cascade" else each for each in loaded]
     return run_rows(
         lightmaps,
-        profiles,
-        device=interop.check_device(device),
+        loaded,
+        device=device,
         views=QUICK_VIEWS if quick else VIEWS,
         resolution=QUICK_RESOLUTION if quick else RESOLUTION,
         whole=not quick,
@@ -122,7 +145,58 @@ def run(
     )
 
 
-def run_rivals(
+def read_lightmaps(
+    meshes_path: str | os.PathLike[str] | None = None,
+    mesh_path: str | os.PathLike[str] | None = None,
+    lightmap_paths: Sequence[str | os.PathLike[str]] = (),
+    mask_path: str | os.PathLike[str] | None = None,
+) -> list[Lightmap]:
+    """Reads the lightmaps of a run.
+
+    Args:
+        meshes_path: A folder of a mesh, or of such folders: each has one `.glb`, its lightmaps, `.exr`, and maybe
+            their `mask.png`.
+        mesh_path: Instead, one mesh.
+        lightmap_paths: Its lightmaps.
+        mask_path: Their mask; None derives it.
+
+    Returns:
+        The lightmaps. Without any path those of the checkout's `demos/data/atlas`.
+
+    Raises:
+        WlmError: A file is missing or damaged, a folder has no mesh with a lightmap, or paths were given that don't go
+            together.
+    """
+    if mesh_path is not None:
+        if meshes_path is not None or not lightmap_paths:
+            raise WlmError("bench atlas: expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
+        return _lightmaps(Path(mesh_path), [Path(path) for path in lightmap_paths], mask_path)
+    if lightmap_paths or mask_path is not None:
+        raise WlmError("bench atlas: --lightmap and --mask need --mesh FILE")
+    folder = demo_data("atlas", "--meshes DIR") if meshes_path is None else Path(meshes_path)
+    if not folder.is_dir():
+        raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")
+    lightmaps = []
+    for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
+        meshes, images = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
+        if len(meshes) > 1:
+            raise WlmError(f"{each}: expected one .glb a folder, found {len(meshes)}")
+        if meshes and images:
+            mask = each / "mask.png"
+            lightmaps += _lightmaps(meshes[0], images, mask if mask.is_file() else None)
+    if not lightmaps:
+        raise WlmError(f"{folder}: expected a .glb and its .exr in it or in folders of it, found none")
+    return lightmaps
+
+
+def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[str] | None) -> list[Lightmap]:
+    name = mesh.resolve().parent.name if mesh.stem == "mesh" else mesh.stem
+    scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
+    meshes = (load_scene(mesh, path, mask_path=mask) for path in lightmaps)
+    return [Lightmap(*pair) for pair in zip(scenes, meshes, strict=True)]
+
+
+def rival_rows(
     results: str | os.PathLike[str], lightmaps: Sequence[Lightmap], *, progress: Note | None = None
 ) -> list[Row]:
     """Measures the rivals alone, at the bits that our tiles took in a former run.
@@ -340,7 +414,7 @@ class _AtlasBench(Bench):
             if any(abs(share / other - 1.0) < _SAME for other in measured):
                 continue
             measured.append(share)
-            for method in (name for name in methods if name in _RIVALS):
+            for method in methods:
                 if enough.get(method, math.inf) > share:
                     make = partial(RIVALS[_RIVALS[method]], self.lit, share)
                     entries.append(self._rival(method, f"bits of {profile}", make))
@@ -349,8 +423,6 @@ class _AtlasBench(Bench):
                     whole = self.lit.sheets[0].mask.shape
                     if (row.get("colour_height"), row.get("colour_width")) == whole and method != "ASTC":
                         enough[method] = _share(row)
-        for method in (name for name in methods if name in OWN_SIZE):
-            entries.append(self._rival(method, _OWN, partial(OWN_SIZE[method], self.lit)))
         return entries
 
     def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:

@@ -15,11 +15,21 @@ Triangles are grouped once a lightmap, which takes no part in the times. Seams a
 row's own UVs. Bits are as everywhere those of a GPU, 64 a texel of half floats, where the paper has 48.
 """
 
+import os
 import time
 from collections.abc import Callable, Sequence
 
-from benchmarks.atlas import QUICK_RESOLUTION, QUICK_VIEWS, RESOLUTION, SCORES, VIEWS, means, warm_up
-from benchmarks.atlas_inputs import Lightmap
+from benchmarks.atlas import (
+    QUICK_RESOLUTION,
+    QUICK_VIEWS,
+    RESOLUTION,
+    SCORES,
+    VIEWS,
+    Lightmap,
+    means,
+    read_lightmaps,
+    warm_up,
+)
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
@@ -53,12 +63,15 @@ _QUICK = {"steps": 200, "resolution": 256}
 
 
 def run(
-    lightmaps: Sequence[Lightmap],
-    profile: str = "paper",
-    only: Sequence[str] = (),
     *,
+    profile: str = "paper",
+    only: Sequence[str] | None = None,
     quick: bool,
     device: str,
+    meshes_path: str | os.PathLike[str] | None = None,
+    mesh_path: str | os.PathLike[str] | None = None,
+    lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
+    mask_path: str | os.PathLike[str] | None = None,
     steps: int | None = None,
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
@@ -66,12 +79,12 @@ def run(
     """Fits the variants of a profile to each lightmap and compares them.
 
     Args:
-        lightmaps: At least one, as `benchmarks.atlas_inputs.load` reads them.
         profile: A profile of method "cascade": its name or a YAML file.
         only: Names of rows; none: all.
-        quick: Short fits in small views, which show on a CPU that all of it works: errors are those of unfinished fits.
+        quick: Short fits in small views, which show on a CPU that everything works: the fits are not finished.
         device: "cpu" or "cuda:0".
-        steps: Of each fit; None: the profile's.
+        meshes_path, mesh_path, lightmap_paths, mask_path: As for `benchmarks.atlas.read_lightmaps`.
+        steps: Steps of each fit; None: the profile's.
         progress: Called with a line before each part of the work.
         done: Called after each lightmap with all rows so far.
 
@@ -79,14 +92,16 @@ def run(
         The rows, lightmap by lightmap, and where there are several their means.
 
     Raises:
-        WlmError: The profile or the device isn't there, the profile is of tiles, or no row has such a name.
+        WlmError: A file, the profile or the device does not exist, the profile is of tiles, or no row has a name.
     """
     settings = Profile.load(profile).override(_QUICK if quick else {})
     if steps is not None:
         settings = settings.override({"steps": steps})
+    choose(settings, only or ())  # a misspelt name fails before the meshes are read
+    lightmaps = read_lightmaps(meshes_path, mesh_path, lightmap_paths or (), mask_path)
     views, resolution = (QUICK_VIEWS, QUICK_RESOLUTION) if quick else (VIEWS, RESOLUTION)
     options = {"device": device, "progress": progress, "done": done}
-    return run_rows(lightmaps, settings, only, views=views, resolution=resolution, **options)
+    return run_rows(lightmaps, settings, only or (), views=views, resolution=resolution, **options)
 
 
 def run_rows(

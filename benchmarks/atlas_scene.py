@@ -1,37 +1,95 @@
 """A scene of many objects and states against its parts, each object and state alone, in as many bits.
 
+The scene is a lightmap set with its mesh, cut into objects that have their own lightmaps. An object is a connected set
+of triangles: triangles are connected where their corners share a position. Pieces with few texels, such as knobs and
+screws, are added to the nearest object that has more. The charts of an object are cut out of the lightmaps, downsampled
+each without its neighbours, and laid out again at whole texels, so that a chart that keeps its size is not resampled.
+
 Rows of method "scene", one for each profile: the file, the compression with its stages, and the error in views of the
 whole scene. After each a row of method "parts", `benchmarks.rivals.scene_parts` in the same bits or few more, by
 `standard` of one lightmap with the same textures.
 
-"gain" is what the scene's mean over views and states is above the parts'; "least gain" that of the state in which it
-is least.
+"gain" is the difference of the mean PSNR over views and states between the scene and the parts; "least gain" is that
+of the state with the smallest difference.
 """
 
+import math
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from benchmarks.rivals.scene_parts import scene_parts
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm import interop
+from wlm.atlas.charts import charts, welded
 from wlm.atlas.codec import sizes
-from wlm.atlas.data import LightmappedScene, from_arrays
+from wlm.atlas.data import LightmappedScene, from_arrays, join
 from wlm.atlas.evaluation import SHARED_RESOLUTION, SHARED_VIEWS, Sampler, compare
 from wlm.atlas.fit import compress
+from wlm.atlas.matching import chart_map
 from wlm.atlas.model import Profile
 from wlm.atlas.shared.weights import peaks_of, scene_weights, variation
+from wlm.atlas.tiles.layout import place
+from wlm.errors import WlmError
+from wlm.formats.gltf import read_gltf
+from wlm.lightmap.data import SheetFrames
+from wlm.lightmap.data import load as load_set
+from wlm.texels import fill_gaps, nearest_valid
 
 PROFILES = ("standard",)
 """Profiles of a run."""
 
+LEAST_TEXELS = 16
+"""Of an object, at the size that is asked for."""
+
+_GAP = 2  # texels between charts: a bilinear read of one meets none of the next
+_SAME_PLACE = 1e-5  # of the scene's size
 _SEED = 1  # seed of the views of the parts' weights
 
 
 def run(
+    *,
+    scene_path: str | os.PathLike[str],
+    hours: Sequence[float] | None = None,
+    side: int | None = None,
+    profiles: Sequence[str] | None = None,
+    budget: float | None = None,
+    parts: bool = True,
+    quick: bool = False,
+    device: str = "cpu",
+    progress: Note | None = None,
+) -> list[Row]:
+    """Measures a scene against its parts.
+
+    Args:
+        scene_path, hours, side: As for `read_scene`.
+        profiles: Profiles; none: `PROFILES`.
+        budget: The budget in place of the profiles'.
+        parts: Whether to measure the parts, which take most of the time.
+        quick: Few small views, for a CPU.
+        device: "cpu" or "cuda:0".
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        The rows, profile by profile.
+
+    Raises:
+        WlmError: A file, a profile or the device does not exist, or the budget is less than the smallest model takes.
+    """
+    scene = read_scene(scene_path, hours or (), side)
+    views = {"views": 8, "resolution": 128} if quick else {}
+    return run_rows(scene, profiles or PROFILES, budget=budget, device=device, parts=parts, **views, progress=progress)
+
+
+def run_rows(
     scene: LightmappedScene,
-    names: Sequence[str] = (),
+    names: Sequence[str],
     *,
     budget: float | None = None,
     device: str,
@@ -40,25 +98,9 @@ def run(
     resolution: int = SHARED_RESOLUTION,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures a scene against its parts.
-
-    Args:
-        scene: The scene, as `benchmarks.scene_inputs.load` cuts it.
-        names: Profiles; none: `PROFILES`.
-        budget: The budget in place of the profiles'.
-        device: "cpu" or "cuda:0".
-        parts: With the parts, which take most of the time.
-        views: Cameras around the scene, and as many from inside.
-        resolution: Pixels along a side.
-        progress: Called with a line before each part of the work.
-
-    Returns:
-        The rows, profile by profile.
-
-    Raises:
-        WlmError: A profile or the device isn't there, or the budget is less than the smallest model takes.
-    """
-    profiles = [Profile.load(name) for name in names or PROFILES]
+    """Measures a scene against its parts in a number of cameras around the scene and as many from inside, whose
+    pictures have `resolution` pixels along a side; the rest as for `run`."""
+    profiles = [Profile.load(name) for name in names]
     if budget is not None:
         profiles = [profile.override({"budget": budget}) for profile in profiles]
     title = f"{scene.name}, {len(scene.sheets)} objects, {len(scene.states)} states"
@@ -139,3 +181,142 @@ def _small(states: int) -> LightmappedScene:
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
     light = np.stack([image ** (1 + state) for state in range(max(states, 2))])
     return from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, light, name="square")
+
+
+def read_scene(
+    path: str | os.PathLike[str], hours: Sequence[float] = (), side: int | None = None, trust: bool = False
+) -> LightmappedScene:
+    """Reads a lightmap set and cuts it into objects.
+
+    Args:
+        path: The set, as `wlm.lightmap.load` takes it, that names its mesh.
+        hours: Of its times those that become states; none: all.
+        side: Texels that the set's longer side is made smaller to, which has a multiple of as many; None: as it is.
+        trust: As of `wlm.lightmap.load`.
+
+    Returns:
+        A scene of a sheet for each object, the largest first, which is called by the set's name and its side; a state
+        is called by its hour.
+
+    Raises:
+        WlmError: The set or its mesh can't be read, or has no such hour or side.
+    """
+    lightmaps = load_set(path, trust=trust).light
+    if lightmaps.mesh is None:
+        raise WlmError(f"{path}: expected a set with a mesh")
+    for hour in hours:
+        if not np.isclose(lightmaps.times, hour).any():
+            raise WlmError(f"{path}: no lightmap of {hour:g} h; it has {', '.join(f'{t:g}' for t in lightmaps.times)}")
+    chosen = np.isclose(lightmaps.times[:, None], np.array(hours or lightmaps.times)).any(1)
+    longest = max(lightmaps.mask.shape)
+    if side is not None and not (0 < side <= longest and longest % side == 0):
+        raise WlmError(f"{path}: side: expected a divisor of {longest}, got {side}")
+    primitives = [each for each in read_gltf(lightmaps.mesh, trust)[1] if 0 in each.uv]
+    if not primitives:
+        raise WlmError(f"{lightmaps.mesh}: expected triangles with TEXCOORD_0")
+    first = np.cumsum([0, *(len(each.position) for each in primitives)])
+    arrays = (
+        np.concatenate([each.position for each in primitives]),
+        np.concatenate([each.triangle + start for each, start in zip(primitives, first, strict=False)]),
+        np.concatenate([each.uv[0] for each in primitives]).astype(np.float64).clip(0.0, 1.0),
+    )
+    states = tuple(f"{time:g} h" for time in lightmaps.times[chosen])
+    scene = cut(replace(lightmaps, frames=lightmaps.frames[chosen]), *arrays, longest // (side or longest))
+    return replace(scene, name=f"{lightmaps.name} {side or longest}", states=states)
+
+
+def cut(
+    lightmaps: SheetFrames, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, factor: int = 1
+) -> LightmappedScene:
+    """Cuts lightmaps into those of the objects of their mesh.
+
+    Args:
+        lightmaps: Their times become states.
+        position: float64 [V, 3], in metres.
+        triangle: int [F, 3].
+        uv: float64 [V, 2], in [0, 1].
+        factor: Texels along a side that become one.
+    """
+    height, width = lightmaps.mask.shape
+    chart = charts(welded(position, uv, triangle))
+    owner = np.where(lightmaps.mask, chart_map(position, uv, triangle, height, width), -1)
+    if (owner >= 0).any():  # a texel that a chart only touches is that of the nearest
+        rows, columns = nearest_valid(owner >= 0)
+        owner = np.where(lightmaps.mask, owner[rows, columns], -1)
+    texel = uv * (width, height)
+    pieces = [
+        _piece(lightmaps.frames, owner == number, texel[triangle[chart == number]].reshape(-1, 2), number, factor)
+        for number in range(int(chart.max()) + 1)
+    ]
+    counts = np.array([int(inside.sum()) for _, inside, _ in pieces])
+    object_of = _objects(position, triangle, chart, counts)
+    scenes = []
+    for number in range(int(object_of.max()) + 1):
+        own = np.flatnonzero(object_of == number)
+        name = f"{lightmaps.name} {number}"
+        scenes.append(_object(position, triangle, texel, chart, own, pieces, factor, name))
+    return join(scenes, lightmaps.name)
+
+
+def _piece(
+    frames: np.ndarray, inside: np.ndarray, corner: np.ndarray, number: int, factor: int
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """A chart's light [M, h, w, 3] at the lower resolution, its texels [h, w], and where it was, x and y of a texel."""
+    height, width = inside.shape
+    low = np.floor(corner.min(0)).clip(0, (width - 1, height - 1)).astype(int) // factor * factor
+    high = np.maximum(np.ceil(corner.max(0)).astype(int), low + 1)
+    # Whole squares; what is beyond the lightmap has no light.
+    columns, rows = (-(-(high - low) // factor)).tolist()
+    x, y = low.tolist()
+    part = (slice(y, y + rows * factor), slice(x, x + columns * factor))
+    mask = inside[part] if inside[part].any() else np.ones_like(inside[part])
+    light = frames[(slice(None), *part)] * mask[..., None]
+    beyond = rows * factor - mask.shape[0], columns * factor - mask.shape[1]
+    light = np.pad(light, ((0, 0), (0, beyond[0]), (0, beyond[1]), (0, 0)))
+    count = np.pad(mask, ((0, beyond[0]), (0, beyond[1]))).reshape(rows, factor, columns, factor).sum((1, 3))
+    light = light.reshape(len(light), rows, factor, columns, factor, 3).sum((2, 4)) / np.maximum(count, 1)[..., None]
+    return fill_gaps(light, count > 0), count > 0, (x, y)
+
+
+def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """The object of each chart, those of most texels first."""
+    size = max(float(np.ptp(position, axis=0).max()), 1e-30)
+    grid = np.round(position / (_SAME_PLACE * size)).astype(np.int64)
+    corner = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)[triangle]
+    links = np.concatenate([corner[:, :2], corner[:, 1:]])
+    total = int(corner.max()) + 1
+    # Charts are connected through their triangles' corners.
+    graph = coo_array((np.ones(len(links), bool), tuple(links.T)), (total, total))
+    label = connected_components(graph, directed=False)[1][corner[:, 0]]
+    first = np.unique(chart, return_index=True)[1]
+    piece = np.unique(label[first], return_inverse=True)[1]
+    texels = np.bincount(piece, counts)
+    middle = np.stack([np.bincount(chart, position[triangle].mean(1)[:, axis]) for axis in range(3)], 1)
+    middle /= np.bincount(chart)[:, None]
+    large = texels >= min(LEAST_TEXELS, texels.max())
+    near = np.flatnonzero(large[piece])
+    joined = piece.copy()
+    joined[~large[piece]] = piece[near[cKDTree(middle[near]).query(middle[~large[piece]])[1]]]
+    _numbers, result = np.unique(joined, return_inverse=True)
+    order = np.argsort(-np.bincount(result, counts), kind="stable")
+    return np.argsort(order)[result.reshape(-1)]
+
+
+def _object(position, triangle, texel, chart, own, pieces, factor, name):
+    """Makes the scene of one object, with its charts laid out anew."""
+    sizes = np.array([pieces[number][1].shape[::-1] for number in own]) + _GAP
+    first, tall = place(sizes, max(int(sizes[:, 0].max()), math.ceil(math.sqrt(sizes.prod(1).sum()))))
+    wide = int((first[:, 0] + sizes[:, 0]).max())
+    light, mask = np.zeros((len(pieces[0][0]), tall, wide, 3), np.float32), np.zeros((tall, wide), bool)
+    shift = np.zeros((len(pieces), 2))
+    for number, (x, y) in zip(own, first + _GAP // 2, strict=True):
+        values, inside, before = pieces[number]
+        at = (slice(y, y + inside.shape[0]), slice(x, x + inside.shape[1]))
+        light[(slice(None), *at)], mask[at] = values, inside
+        shift[number] = np.array([x, y]) - np.array(before) / factor
+    faces = np.flatnonzero(np.isin(chart, own))
+    # A vertex that two charts have has two places.
+    pairs = np.column_stack([np.repeat(chart[faces], 3), triangle[faces].reshape(-1)])
+    used, corner = np.unique(pairs, axis=0, return_inverse=True)
+    uv = (texel[used[:, 1]] / factor + shift[used[:, 0]]) / (wide, tall)
+    return from_arrays(position[used[:, 1]], corner.reshape(-1, 3), uv, light, mask, name, metres=True)

@@ -35,7 +35,7 @@ from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
 from benchmarks.rivals.lightmap_torch import PlainFit
 from benchmarks.rows import Row
-from benchmarks.runner import Bench, Fit, Note, demo_data
+from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
 from wlm.errors import WlmError
 from wlm.formats import zstd
 from wlm.lightmap.codec import tile_sizes
@@ -89,69 +89,47 @@ def run(
     quick: bool,
     device: str,
     set_path: str | os.PathLike[str] | None = None,
-    names: Sequence[str] | None = None,
+    profiles: Sequence[str] | None = None,
     rivals: bool = True,
+    rivals_only: bool = False,
+    rival_names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the lightmap system on one set.
 
     Args:
         quick: Three profiles with short fits and a third of the rivals, scored at three times (9, 12 and 21 h if the
-            set has them): five minutes on two CPU cores for 16 tiles. Its errors are those of unfinished fits.
+            set has them): five minutes on two CPU cores for 16 tiles. The fits are not finished, so errors are large.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
-        names: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
-        rivals: With the rivals, which take minutes on the CPU and no GPU: `run_rivals` measures them elsewhere.
+        profiles: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
+        rivals: Whether to measure the rivals too.
+        rivals_only: Measure only the rivals. They need no GPU, except those that are fitted.
+        rival_names: Measure only these keys of `benchmarks.rivals.lightmap.RIVALS`.
         progress: Called with a line before each part of the work.
 
     Returns:
         The rows, in the order of the module's list.
 
     Raises:
-        WlmError: The set or the device isn't there, or a fit diverged.
+        WlmError: The set, the device or a rival does not exist, options contradict each other, or a fit diverged.
     """
-    profiles = [Profile.load(name) for name in names or (QUICK_PROFILES if quick else PROFILES)]
-    lightmaps = _load(set_path)
-    chosen = np.arange(len(lightmaps.times))
+    for name in rival_names or ():
+        check_rival(name)
+    if rivals_only or rival_names:
+        expect_alone("--rivals-only", {"--no-rivals": not rivals, "--profile": profiles})
+    lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
+    chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
+    if rivals_only or rival_names:
+        bench = _LightmapBench(lightmaps, chosen, device, progress, None)
+        return [bench.rival_row(name) for name in rival_names or usual(bench.device, quick)]
+    loaded = [Profile.load(name) for name in profiles or (QUICK_PROFILES if quick else PROFILES)]
     if quick:
         steps = max(200, _QUICK_TILE_STEPS // TileGrid.of(*lightmaps.light.mask.shape).count)
-        profiles = [
-            profile.model_copy(update={"steps": min(steps, profile.steps), "samples": _QUICK_SAMPLES})
-            for profile in profiles
-        ]
-        chosen = _quick_times(lightmaps.times)
+        short = {"samples": _QUICK_SAMPLES}
+        loaded = [each.model_copy(update=short | {"steps": min(steps, each.steps)}) for each in loaded]
     names = usual(device, quick) if rivals else ()
-    return run_rows(lightmaps, profiles, device=device, chosen=chosen, rivals=names, progress=progress)
-
-
-def run_rivals(
-    *,
-    quick: bool = False,
-    device: str = "cpu",
-    set_path: str | os.PathLike[str] | None = None,
-    names: Sequence[str] | None = None,
-    progress: Note | None = None,
-) -> list[Row]:
-    """Measures the rivals alone.
-
-    Args:
-        quick, set_path, progress: As for `run`.
-        device: "cpu" or "cuda:0", for the rivals that are fitted; the others run on the CPU.
-        names: Keys of `benchmarks.rivals.lightmap.RIVALS`; None: all, or with `quick` a third of them, and on the CPU
-            without those that are fitted.
-
-    Returns:
-        Their rows.
-
-    Raises:
-        WlmError: The set or the device isn't there, or a name is unknown.
-    """
-    for name in names or ():
-        check_rival(name)
-    lightmaps = _load(set_path)
-    chosen = _quick_times(lightmaps.times) if quick else np.arange(len(lightmaps.times))
-    bench = _LightmapBench(lightmaps, chosen, device, progress, None)
-    return [bench.rival_row(name) for name in names or usual(bench.device, quick)]
+    return run_rows(lightmaps, loaded, device=device, chosen=chosen, rivals=names, progress=progress)
 
 
 def run_rows(
@@ -189,10 +167,6 @@ def run_rows(
     rows += [bench.rival_row(name) for name in rivals]
     rows += [bench.fit_row(fit) for fit in fits if len(fit.model.light.mapped)]
     return rows + bench.plain_rows(best)
-
-
-def _load(set_path: str | os.PathLike[str] | None) -> LightmapSet:
-    return load(demo_data("city", "--set PATH") if set_path is None else set_path)
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:

@@ -54,8 +54,8 @@ _METRICS = ("psnr", "ssim")
 
 
 def run(
-    only: Sequence[str] = (),
     *,
+    only: Sequence[str] | None = None,
     quick: bool,
     device: str,
     set_path: str | os.PathLike[str] | None = None,
@@ -80,6 +80,7 @@ def run(
     Raises:
         WlmError: The set or the device isn't there, no row has such a name, no tile is dynamic, or a fit diverged.
     """
+    only = only or ()
     _check(only)
     lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
     profile = Profile.load(_PROFILE).override(_QUICK if quick else {})

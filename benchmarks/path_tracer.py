@@ -1,35 +1,25 @@
 """Six-way lightmaps by Mitsuba's volumetric path tracer, of one bounce or more, and Open Image Denoise: extra `bake`.
 
 An independent estimate of the same integral: with many samples it checks the march, with few it shows the quality that
-a path tracer has in the time of a frame. Mitsuba traces on the CPU, or on a GPU whose driver has OptiX, which drivers
-for computing alone often lack; the denoiser runs on the CPU.
+a path tracer has in the time of a frame. Mitsuba traces on the CPU here: `wlm.smoke.transport.tracing` is the path
+tracer that is measured on a GPU.
 """
 
 import functools
 import importlib.util
 import math
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 import torch
 
-from wlm.errors import WlmError, one_line
+from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import VECTORS, Camera
-from wlm.smoke.scene import CameraSettings, make_camera
-from wlm.smoke.synthetic import make_plume
-
-GPU = "cuda_ad_rgb"
-"""Mitsuba's variant for a GPU."""
 
 _FILTER = "RTLightmap"  # of one image without normals or albedo, in linear light
 _NEVER = 100  # bounces after which Russian roulette begins
 _LLVM = 19  # older versions can't compile Mitsuba's kernels, and end the process
-_TRIAL = f"from benchmarks.path_tracer import try_variant; try_variant({GPU!r})"
-_PATIENCE = 180.0  # seconds of a trial, most of which compile the first kernels
-_REASON = 160  # characters of why it failed
 
 
 def has_tracer() -> bool:
@@ -42,64 +32,18 @@ def has_denoiser() -> bool:
     return importlib.util.find_spec("pyoidn") is not None
 
 
-def choose_variant(device: str = "cpu") -> tuple[str, str]:
-    """Chooses Mitsuba's fastest variant for a device.
-
-    Args:
-        device: "cpu" or "cuda:0".
-
-    Returns:
-        The variant, and the reason why it is one of the CPU although a GPU was asked for, else an empty string.
+def choose_variant() -> str:
+    """Chooses Mitsuba's fastest variant on the CPU.
 
     Raises:
-        WlmError: Mitsuba isn't installed.
+        WlmError: Mitsuba is not installed.
     """
     if not has_tracer():
         raise WlmError("path tracing needs mitsuba: install wlm[bake]")
     import drjit
 
-    reason = ""
-    if device != "cpu":
-        reason = _no_gpu(device, drjit.has_backend(drjit.JitBackend.CUDA))
-        if not reason:
-            return GPU, ""
     fast = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= _LLVM
-    return "llvm_ad_rgb" if fast else "scalar_rgb", reason
-
-
-def _no_gpu(device: str, has_cuda: bool) -> str:
-    """Why Mitsuba can't trace on a GPU; empty if it can."""
-    if device != "cuda:0":
-        return "Mitsuba takes the first GPU alone"
-    if not has_cuda:
-        return "Dr.Jit finds no CUDA"
-    # In a process of its own, which Mitsuba may end where OptiX is missing or too old.
-    try:
-        trial = subprocess.run(
-            [sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=_PATIENCE, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return f"a first image took more than {_PATIENCE:g} s"
-    except OSError as error:
-        return f"a second process can't be started, {error.strerror}"
-    if trial.returncode == 0:
-        return ""
-    lines = trial.stderr.strip().splitlines()
-    return one_line(lines[-1] if lines else f"a first image ended with {trial.returncode}", _REASON)
-
-
-def try_variant(variant: str) -> None:
-    """Traces a small plume.
-
-    Raises:
-        WlmError: Mitsuba isn't installed, or the image is black or not finite.
-        Exception: Whatever Mitsuba raises where the variant doesn't work.
-    """
-    volume = make_plume(8, hot=False, extinction=14.0)
-    camera = make_camera(CameraSettings(resolution=8), volume.origin, (1.0, 1.0, 1.0))
-    lightmaps, _ = PathTracer(volume, camera, variant=variant)(4)
-    if not (np.isfinite(lightmaps).all() and lightmaps.any()):
-        raise WlmError(f"path tracing: {variant}: expected light, found none, or numbers that aren't finite")
+    return "llvm_ad_rgb" if fast else "scalar_rgb"
 
 
 class PathTracer:
@@ -135,11 +79,9 @@ class PathTracer:
         """
         if camera.perspective:
             raise ValueError("six-way lightmaps need an orthographic camera")
-        if not has_tracer():
-            raise WlmError("path tracing needs mitsuba: install wlm[bake]")
+        self.variant = variant or choose_variant()
         import mitsuba
 
-        self.variant = variant or choose_variant()[0]
         mitsuba.set_variant(self.variant)
         self._mitsuba, self._camera, self._order = mitsuba, camera, order
         self._smoke = self._load_smoke(volume, albedo, g)

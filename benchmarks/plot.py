@@ -19,7 +19,6 @@ from wlm.formats.atomic import atomic_path
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.transforms import Bbox
 
 # Okabe and Ito 2008, "Color Universal Design": told apart with any common colour vision. Its yellow is too
 # pale for white.
@@ -31,7 +30,7 @@ _MARKERS = ("o", "s", "^", "D", "v", "P")
 _LOG_RATIO = 8.0
 _MARKER_POINTS = 7.0
 _LABEL_POINTS = 9.0
-# How far from its marker a label may stand, in points; beyond the first it gets a leader.
+# Distances of a label from its marker, in points.
 _RINGS = (0.0, 14.0, 30.0, 48.0, 70.0, 96.0)
 # Orange and sky blue have too little contrast with white to be read as letters; three quarters of them has
 # enough.
@@ -205,7 +204,9 @@ def _wide(values: Sequence[float]) -> bool:
 
 
 def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence[str]) -> None:
-    """Puts each row's name beside its marker, where it covers least of what else is drawn."""
+    """Places each row's name near its marker, where it overlaps other labels and markers least."""
+    from matplotlib.text import Text
+
     if not rows:
         return
     pixels = figure.dpi / 72.0
@@ -214,20 +215,14 @@ def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel,
     centres = axes.transData.transform([panel.position(row) for row in rows])
     half = 0.5 * _MARKER_POINTS * pixels
     taken = [(cx - half, cy - half, cx + half, cy + half) for cx, cy in centres]
-    taken += [_box(text.get_window_extent(renderer)) for text in axes.texts]
-    front = axes.transData.transform(axes.lines[-1].get_xydata())  # what _draw_panel drew last
-    edges = [_segment_box(a, b) for a, b in itertools.pairwise(_corners(front))]
-
-    labels: list[_Box] = []
-    leaders: list[_Box] = []
-    # The crowded points choose first; a lonely one finds room anywhere.
+    taken += [tuple(text.get_window_extent(renderer).extents) for text in axes.texts]
+    # Points with near neighbours are labelled first, because they have the fewest free positions.
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2) + np.diag(np.full(len(rows), np.inf))
     for index in np.argsort(gaps.min(axis=1), kind="stable"):
         row, (cx, cy) = rows[index], centres[index]
         colour, _ = _style(row.method, methods)
-        name = f"{row.method} {row.option}".strip()
         label = axes.annotate(
-            name,
+            f"{row.method} {row.option}".strip(),
             (cx, cy),
             xycoords="figure pixels",
             xytext=(cx, cy),
@@ -237,74 +232,33 @@ def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel,
             fontsize=_LABEL_POINTS,
             color=_ink(colour),
             zorder=4,
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.6, "shrinkA": 0.0, "shrinkB": 0.0},
         )
-        extent = label.get_window_extent(renderer)
-        area = extent.width * extent.height
-        best = None
+        extent = Text.get_window_extent(label, renderer)  # without the line to the marker
+        width, height = extent.width, extent.height
+        places = []
         for ring, direction in itertools.product(_RINGS, range(16)):
-            angle = direction * math.pi / 8.0
-            dx, dy = math.cos(angle), math.sin(angle)
-            # The box touches the ring from outside, whatever its shape.
-            x = cx + dx * (half + (3.0 + ring) * pixels + extent.width / 2.0)
-            y = cy + dy * (half + (1.0 + ring) * pixels + extent.height / 2.0)
-            # Pushed back inside the frame: what is cut off can't be read.
-            x = min(max(x, frame.x0 + extent.width / 2.0), frame.x1 - extent.width / 2.0)
-            y = min(max(y, frame.y0 + extent.height / 2.0), frame.y1 - extent.height / 2.0)
-            box = (x - extent.width / 2, y - extent.height / 2, x + extent.width / 2, y + extent.height / 2)
-            leader = _leader(cx, cy, box) if ring > 0.0 else []
-            cost = 4.0 * sum(_overlap(_grown(box, pixels), other) for other in taken)
-            # A thin leader has next to no area, so its crossings count by the piece, old under new and new
-            # over old.
-            crossings = sum(_overlap(piece, other) > 0.0 for piece in leader for other in labels)
-            crossings += sum(_overlap(box, piece) > 0.0 for piece in leaders)
-            cost += 0.05 * area * crossings
-            cost += 0.5 * sum(_overlap(box, edge) for edge in edges)
-            # Among free places, the nearest, and right or left of the marker before above or below.
-            cost += 0.01 * area * (ring / _RINGS[1] + 0.5 * abs(dy))
-            if best is None or cost < best[0]:
-                best = (cost, x, y, box, leader)
-        _, x, y, box, leader = best
-        label.set_position((x, y))
+            dx, dy = math.cos(direction * math.pi / 8.0), math.sin(direction * math.pi / 8.0)
+            x = cx + dx * (half + (3.0 + ring) * pixels + width / 2.0)
+            y = cy + dy * (half + (1.0 + ring) * pixels + height / 2.0)
+            # A label stays inside the axes, where nothing of it is cut off.
+            x = min(max(x, frame.x0 + width / 2.0), frame.x1 - width / 2.0)
+            y = min(max(y, frame.y0 + height / 2.0), frame.y1 - height / 2.0)
+            box = (x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0)
+            cost = 4.0 * sum(_overlap(box, other, pixels) for other in taken)
+            # Of free positions the nearest is taken, and one beside the marker before one above or below it.
+            cost += 0.01 * width * height * (ring / _RINGS[1] + 0.5 * abs(dy))
+            places.append((cost, (x, y), box))
+        _, place, box = min(places, key=lambda each: each[0])
+        label.set_position(place)
         taken.append(box)
-        labels.append(box)
-        leaders += leader
-        if leader:
-            line = axes.transData.inverted().transform([(cx, cy), leader[-1][:2]])
-            axes.plot(*line.T, color=colour, linewidth=0.6, zorder=1.5, scalex=False, scaley=False)
 
 
 _Box = tuple[float, float, float, float]
 
 
-def _box(extent: Bbox) -> _Box:
-    return extent.x0, extent.y0, extent.x1, extent.y1
-
-
-def _overlap(a: _Box, b: _Box) -> float:
-    """Area that two boxes share, in square pixels."""
-    return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
-
-
-def _grown(box: _Box, margin: float) -> _Box:
-    return box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin
-
-
-def _leader(x: float, y: float, box: _Box) -> list[_Box]:
-    """The line from a marker to the nearest point of its label, as small boxes, the last one at the label."""
-    end_x, end_y = min(max(x, box[0]), box[2]), min(max(y, box[1]), box[3])
-    points = [(x + t * (end_x - x), y + t * (end_y - y)) for t in np.linspace(0.125, 1.0, 8)]
-    return [(px, py, px + 1.0, py + 1.0) for px, py in points]
-
-
-def _corners(points: np.ndarray) -> list[tuple[float, float]]:
-    """The points of a step line that goes right before it goes up or down."""
-    corners = [tuple(points[0])]
-    for (x0, y0), (x1, y1) in itertools.pairwise(points):
-        del x0
-        corners += [(x1, y0), (x1, y1)]
-    return corners
-
-
-def _segment_box(a: tuple[float, float], b: tuple[float, float]) -> _Box:
-    """A level or upright segment as a box of two pixels' width."""
-    return min(a[0], b[0]) - 1.0, min(a[1], b[1]) - 1.0, max(a[0], b[0]) + 1.0, max(a[1], b[1]) + 1.0
+def _overlap(a: _Box, b: _Box, margin: float) -> float:
+    """Area that the first box, enlarged by a margin, shares with the second, in square pixels."""
+    width = min(a[2] + margin, b[2]) - max(a[0] - margin, b[0])
+    height = min(a[3] + margin, b[3]) - max(a[1] - margin, b[1])
+    return max(0.0, width) * max(0.0, height)

@@ -15,7 +15,7 @@ Rows of each set, by method:
 - "held out": the first profile: light at every fifth probe from a fit to the others, and the light half-way between
   probes; with that of the uncompressed others by two simple rules.
 - "volume" and "views" of `benchmarks.probe_volume`, the first profile: light through the cascaded volume along a walk,
-  and pictures under it. `run_volume` measures the walks only.
+  and pictures under it.
 
 A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
 graph, so that gaps between launches do not count; the rivals decode on the CPU.
@@ -34,7 +34,7 @@ from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rivals.rival import Rival
 from benchmarks.rows import Row
-from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors
+from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors, expect_alone
 from wlm.errors import WlmError
 from wlm.formats import zstd
 from wlm.probe.between import between_psnr, held_out
@@ -79,33 +79,44 @@ PANELS = (Panel("bpp", "psnr", ("ours", "pca", *_RIVALS)), Panel("decode_ms", "m
 
 def run(
     *,
-    quick: bool,
-    device: str,
+    quick: bool = False,
+    device: str = "cpu",
     probes_path: str | os.PathLike[str] | None = None,
-    keys: Sequence[str] = (),
+    keys: Sequence[str] | None = None,
     rivals: bool = True,
+    rivals_at: str | os.PathLike[str] | None = None,
+    volume_only: bool = False,
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures the probe system on one file.
 
     Args:
         quick: Short fits, the profiles' ratios only, rivals of one size, a short walk, and of the demo noon only: less
-            than two minutes on two CPU cores. The errors are those of unfinished fits.
+            than two minutes on two CPU cores. The fits are not finished, so errors are large.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
-        probes_path: A file as `wlm.probe.load` reads it; None: the checkout's
-            `demos/data/probes/street.npz`.
-        keys: Which of the file's arrays, one set of rows each; none: the only one, or noon and night of the demo's.
-        rivals: With the PCA family and Unreal's packing, which take minutes on the CPU and no GPU: `run_rivals`
-            has them alone.
+        probes_path: A file as `wlm.probe.load` reads it; None: the checkout's `demos/data/probes/street.npz`.
+        keys: The arrays of the file, one set of rows each; none: the only one, or noon and night of the demo's.
+        rivals: Whether to measure the PCA family and Unreal's packing, which take minutes on the CPU and no GPU.
+        rivals_at: Measure only the rivals. The command states this result file, whose sizes are the same shares.
+        volume_only: Measure only the volume, filled from the original probes and from principal components.
         progress: Called with a line before each part of the work.
 
     Returns:
         The rows, set by set in the order of the module's list.
 
     Raises:
-        WlmError: The file, a key or the device isn't there, or a fit diverged.
+        WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
     """
-    sets = _load(probes_path, keys or (_DEMO_KEYS[: 1 if quick else None] if probes_path is None else ()))
+    if volume_only:
+        expect_alone("--volume-only", {"--quick": quick, "--no-rivals": not rivals, "--rivals-at": rivals_at})
+    if rivals_at is not None:
+        expect_alone("--rivals-at", {"--quick": quick, "--no-rivals": not rivals, "--device": device != "cpu"})
+    if probes_path is None:
+        probes_path, keys = demo_data("probes/street.npz", "--probes FILE"), keys or _DEMO_KEYS[: 1 if quick else None]
+    sets = [load(probes_path, key=key) for key in keys or (None,)]
+    if volume_only or rivals_at is not None:
+        benches = [ProbeBench(probes, device, progress) for probes in sets]
+        return [row for bench in benches for row in (bench.volume() if volume_only else bench.rival_rows(SHARES))]
     profiles = [Profile.load(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(probes.live.sum()) for probes in sets))
@@ -120,54 +131,6 @@ def run(
         frames=_QUICK_FRAMES if quick else None,
         progress=progress,
     )
-
-
-def run_rivals(
-    *,
-    probes_path: str | os.PathLike[str] | None = None,
-    keys: Sequence[str] = (),
-    progress: Note | None = None,
-) -> list[Row]:
-    """Measures the rivals only, on the CPU; arguments and errors as for `run`."""
-    sets = _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ()))
-    benches = [_ProbeBench(probes, "cpu", progress) for probes in sets]
-    return [row for bench in benches for row in bench.rival_rows(SHARES)]
-
-
-def run_volume(
-    *,
-    device: str,
-    probes_path: str | os.PathLike[str] | None = None,
-    keys: Sequence[str] = (),
-    frames: int | None = None,
-    progress: Note | None = None,
-) -> list[Row]:
-    """Measures the volume only, filled from the original probes and from principal components.
-
-    Args:
-        device: As for `run`.
-        probes_path: As for `run`.
-        keys: As for `run`.
-        frames: Of the walk, at least one; None: as many as a tenth of a block each takes.
-        progress: As for `run`.
-
-    Returns:
-        The rows of method "volume", set by set.
-
-    Raises:
-        WlmError: The file, a key or the device isn't there.
-    """
-    rows = []
-    for probes in _load(probes_path, keys or (_DEMO_KEYS if probes_path is None else ())):
-        bench = _ProbeBench(probes, device, progress)
-        rows += volume_rows(bench, probes, {"pca": compress(probes, "pca")}, frames)
-    return rows
-
-
-def _load(path: str | os.PathLike[str] | None, keys: Sequence[str]) -> list[ProbeSet]:
-    if path is None:
-        path = demo_data("probes/street.npz", "--probes FILE")
-    return [load(path, key=key) for key in keys or (None,)]
 
 
 def run_rows(
@@ -197,7 +160,7 @@ def run_rows(
         raise ValueError("expected at least one set and one profile")
     rows = []
     for probes in sets:
-        bench = _ProbeBench(probes, device, progress, repeats)
+        bench = ProbeBench(probes, device, progress, repeats)
         first, *others = [bench.fit_profile(profile, profile.name) for profile in profiles]
         for ratio in ratios:
             if ratio != profiles[0].ratio:
@@ -215,7 +178,7 @@ def run_rows(
     return rows
 
 
-class _ProbeBench(Bench):
+class ProbeBench(Bench):
     """A set of probes."""
 
     def __init__(self, probes: ProbeSet, device: str, progress: Note | None, repeats: int | None = None) -> None:
@@ -223,6 +186,10 @@ class _ProbeBench(Bench):
         super().__init__("probe", device, progress, scene=f"{probes.name} {key}".strip(), repeats=repeats)
         self.probes = probes
         self.position, self.values = probes.position[probes.live], probes.values[probes.live]
+
+    def volume(self, frames: int | None = None) -> list[Row]:
+        """Measures the volume filled from the original probes and from principal components."""
+        return volume_rows(self, self.probes, {"pca": compress(self.probes, "pca")}, frames)
 
     def fit_profile(self, profile: Profile, option: str) -> Fit:
         """Fits and writes a profile; compiling its kernels is no part of either time."""

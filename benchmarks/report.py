@@ -44,9 +44,7 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
             page = f"{index.stem}/{system}.md"
             contents[page] = "\n".join([f"# Results: {system}\n", f"{head}\n", *plots, *parts])
             links.append(f"- [{system}]({page}): {', '.join(machines)}")
-    foot = (
-        "Each page has the commands that measure its runs again; `python -m benchmarks plot` draws the plots.\n"
-    )
+    foot = "Each page has the commands that measure its runs again; `python -m benchmarks plot` draws the plots.\n"
     return {index.name: "\n".join(["# Results\n", f"{head}\n", *links, "", foot]), **contents}
 
 

@@ -153,6 +153,17 @@ class Bench:
         return [row.with_timing(timings[index], self._clock) for index, (row, _) in enumerate(peers)]
 
 
+def expect_alone(option: str, others: Mapping[str, object]) -> None:
+    """Raises a `WlmError` if an option was given together with others that have no meaning beside it.
+
+    Args:
+        option: The option that was given.
+        others: Whether each of the others was given, by its name.
+    """
+    if any(others.values()):
+        raise WlmError(f"{option}: expected without {' and '.join(others)}")
+
+
 def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
     """Compares a decode with the float64 decode of the same model.
 

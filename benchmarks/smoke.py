@@ -22,17 +22,712 @@ makes; on CUDA the lattice replays graphs by itself where it does many steps, an
 graphs, so that gaps between launches do not count.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+import warp as wp
+from torch.nn.functional import interpolate
 
 from benchmarks.plot import Panel
 from benchmarks.rows import Row
-from benchmarks.runner import Note
-from benchmarks.smoke_air import advection_rows, lattice_rows, smoke_brick_rows, storage_rows
-from benchmarks.smoke_light import frame_rows, guide_rows, six_rows, weight_rows
-from benchmarks.smoke_setup import FULL, QUICK, Sizes, SmokeBench
+from benchmarks.runner import Bench, Note
+from wlm.fluid.lattice import Lattice
+from wlm.fluid.volume import DensityVolume
+from wlm.interop import stream, to_warp
+from wlm.metrics.error import psnr_from_mse
+from wlm.smoke.camera import RULES, Camera
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.march.coarse import Guide, guide
+from wlm.smoke.march.fine import bake, lit
+from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
+from wlm.smoke.shading import Light, obstacle_visibility
+from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.orders import scatter
+from wlm.smoke.transport.tracing import trace
+from wlm.view.smoke import Drawing
+from wlm.view.smoke_run import AllOrders, SixWays
+from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid.lattice_fields import voxelise_sphere
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
+from wlm_kernels.smoke.settings import March
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """What a plot shows: PSNR and error of guiding maps and of the fine march against their time."""
+
+_SPEED = 0.1  # of the inlet, cells a step
+_VISCOSITY = 1e-6
+_COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
+_RATIO = 4
+_SUBSTEPS = 2
+_THRESHOLD = 1e-6
+# Steps of a whole turn of the ball for each voxel along the box's edge: its centre then goes 0.63 voxels a step.
+_TURN = 2
+_BALL = (0.68, 0.2)  # its centre along x and its radius, of the box's edge
+_SCHEMES = ("semi-lagrangian", "maccormack")
+# Floats that a cell has to be read and written at the least: each pass takes its fields once, and leaves one.
+_PASSES = {"semi-lagrangian": 2, "maccormack": 2 + 3}
+_CLOUD = "cloud"
+_DEPTH = 8.0  # optical, through the cloud's box at density 1
+_OCTAVES = range(2, 7)
+_GAIN = 0.6  # of an octave over the one before
+_HALF_GUIDE = (5, 10, 20)  # steps at which 16 bits are looked at
+_HALF_SIX = 0.5
+_PLUME = 14.0  # the plume's extinction, over its box
+_LIGHTS = 12
+_WEIGHT_STEP = 1.0
+_JITTER = 1.0
+_PATHS = 64  # a pixel, on a GPU
+_FEW_PATHS = 4
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Grids, steps and repeats."""
+
+    lattice: int  # cells along an edge of the large lattice
+    small: int  # and of the small one
+    chunk: int  # steps of a lattice that are timed as one
+    compared: tuple[int, ...]  # steps after which velocities of 16 and 32 bits are compared
+    drift: int  # steps after which the drift of the mass is measured
+    fills: tuple[float, ...]  # shares of the domain in which there is smoke
+    coarse: int  # cells of velocity along an edge, each four voxels of smoke along its edge
+    cloud: int  # voxels along an edge of the cloud
+    resolution: int  # pixels along an edge of its image
+    exact: float  # step in voxels of the march that guiding maps are compared with
+    guide_shared: tuple[float, ...]  # steps of guiding maps whose pixels share marches to the lights
+    guide_alone: tuple[float, ...]  # and of those with one for each pixel
+    six: tuple[float, ...]  # steps of the six-way march; the shortest is last
+    plume: int  # pixels along an edge of the image of the plume
+    scale: float  # of the scene's cells
+    frames: int  # of the scene before the one that is timed
+    warmup: int  # calls before the first that is timed
+    repeats: int  # samples of a time
+    few: int  # samples of a time that is long
+    every: bool  # include slow-to-compile cases of minor interest
+
+
+FULL = Sizes(
+    lattice=256,
+    small=100,
+    chunk=48,
+    compared=(500, 1000),
+    drift=5000,
+    fills=(0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0),
+    coarse=100,
+    cloud=400,
+    resolution=512,
+    exact=0.5,
+    guide_shared=(2, 3, 5, 10, 15, 20),
+    guide_alone=(1, 2, 3, 5, 10, 15, 20),
+    six=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 2.0, 1.0, 0.5, 0.25),
+    plume=64,
+    scale=1.0,
+    frames=40,
+    warmup=3,
+    repeats=12,
+    few=3,
+    every=True,
+)
+"""The paper's grids: for a GPU."""
+
+QUICK = Sizes(
+    lattice=48,
+    small=24,
+    chunk=8,
+    compared=(100, 200),
+    drift=300,
+    fills=(0.0, 0.25, 1.0),
+    coarse=12,
+    cloud=48,
+    resolution=48,
+    exact=0.5,
+    guide_shared=(2, 3, 5, 10, 15, 20),
+    guide_alone=(2, 5, 10, 20),
+    six=(1.0, 0.5, 0.25),
+    plume=24,
+    scale=0.12,
+    frames=12,
+    warmup=1,
+    repeats=5,
+    few=1,
+    every=False,
+)
+"""For a CPU."""
+
+
+class SmokeBench(Bench):
+    """A device and sizes.
+
+    Attributes:
+        bandwidth: Bytes a second that a copy reads and writes; NaN until it is measured.
+    """
+
+    def __init__(self, device: str, sizes: Sizes, progress: Note | None = None) -> None:
+        timing = {"warmup": sizes.warmup, "repeats": sizes.repeats, "few": sizes.few}
+        super().__init__("smoke", device, progress, clock="time_ms", **timing)
+        self.sizes, self.bandwidth = sizes, math.nan
+
+    def of_copy(self, bytes_moved: float, ms: float) -> float:
+        """The share of a copy's bandwidth that so many bytes in so many milliseconds are."""
+        return bytes_moved / (1e-3 * ms) / self.bandwidth
+
+
+def lattice_rows(bench: SmokeBench) -> list[Row]:
+    """A copy, and steps of lattices in the same run: with each kind of boundary, storage and operator."""
+    bench.note("lattice")
+    cells, small = bench.sizes.lattice, bench.sizes.small
+    cases = {
+        "float32, periodic": (cells, {"faces": "periodic"}),
+        "float32, six walls": (cells, {"faces": "walls"}),
+        "float32, all boundaries": (cells, {}),
+        "float32, all boundaries, BGK": (cells, {"operator": "bgk"}),
+        "float32, all boundaries, D3Q27": (cells, {"lattice": "D3Q27"}),
+        "float16, periodic": (cells, {"faces": "periodic", "storage": "float16"}),
+        "float16, all boundaries": (cells, {"storage": "float16"}),
+        f"float32, all boundaries, {small}³": (small, {}),
+        f"float16, all boundaries, {small}³": (small, {"storage": "float16"}),
+    }
+    if not bench.sizes.every:
+        del cases["float32, all boundaries, BGK"]
+    chunk, calls = bench.sizes.chunk, {}
+    floats = _COPIED[bench.device.split(":")[0]]
+    source = torch.zeros(floats, device=bench.device)
+    target = torch.ones_like(source)
+    calls["copy"] = lambda: target.copy_(source)
+    calls["kernel"] = lambda: torch.neg(source, out=target)
+    for name, (size, settings) in cases.items():
+        calls[name] = partial(_jet(bench, size, **settings).step, chunk)
+    sphere = f"float32, moving sphere, {small}³"
+    calls[sphere], moved = _moving(bench, small)
+    times = bench.time(calls)
+    # The faster of a memcpy and a kernel: devices differ.
+    copy = min((times.pop("copy"), times.pop("kernel")), key=lambda timing: timing.median_ms)
+    bench.bandwidth = 8 * floats / (1e-3 * copy.median_ms)
+    rows = [bench.row("lattice", "a copy", scene="jet", timing=copy, bandwidth=1e-9 * bench.bandwidth)]
+    for name, (size, settings) in cases.items():
+        timing = times[name]
+        ms = timing.median_ms / chunk
+        figures = {"mlups": 1e-3 * size**3 / ms, "of_copy": bench.of_copy(_bytes(**settings) * size**3, ms)}
+        rows.append(bench.row("lattice", name, scene="jet", timing=timing, calls=chunk, cells=size, **figures))
+    figures = {"cells": small, "mlups": 1e-3 * small**3 * moved / times[sphere].median_ms}
+    note = "marked anew each step"
+    return [*rows, bench.row("lattice", sphere, note, scene="jet", timing=times[sphere], calls=moved, **figures)]
+
+
+def storage_rows(bench: SmokeBench) -> list[Row]:
+    """The error of 16 bits against 32, and the mass of both."""
+    bench.note("lattice: 16 bits against 32")
+    sizes = bench.sizes
+    exact, half = (_jet(bench, sizes.small, storage=storage) for storage in ("float32", "float16"))
+    before = exact.mass(), half.mass()
+    rows = []
+    for steps in sizes.compared:
+        for lattice in (exact, half):
+            lattice.step(steps - lattice.steps)
+        a, b = (wp.to_torch(lattice.velocity()).double() for lattice in (exact, half))
+        rms = float((a - b).square().sum(-1).mean().sqrt()) / _SPEED
+        largest = float((a - b).abs().max()) / _SPEED
+        figures = {"cells": sizes.small, "rms": rms, "largest": largest}
+        rows.append(bench.row("lattice storage", f"float16, {steps:,} steps", scene="jet", **figures))
+    for name, lattice, mass in (("float32", exact, before[0]), ("float16", half, before[1])):
+        lattice.step(sizes.drift - lattice.steps)
+        figures = {"cells": sizes.small, "mass_drift": lattice.mass() / mass - 1.0}
+        rows.append(bench.row("lattice storage", f"{name}, {sizes.drift:,} steps", scene="jet", **figures))
+    return rows
+
+
+def advection_rows(bench: SmokeBench) -> list[Row]:
+    """Schemes and storages: the time of a step with and without solids, and the error after a ball's whole turn."""
+    rows = []
+    n = bench.sizes.coarse
+    box, cells = _box(n), (_RATIO * n) ** 3
+    for storage in advection.STORAGES:
+        bench.note(f"advection: {storage}")
+        fields = [_fields(torch.full((cells,), 0.5), storage, bench.device) for _ in range(3)]
+        velocity = _swirl(n, bench.device)
+        calls = {}
+        for solid, radius in (("", 0.0), (", a sphere", 0.12)):
+            if solid and storage == "float16" and not bench.sizes.every:
+                continue
+            walls = _walls(box, bench.device, radius)
+            for scheme in _SCHEMES:
+                option = f"{scheme}, {storage}{solid}"
+                calls[option] = _carry(bench, scheme, box, velocity, walls, fields)
+        times = bench.time(calls)
+        for option, timing in times.items():
+            scheme = option.split(",")[0]
+            moved = cells * _PASSES[scheme] * (2 if storage == "float16" else 4)
+            figures = {
+                "voxels": _RATIO * n,
+                "voxel_rate": 1e-3 * cells / timing.median_ms,
+                "of_copy": bench.of_copy(moved, timing.median_ms),
+            }
+            if not option.endswith("sphere"):
+                figures |= _turn(bench, scheme, storage)
+            rows.append(bench.row("advection", option, scene="ball", timing=timing, **figures))
+    return rows
+
+
+def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
+    """Bricks of smoke: a step's time by the share of the box that has some."""
+    bench.note("advection: bricks")
+    n, rows = bench.sizes.coarse, []
+    edge = _RATIO * n
+    box, velocity = _box(n), _swirl(n, bench.device)
+    walls = _walls(box, bench.device, 0.0)
+    for scheme in _SCHEMES:
+        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme))
+        calls, lists = {"dense": dense}, {}
+        for fill in bench.sizes.fills:
+            name = f"smoke in {100 * fill:g}%"
+            calls[name], lists[name] = _carry_bricks(bench, scheme, fill, box, velocity, walls)
+        times = bench.time(calls)
+        for name, timing in times.items():
+            figures = {"voxels": edge}
+            if name != "dense":
+                worked = int(lists[name].count.numpy()[0]) * advection_places.BRICK**3 / edge**3
+                figures["worked_on"] = min(worked, 1.0)
+                figures["speedup"] = times["dense"].median_ms / timing.median_ms
+            rows.append(bench.row("advection bricks", f"{scheme}, {name}", scene="cube", timing=timing, **figures))
+    return rows
+
+
+# Lattices.
+
+
+def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattice:
+    """Air in through a round inlet, past a sphere, out at the other end between walls; or at rest."""
+    lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
+    if faces != "periodic":
+        for face in ("-x", "+x", "-y", "+y", "-z", "+z"):
+            lattice.set_wall(face)
+    if faces == "all":
+        across = (np.indices((size, size)) + 0.5) / size - 0.5
+        lattice.set_inlet("-x", (_SPEED, 0.0, 0.0), where=np.hypot(*across) < 0.15)
+        lattice.set_outlet("+x")
+        lattice.set_solid(_sphere(wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device), 0.0))
+    return lattice
+
+
+def _sphere(mask: wp.array, moved: float) -> wp.array:
+    size = mask.shape[0]
+    voxelise_sphere(mask, 1, (0.4 * size + moved, 0.5 * size, 0.5 * size), 0.12 * size)
+    return mask
+
+
+def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
+    """Steps of a jet whose sphere goes to and fro, and how many they are."""
+    lattice, speed, steps = _jet(bench, size), 0.05, 10
+    mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
+    lattice.step(1)
+
+    def go() -> None:
+        for k in range(steps):
+            there = k < steps // 2
+            _sphere(mask, speed * (k if there else steps - k))
+            lattice.set_solid(mask, (speed if there else -speed, 0.0, 0.0))
+            lattice.step(1)
+
+    return go, steps
+
+
+def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
+    """Bytes of one cell that a step has to read and write: populations, and whether it is solid."""
+    return 2 * len(velocity_set(lattice).c) * (2 if storage == "float16" else 4) + int(faces == "all")
+
+
+# Smoke.
+
+
+def _box(n: int) -> advection_places.Box:
+    ends = (advection_places.OPEN,) * 2
+    return advection_places.make_box((n, n, n), _RATIO, (ends,) * 3)
+
+
+def _fields(density: torch.Tensor, storage: str, device: str) -> advection.Fields:
+    kind = torch.float16 if storage == "float16" else torch.float32
+    nothing = wp.empty(0, dtype=advection.STORAGES[storage], device=device)
+    return advection.Fields(to_warp(density.to(device, kind).flatten().clone()), nothing)
+
+
+def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
+    """Cells of a sphere in the middle, whose radius is a share of the edge; none for a radius of 0."""
+    n = box.coarse[0]
+    walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
+    if radius:
+        solid = wp.zeros((n,) * 3, dtype=wp.uint8, device=device)
+        voxelise_sphere(solid, 1, (0.5 * n,) * 3, radius * n)
+        advection_places.mark_walls(box, solid.flatten(), walls)
+    return walls
+
+
+def _swirl(n: int, device: str) -> wp.array:
+    """Eddies of the size of the box, at the speed of air on a lattice."""
+    at = 2 * np.pi * (np.arange(n) + 0.5) / n
+    x, y, _ = np.meshgrid(at, at, at, indexing="ij")
+    u = _SPEED * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0.5 * np.sin(x + y)], -1)
+    return wp.array(u.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
+
+
+def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
+    """A step that writes to a second field: replayed, it does the same again."""
+
+    def step() -> None:
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
+        if scheme == "maccormack":
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS)
+
+    return bench.replay(step)
+
+
+def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
+    """Smoke in a cube in the box's corner that is a share of the box."""
+    edge = _RATIO * bench.sizes.coarse
+    density = torch.zeros((edge,) * 3, device=bench.device)
+    full = round(fill ** (1 / 3) * edge)
+    density[:full, :full, :full] = 0.5
+    return [_fields(density, "float32", bench.device) for _ in range(3 if scheme == "maccormack" else 2)]
+
+
+def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
+    """A step in bricks, their lists and the emptying of others; and the bricks."""
+    fields = _cubes(bench, fill, scheme)
+    rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
+    bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
+    edge = box.n[0]
+    at = torch.arange(edge**3, device=bench.device)
+    brick = torch.zeros(bricks.busy.shape[0], dtype=torch.int32, device=bench.device)
+    x, y, z = at // edge**2, at // edge % edge, at % edge
+    size = advection_places.BRICK
+    index = (x // size * box.bricks[1] + y // size) * box.bricks[2] + z // size
+    brick[index[wp.to_torch(fields[0].density) > 0]] = 1
+    busy = to_warp(brick)
+
+    def step() -> None:
+        wp.copy(bricks.busy, busy)
+        advection_places.relist(box, bricks)
+        for field in fields:
+            advection_sources.empty_retired(box, bricks, field)
+        advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
+        if scheme == "maccormack":
+            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
+
+    return bench.replay(step), bricks
+
+
+def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
+    """Turns a smooth ball once about the box's axis, after which it should be where it was.
+
+    Returns:
+        `rms`, over the ball's own RMS; `max_error`, where the ball's greatest density is 1; `smoke_gained`.
+    """
+    n, device = bench.sizes.coarse, bench.device
+    edge, box = _RATIO * n, _box(n)
+    steps = _TURN * edge
+    at = np.arange(n) + 0.5 - 0.5 * n
+    x, y, z = np.meshgrid(at, at, at, indexing="ij")
+    u = 2 * np.pi / steps * np.stack([-y, x, np.zeros_like(z)], -1)
+    velocity = wp.array(u.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
+    places = (torch.arange(edge, device=device) + 0.5) / edge
+    centre, radius = _BALL
+    x, y, z = torch.meshgrid(places - centre, places - 0.5, places - 0.5, indexing="ij")
+    distance = (x * x + y * y + z * z).sqrt() / radius
+    ball = torch.where(distance < 1.0, 0.5 + 0.5 * torch.cos(math.pi * distance), 0.0)
+    fields = [_fields(ball, storage, device) for _ in range(3)]
+    nothing = wp.empty(0, dtype=wp.uint8, device=device)
+    with stream(device):
+        for _ in range(steps):
+            advection.advect(box, velocity, nothing, fields[0], fields[1], 1.0)
+            if scheme == "maccormack":
+                advection.correct(box, velocity, nothing, *fields, 1.0)
+                fields[1], fields[2] = fields[2], fields[1]
+            fields[0], fields[1] = fields[1], fields[0]
+        error = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()
+        total = ball.double()
+        return {
+            "rms": float(error.square().mean().sqrt() / total.square().mean().sqrt()),
+            "max_error": float(error.abs().max()),
+            "smoke_gained": float(error.sum() / total.sum()),
+        }
+
+
+def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
+    """A billowing column: octaves of noise, cut off. The random numbers are the CPU's, so that all devices agree.
+
+    Args:
+        n: Voxels along an edge.
+        device: Where it is made.
+        seed: Of the noise.
+
+    Returns:
+        float32 [n, n, n], in [0, 1].
+    """
+    random = np.random.default_rng(seed)
+    noise = torch.zeros((1, 1, n, n, n), device=device)
+    for octave in _OCTAVES:
+        k = min(2**octave + 1, n)
+        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32)).to(device)
+        noise += _GAIN**octave * interpolate(coarse, (n, n, n), mode="trilinear", align_corners=True)
+    at = torch.linspace(-1.0, 1.0, n, device=device)
+    x, y, z = torch.meshgrid(at, at, at, indexing="ij")
+    radius = ((x - 0.2 * y) ** 2 + z**2).sqrt() / (0.35 + 0.125 * (y + 1.0))
+    return ((1.5 * noise[0, 0] + 0.9 - radius).clamp(0.0, 1.0) * (y.abs() < 0.95)).contiguous()
+
+
+def guide_rows(bench: SmokeBench) -> list[Row]:
+    """Guiding maps by their step, with marches to the lights shared or each pixel's own, against a fine march."""
+    bench.note("guide")
+    sizes = bench.sizes
+    volumes, camera = _cloud(bench)
+    fine = guide(volumes["float32"], camera, March(sizes.exact, jitter=0.0, cutoff=0.0), shared=False)
+    cases = {("shared", step, "float32"): volumes["float32"] for step in sizes.guide_shared}
+    cases |= {("alone", step, "float32"): volumes["float32"] for step in sizes.guide_alone}
+    cases |= {("shared", step, "float16"): volumes["float16"] for step in _HALF_GUIDE}
+    calls = {
+        (way, step, storage): partial(guide, volume, camera, March(float(step), jitter=_JITTER), shared=way == "shared")
+        for (way, step, storage), volume in cases.items()
+    }
+    # Calls of seconds get fewer samples than those of milliseconds.
+    long = {key: call for key, call in calls.items() if key[0] == "alone" and key[1] < 5}
+    short = {key: call for key, call in calls.items() if key not in long}
+    times = bench.time(short) | bench.time(long, few=True)
+    # Python takes longer to launch it than it takes itself: in a frame that is one graph, this is its time.
+    cuda = bench.device != "cpu"
+    replays = bench.time({key: bench.replay(call) for key, call in short.items()}) if cuda else {}
+    rows = []
+    for key, volume in cases.items():
+        way, step, storage = key
+        shared = way == "shared"
+        jittered = guide(volume, camera, March(float(step), jitter=_JITTER), shared=shared)
+        still = guide(volume, camera, March(float(step), jitter=0.0), shared=shared)
+        option = f"h {step:g}" + (", each pixel alone" if way == "alone" else "")
+        option += ", float16" if storage == "float16" else ""
+        row = bench.row(
+            "guide",
+            option,
+            scene=_CLOUD,
+            timing=times[key],
+            replay_ms=replays[key].median_ms if key in replays else None,
+            psnr=_psnr(jittered, fine),
+            light_rms=_relative(jittered.light, fine.light),
+            still_light_rms=_relative(still.light, fine.light),
+            transparency_rms=_rms(jittered.transparency - fine.transparency),
+            max_error=float((jittered.light - fine.light).abs().max()),
+            voxels=sizes.cloud,
+            pixels=sizes.resolution,
+        )
+        rows.append(row)
+    return rows
+
+
+def six_rows(bench: SmokeBench) -> list[Row]:
+    """The fine march of six-way lightmaps by its step, with its own estimate of its error."""
+    bench.note("six ways")
+    sizes = bench.sizes
+    volumes, camera = _cloud(bench)
+    cases = {f"step {step:g}": (volumes["float32"], step) for step in sizes.six}
+    cases[f"step {_HALF_SIX:g}, float16"] = (volumes["float16"], _HALF_SIX)
+    calls = {name: partial(bake, volume, camera, step=step, estimate=False) for name, (volume, step) in cases.items()}
+    times = bench.time(calls, few=True)
+    finest = bake(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
+    rows = []
+    for name, (volume, step) in cases.items():
+        six = bake(volume, camera, step=step)
+        is_finest = step == sizes.six[-1]
+        row = bench.row(
+            "six ways",
+            name,
+            "the finest" if is_finest else "",
+            scene=_CLOUD,
+            timing=times[name],
+            halving_rms=six.error.rms,
+            finest_rms=None if is_finest else _relative(six.lightmaps, finest),
+            max_error=six.error.largest,
+            voxels=sizes.cloud,
+            pixels=sizes.resolution,
+        )
+        rows.append(row)
+    return rows
+
+
+def weight_rows(bench: SmokeBench) -> list[Row]:
+    """Rules that weight six lightmaps, against a march to each of some oblique lights, on the demo's plume."""
+    bench.note("weights")
+    volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
+    size = volume.voxel * np.array(volume.shape)
+    camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
+    six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
+    six = SixWay(six.lightmaps, None, camera=camera)
+    lights = [tuple(map(float, toward)) for toward in _directions(_LIGHTS)]
+    exact = [lit(volume, camera, toward, step=_WEIGHT_STEP) for toward in lights]
+    rows = []
+    for rule in RULES:
+        weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
+        pairs = list(zip(weighted, exact, strict=True))
+        bias = [float(w.double().mean() / e.double().mean()) - 1.0 for w, e in pairs]
+        row = bench.row(
+            "weights",
+            rule,
+            scene="plume",
+            bias=float(np.mean(bias)),
+            bias_min=min(bias),
+            bias_max=max(bias),
+            rms=_relative(torch.stack(weighted), torch.stack(exact)),
+            worst_rms=max(_relative(w, e) for w, e in pairs),
+            max_error=max(float((w - e).abs().max()) for w, e in pairs),
+            lights=_LIGHTS,
+        )
+        rows.append(row)
+    return rows
+
+
+def frame_rows(bench: SmokeBench) -> list[Row]:
+    """A frame of a scene by stages: the air alone, the whole simulation, the guiding map, shadows and shading; all that
+    `wlm smoke run` does after the simulation; light of a point in the smoke, of fire, and of paths."""
+    sizes, device = bench.sizes, bench.device
+    scene = load_scene("jet-sphere").scaled(sizes.scale)
+    scene = scene.model_copy(
+        update={"camera": scene.camera.model_copy(update={"resolution": sizes.resolution}), "frames": sizes.frames + 1}
+    )
+    bench.note(f"frame: {sizes.frames} frames before it")
+    steps = scene.steps // scene.smoke.substeps
+    in_bricks = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"bricks": True})})
+    dense, bricked, air = (make_solver(settings, device=device) for settings in (scene, in_bricks, scene))
+    air.step(1)
+    for solver in (dense, bricked):
+        solver.step(steps * sizes.frames)
+        solver.check()
+    volume, camera = volume_of(scene, dense), make_camera(scene.camera, scene.grid.origin, scene.grid.size)
+    # The smoke that the frame shows stays as it is while the simulation goes on.
+    volume = DensityVolume(volume.density.clone(), volume.extinction, volume.voxel, volume.origin)
+    bench.note("frame: its stages")
+    surface = guide(volume, camera)
+    six = bake(volume, camera, estimate=False)
+    lights = [settings.light() for settings in scene.lights]
+    corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
+    corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
+
+    def shadows() -> list[Light]:
+        return [
+            Light(
+                light.toward,
+                light.irradiance,
+                obstacle_visibility(surface.depth, camera, light.toward, corners, triangles),
+            )
+            for light in lights
+        ]
+
+    shadowed = shadows()
+
+    def shading() -> torch.Tensor:
+        return six.shade(shadowed, background=scene.background)
+
+    calls = {
+        "air alone": lambda: [air.lattice.step(scene.smoke.substeps) for _ in range(steps)],
+        "simulation": lambda: dense.step(steps),
+        "simulation, smoke in bricks": lambda: bricked.step(steps),
+        "guide": lambda: guide(volume, camera),
+        "obstacles' shadows": shadows,
+        "weights and background": shading,
+    }
+    times = bench.time(calls, few=device == "cpu")
+    march = partial(bake, volume, camera, step=_HALF_SIX, estimate=False)
+    times |= bench.time({"six ways by march": march}, few=True)
+    drawn = _drawn(scene, volume, camera, scene.time(sizes.frames), device)
+    times |= bench.time({name: bench.replay(call) for name, call in drawn.items()}, few=device == "cpu")
+    paths = _FEW_PATHS if device == "cpu" else _PATHS
+    times |= bench.time(_traced(volume, camera, paths), few=True)
+    air_cells, voxels = ("x".join(map(str, shape)) for shape in (scene.grid.cells, scene.grid.shape))
+    pixels = f"{camera.width}x{camera.height}"
+    of = {
+        "air alone": f"{air_cells}, {scene.steps} steps",
+        "simulation": f"{voxels}, {steps} steps of smoke",
+        "simulation, smoke in bricks": f"{100 * bricked.active_cells / np.prod(bricked.shape):.3g}% of {voxels}",
+        "guide": f"{pixels}, h 10",
+        "obstacles' shadows": f"{len(lights)} lights",
+        "weights and background": pixels,
+        "six ways by march": f"{pixels}, step {_HALF_SIX:g}",
+        **dict.fromkeys(drawn, f"{pixels}, a graph on a GPU"),
+        **dict.fromkeys(_traced(volume, camera, paths), f"{pixels}, {paths} samples"),
+    }
+    rows = [bench.row("frame", name, of[name], scene="jet-sphere", timing=timing) for name, timing in times.items()]
+    parts = ("simulation", "guide", "obstacles' shadows", "weights and background")
+    total = sum(times[name].median_ms for name in parts)
+    figures = {"time_ms": total, "frame_rate": 1e3 / total}
+    notes = "simulation, guide, shadows, weights"
+    return [*rows, bench.row("frame", "all but the network", notes, scene="jet-sphere", **figures)]
+
+
+def _drawn(
+    scene: Scene, volume: DensityVolume, camera: Camera, time: float, device: str
+) -> dict[str, Callable[[], object]]:
+    """What lights a frame, by its name: pictures with shadows and obstacles, and light that is found by diffusion."""
+    lights = [settings.light() for settings in scene.lights]
+    parts = {"background": scene.background, "obstacles": scene.obstacles}
+    drawing = Drawing(camera, lights, albedo=scene.smoke.albedo, **parts, device=device)
+    drawing.move(time)
+    lamp = PointLight(tuple(map(float, volume.centre)))
+    hot = replace(volume, temperature=volume.density, emission=1.0)
+    six, every = SixWays(), AllOrders(scene.smoke.albedo)
+    return {
+        "six ways, drawn": lambda: drawing(six(volume, camera, lights)),
+        "all orders, drawn": lambda: drawing(every(volume, camera, lights)),
+        "all orders, no obstacle": lambda: every(volume, camera, lights).shade(background=scene.background),
+        "all orders of a point light": lambda: scatter(volume, camera, [lamp], scene.smoke.albedo),
+        "all orders of fire": lambda: scatter(hot, camera, [], scene.smoke.albedo),
+    }
+
+
+def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Callable[[], object]]:
+    """Six planes by path tracing, under lights along the camera's axes."""
+    six = [Light(tuple(map(float, sign * axis)), (4 * math.pi,) * 3) for axis in camera.axes for sign in (1.0, -1.0)]
+    settings = {"samples": paths, "orders": 0}
+    return {
+        "six planes by paths, one order": lambda: trace(volume, camera, six, highest=1, **settings),
+        "six planes by paths, all orders": lambda: trace(volume, camera, six, **settings),
+    }
+
+
+def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
+    """The cloud in both storages, and a camera that looks down on it from aside."""
+    n, pixels = bench.sizes.cloud, bench.sizes.resolution
+    density = make_cloud(n, bench.device)
+    volumes = {
+        name: DensityVolume(density.to(kind), extinction=_DEPTH / n)
+        for name, kind in (("float32", torch.float32), ("float16", torch.float16))
+    }
+    centre = volumes["float32"].centre
+    eye = centre + n * np.array([1.6, 0.9, 2.2])
+    return volumes, Camera.look_at(eye, centre, extent=1.15 * n, height=pixels, width=pixels)
+
+
+def _directions(count: int) -> np.ndarray:
+    """Directions spread evenly on a sphere, none along an axis: the points of Fibonacci's spiral, [count, 3]."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), height, across * np.sin(turn)], -1)
+
+
+def _rms(values: torch.Tensor) -> float:
+    return float(values.double().square().mean().sqrt())
+
+
+def _relative(values: torch.Tensor, exact: torch.Tensor) -> float:
+    """The RMS difference over the RMS of the exact values."""
+    return _rms(values.double() - exact.double()) / _rms(exact)
+
+
+def _psnr(coarse: Guide, fine: Guide) -> float:
+    """Of the light, whose greatest value is the peak."""
+    return psnr_from_mse(_rms(coarse.light - fine.light) ** 2, float(fine.light.max()))
+
 
 # The lattice comes first: it measures the copy that others are compared with.
 _PARTS: tuple[Callable[[SmokeBench], list[Row]], ...] = (

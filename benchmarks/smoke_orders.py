@@ -1,33 +1,41 @@
-"""Light of all orders in smoke, scored by the picture: each way to it against path tracing, with its whole time.
+"""Light of all orders in smoke: each method and its rivals against path tracing, with the time of a whole picture.
 
 The scenes, one at each albedo:
 
-- "plumes": unseen plumes and clouds from any side, each under three directional lights of random colours.
-- "jet": a jet past a sphere that was simulated, from some sides, two frames of each for the flicker.
+- "plumes": unseen plumes and clouds from random sides, each under three directional lights of random colours.
+- "jet": a simulated jet past a sphere from some sides, two frames of each for the flicker.
 
-The methods, each a row; a picture's PSNR and FLIP are in sRGB, against path tracing with many samples:
+The options of method "all orders"; PSNR and FLIP of a picture are in sRGB, against path tracing with many samples:
 
 - "single scattering", and "single x gain", a factor on it;
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
-- "fitted filter", a linear one of planes blurred at four scales;
+- "fitted filter", a linear filter of planes blurred at four scales;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
-- "diffusion" on a grid of 32^3 beside single scattering, which is a part of
-- "learned mix", what `wlm.smoke.transport.scatter` does.
+- "diffusion" on a grid of 32^3 and single scattering, which are the inputs of
+- "learned mix", the result of `wlm.smoke.transport.scatter`.
 
-The gain and the weights of the fitted octaves and filter are those nearest to the very references that they are scored
-by: other smoke would give no better ones. A reference is the mean of two traced apart: "path tracing" is its own noise,
-which their difference tells. Flicker is the RMS change of a picture from one frame to the next where smoke is visible,
-after the earlier one is warped by the smoke's motion, and its ratio to the references', of whose two the noise cancels.
+The gain and the weights of the fitted octaves and of the fitted filter are fitted to the references of the score
+itself: weights fitted to other smoke could not score higher. A reference is the mean of two pictures that are traced
+independently: "path tracing" is its noise, estimated from their difference. Flicker is the RMS change of a picture from
+one frame to the next where smoke is visible, after the earlier frame is warped by the motion of the smoke, and its
+ratio to the change of the references, whose noise cancels in the product of the two.
 
-Rows of what the mix adds to diffusion, light by light on grids of every size, are those of `smoke_grids`; of other
-phase functions, point lights in the smoke and fire those of `smoke_other_light`.
+Method "gain by grid" has one row for each grid: plumes and clouds that the mix was not trained on, with extinctions
+inside and outside the range of the training, under single lights, from random sides. The gain is the PSNR of the mix
+minus the PSNR of single scattering and diffusion, its input, for one light at one albedo.
 
-A time is of a whole picture, from the smoke to the shaded image: on CUDA one graph, but for the path tracer and the
-denoiser, which are calls.
+Methods "phase functions" and "light in smoke" measure cases that the mix was not trained on: several mean cosines g of
+the Henyey-Greenstein phase function; and a point light in the middle or at a random point of a plume and of a cloud,
+and a burning plume without another light. The PSNR of "light in smoke" is of pictures scaled to their maximum, and the
+bias is that of all light that reaches the camera. A gain is the PSNR minus that of single scattering; of fire, minus
+that of its emission.
+
+A time is that of a whole picture, from the smoke to the shaded image: on CUDA one graph, except for the path tracer and
+the denoiser, which are calls.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,10 +46,10 @@ from benchmarks.path_tracer import denoised_picture, denoiser_device, has_denois
 from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octaves, three_octaves
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
-from benchmarks.smoke_grids import GridSizes, grid_rows
-from benchmarks.smoke_other_light import other_rows
+from benchmarks.smoke import make_cloud
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
+from wlm.interop import stream
 from wlm.metrics.flip import flip_display
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.march.motion import motion
@@ -50,13 +58,15 @@ from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import advance, make_solver, volume_of
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.learning import FAINT, draw_view, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.orders import orders_march, scatter
+from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 
-METHOD = "all orders"
-"""The table of these rows."""
+METHOD, GRIDS, PHASES, INSIDE = "all orders", "gain by grid", "phase functions", "light in smoke"
+"""The tables of the rows."""
 
 ALBEDOS = (0.9, 1.0)
 
@@ -71,6 +81,29 @@ _VISIBLE = 0.05  # opacity
 _OF_MEAN = 20.0 * math.log10(2.0)  # dB, by which the mean of two has less noise than their difference
 _TRACED, _DENOISED, _GAIN = "path tracing", "1 sample, denoised", "single x gain"
 _OCTAVES, _FILTER = "fitted octaves", "fitted filter"
+_PLUMES, _CLOUDS = (11, 12), (0, 5)  # seeds of the smoke of "gain by grid"
+_DRAWN = 128  # largest edge in voxels at which a plume is drawn before it is resampled
+_G = (-0.3, 0.3, 0.6, 0.8)  # mean cosines of the phase functions
+_VIEWS, _PIXELS, _SAMPLES, _CELLS = 6, 32, 512, 64  # of "phase functions" and "light in smoke"
+_EXTINCTIONS = (8.0, 30.0)
+_BURNING, _GLOW = 20.0, 10.0  # extinction and emission of the fire
+
+
+@dataclass(frozen=True)
+class GridSizes:
+    """Grids, pictures and samples.
+
+    Attributes:
+        grids: Voxels along an edge.
+        extinctions: Of density 1, over the box's edge.
+        pixels: H and W.
+        samples: Paths a pixel of a reference.
+    """
+
+    grids: tuple[int, ...]
+    extinctions: tuple[float, ...]
+    pixels: int
+    samples: int
 
 
 @dataclass(frozen=True)
@@ -86,8 +119,8 @@ class OrdersSizes:
         scale, frames: Of the scene `jet-sphere`: cells as a multiple of its own, and frames before the first seen.
         sides: From which it is seen.
         repeats: Samples of a time.
-        single: Of the rows of `smoke_grids`.
-        other: Arguments of `smoke_other_light.other_rows`, by name.
+        single: Sizes of `grid_rows`.
+        other: Arguments of `other_rows`, by name.
     """
 
     plumes: int
@@ -377,3 +410,114 @@ def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
         shots.append(Shot(volumes[0], camera, lights, 100 + 2 * side))
         shots.append(Shot(volumes[1], camera, lights, 101 + 2 * side, moved))
     return shots
+
+
+def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) -> list[Row]:
+    """The rows.
+
+    Args:
+        bench: The benchmark.
+        sizes: What is measured.
+        model: None: the one that comes with wlm.
+    """
+    model = (load_orders() if model is None else model).to(bench.device)
+    rows = []
+    for cells in sizes.grids:
+        bench.note(f"grid of {cells}^3")
+        diffused, mixed = (np.array(part) for part in zip(*_scores(bench.device, sizes, cells, model), strict=True))
+        gains = mixed - diffused
+        figures = {"psnr": mixed.mean(), "psnr_min": mixed.min(), "gain": gains.mean(), "gain_min": gains.min()}
+        note = f"{len(gains)} lights, gains within {np.quantile(gains, 0.05):+.3f} and {gains.max():+.3f} dB"
+        settings = {"voxels": cells, "pixels": sizes.pixels, "samples": sizes.samples}
+        rows.append(bench.row(GRIDS, f"{cells} voxels", note, scene="single lights", **figures, **settings))
+    return rows
+
+
+def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> Iterator[tuple[float, float]]:
+    """Of each light at each albedo the PSNR of diffusion and of the mix."""
+    for number, (density, extinction) in enumerate(_smoke(device, sizes, cells)):
+        random = np.random.default_rng([cells, number])
+        volume = DensityVolume(density, extinction, 1.0 / cells)
+        camera = Camera.around(volume, toward=random.normal(size=3), pixels=sizes.pixels)
+        lights = [Light(tuple(map(float, random.normal(size=3)))) for _ in range(_LIGHTS)]
+        traced = trace(volume, camera, lights, samples=sizes.samples, orders=_KEPT, seed=number)
+        with stream(device):
+            _, inputs = make_inputs(volume, camera, lights, ALBEDOS, orders_march(volume))
+            for albedo in ALBEDOS:
+                diffused = inputs.by_diffusion(albedo)
+                mixed = model.light(inputs.at(albedo), (albedo,) * 3)[..., 0]
+                truth = (traced if albedo == 1.0 else traced.with_albedo((albedo,) * 3)).planes.sum(1)[..., 0]
+                for one, other, wanted in zip(diffused, mixed, truth, strict=True):
+                    yield psnr(one, wanted), psnr(other, wanted)
+
+
+def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Tensor, float]]:
+    """Densities [X, Y, Z] and extinctions."""
+    for seed in _PLUMES:
+        drawn = make_plume(min(cells, _DRAWN), seed=seed, hot=False).density.to(device)
+        size = (cells,) * 3
+        density = torch.nn.functional.interpolate(drawn[None, None], size, mode="trilinear")[0, 0].contiguous()
+        yield from ((density, extinction) for extinction in sizes.extinctions)
+    for seed in _CLOUDS:
+        density = make_cloud(cells, device, seed)
+        yield from ((density, extinction) for extinction in sizes.extinctions)
+
+
+def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, cells: int = _CELLS) -> list[Row]:
+    """The rows.
+
+    Args:
+        bench: The benchmark.
+        views: Of each phase function.
+        samples: Paths a pixel of a reference.
+        cells: Voxels along an edge of smoke with light in it.
+    """
+    rows = []
+    settings = {"pixels": _PIXELS, "samples": samples}
+    for g in _G:
+        bench.note(f"phase function of g {g:g}")
+        for albedo in ALBEDOS:
+            values, once = np.array([_phase(bench.device, n, g, albedo, samples) for n in range(views)]).T
+            figures = {"psnr": values.mean(), "psnr_min": values.min(), "gain": (values - once).mean()}
+            option = f"g {g:g}, albedo {albedo:g}"
+            rows.append(bench.row(PHASES, option, f"{views} pictures", scene="plumes", **figures, **settings))
+    bench.note(INSIDE)
+    for option, wanted, found, once in _inside(bench.device, samples, cells):
+        scale = 1.0 / float(wanted.max())
+        value, plain = (psnr(scale * picture, scale * wanted) for picture in (found, once))
+        figures = {"psnr": value, "gain": value - plain, "bias": float(found.sum() / wanted.sum()) - 1.0}
+        rows.append(bench.row(INSIDE, option, scene="plume and cloud", **figures, voxels=cells, **settings))
+    return rows
+
+
+def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> tuple[float, float]:
+    """PSNR of a picture of a plume under three lights, and of single scattering's."""
+    volume, camera, ways = draw_view(_SEED, number, pixels=_PIXELS, lights=3)
+    volume = replace(volume, density=volume.density.to(device))
+    lights = [Light(way.toward, (_FOUR_PI / 3,) * 3) for way in ways]
+    grey = (albedo,) * 3
+    wanted = trace(volume, camera, lights, albedo=grey, g=g, samples=samples, orders=0, seed=number).total
+    made = scatter(volume, camera, lights, grey, march=orders_march(volume, g))
+    return psnr(made.shade(), wanted), psnr(made.lit.shade(albedo=grey), wanted)
+
+
+def _inside(device: str, samples: int, cells: int) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """What is lit, traced, found, and found of light scattered once, [H, W]."""
+    random = np.random.default_rng(_SEED)
+    plume = make_plume(cells, seed=11, hot=False).density.to(device)
+    for name, density in (("plume", plume), ("cloud", make_cloud(cells, device))):
+        smoky = (np.argwhere(density.cpu().numpy() > 0.3) + 0.5) / cells
+        for extinction in _EXTINCTIONS:
+            volume = DensityVolume(density, extinction, 1.0 / cells)
+            camera = Camera.around(volume, toward=random.normal(size=3), pixels=_PIXELS)
+            for where, place in (("the middle", smoky.mean(0)), ("random", smoky[random.integers(len(smoky))])):
+                lamp = PointLight(tuple(map(float, place)), (_FOUR_PI,) * 3, radius=0.05)
+                wanted = trace(volume, camera, [lamp], samples=samples, orders=0).total[..., 0]
+                made = scatter(volume, camera, [lamp])
+                option = f"{name} of extinction {extinction:g}, light at {where}"
+                yield option, wanted, made.shade()[..., 0], made.lit.shade()[..., 0]
+    fire = replace(make_plume(cells, seed=4, hot=True, extinction=_BURNING, device=device), emission=_GLOW)
+    camera = Camera.around(fire, toward=(0.3, 0.2, 1.0), pixels=_PIXELS)
+    wanted = trace(fire, camera, [], albedo=(0.9,) * 3, samples=samples, orders=0).total[..., 0]
+    made = scatter(fire, camera, [], (0.9,) * 3)
+    yield f"fire of extinction {_BURNING:g}", wanted, made.shade()[..., 0], made.lit.emission

@@ -13,6 +13,7 @@ lightmaps of 512² at a share of 0.17, 1.5 dB above Lanczos and 2.0 dB above a b
 """
 
 import functools
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,9 +21,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.rivals.atlas_carving import carving
-from benchmarks.rivals.atlas_colours import single_colour
-from benchmarks.rivals.atlas_share import budget_bits, read_blocks
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
@@ -133,7 +131,9 @@ def best_astc(scene: LightmappedScene, share: float) -> Rival:
 def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int) -> tuple[tuple[int, int], int]:
     """Finds a large size of the lightmap's shape, up to its own, of which charts read few enough blocks (width,
     height); and the number of these blocks."""
-    most = budget_bits(sheet, share) // bits
+    if not 0.0 < share < math.inf:
+        raise ValueError(f"share: expected above 0, got {share}")
+    most = int(share * sheet.mask.size * SOURCE_BITS) // bits
     longest = max(sheet.mask.shape)
 
     def size(side: int) -> tuple[int, int]:
@@ -154,9 +154,16 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
 
 
 def _read_blocks(sheet: Sheet, size: tuple[int, int], block: tuple[int, int]) -> int:
-    """Counts the blocks (width, height) of a texture of a size that are read at the centres of the charts' texels."""
-    place = np.argwhere(sheet.mask) + 0.5
-    return read_blocks(place * (np.array(size) / sheet.mask.shape) - 0.5, size, block)
+    """Counts the blocks (width, height) of a texture that bilinear reads at the centres of the charts' texels touch."""
+    place = (np.argwhere(sheet.mask) + 0.5) * (np.array(size) / sheet.mask.shape) - 0.5
+    low = np.floor(place).astype(np.int64)
+    # A read at a texel's centre touches only this texel.
+    last, side = np.minimum(low + (place > low), np.array(size) - 1), np.array(block[::-1])
+    read = np.zeros([-(-count // each) for count, each in zip(size, side, strict=True)], bool)
+    for y in (low[:, 0], last[:, 0]):
+        for x in (low[:, 1], last[:, 1]):
+            read[np.maximum(y, 0) // side[0], np.maximum(x, 0) // side[1]] = True
+    return int(np.count_nonzero(read))
 
 
 def _texture(name: str, texels: np.ndarray, bytes: int, start: float) -> Rival:
@@ -177,9 +184,5 @@ RIVALS: dict[str, Callable[[LightmappedScene, float], Rival]] = {
         for name in ("bc6h", "bc6h own", "astc4x4", "astc6x6", "astc8x8")
     },
     "astc": best_astc,
-    "carving": carving,
 }
 """Rivals by name: functions of a scene and a share."""
-
-OWN_SIZE: dict[str, Callable[[LightmappedScene], Rival]] = {"single colour": single_colour}
-"""Rivals without a budget by name: functions of a scene."""

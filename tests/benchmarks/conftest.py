@@ -1,4 +1,4 @@
-"""Measurements of whole systems belong to the long run."""
+"""Marks the tests that measure a whole system as slow."""
 
 from pathlib import Path
 
@@ -8,9 +8,9 @@ from benchmarks import Row
 
 HERE = Path(__file__).parent
 MEASURED = {"rows", "made"}
-"""Fixtures that run a whole benchmark, in up to a minute."""
-QUICK = ("test_bench_atlas", "test_bench_atlas_scene")
-"""Modules whose benchmarks take seconds; they stay in the quick run."""
+"""Fixtures that run a whole benchmark, which takes up to a minute."""
+QUICK = ("test_bench_atlas_scene",)
+"""Modules whose benchmarks take seconds; their tests stay in the quick run."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks

@@ -1,17 +1,117 @@
-"""`python -m benchmarks`: reports as pages, and checks of outputs before the work."""
+"""`python -m benchmarks`: the options of every measuring command reach its `run`, and errors are one line."""
 
 import json
+from pathlib import Path
 
+import pytest
+from builders.bench_rows import check_command
 from typer.testing import CliRunner
 
-from benchmarks import Row, describe_environment, write_json
-from benchmarks.app import app
+from benchmarks import Row, describe_environment, read_json, write_json
+from benchmarks.app import _COMMANDS, app
+
+# The words of a command; the command that the result file states, where it differs; and some arguments of `run`.
+COMMANDS = [
+    (["lightmap", "--set", "a/city"], "lightmap --device cpu --set city", {"set_path": Path("a/city"), "quick": False}),
+    (
+        ["lightmap", "--quick", "--profile", "M", "--profile", "a/b.yaml", "--no-rivals"],
+        "lightmap --quick --profile M --profile b.yaml --no-rivals --device cpu",
+        {"profiles": ["M", "a/b.yaml"], "rivals": False, "rivals_only": False, "rival_names": None},
+    ),
+    (["lightmap", "--rivals-only"], "lightmap --rivals-only --device cpu", {"rivals_only": True, "rivals": True}),
+    (["lightmap", "--rival", "bc7"], "lightmap --rival bc7 --device cpu", {"rival_names": ["bc7"]}),
+    (
+        ["lightmap-ablation", "--quick", "--set", "city", "--steps", "20", "--only", "3D alone"],
+        "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'",
+        {"only": ["3D alone"], "steps": 20},
+    ),
+    (
+        ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
+        "probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon",
+        {"keys": ["sh", "sh_noon"], "rivals": False, "quick": False, "volume_only": False},
+    ),
+    (["probe", "--volume-only"], "probe --volume-only --device cpu", {"volume_only": True}),
+    (
+        ["atlas", "--quick", "--meshes", "a/Cube", "--profile", "bc6h"],
+        "atlas --quick --device cpu --meshes Cube --profile bc6h",
+        {"meshes_path": Path("a/Cube"), "profiles": ["bc6h"], "rivals": True, "rivals_at": None},
+    ),
+    (
+        ["atlas-scene", "--set", "town", "--hour", "6", "--side", "48", "--quick", "--budget", "0.1", "--no-parts"],
+        "atlas-scene --set town --hour 6.0 --side 48 --budget 0.1 --no-parts --quick --device cpu",
+        {"scene_path": Path("town"), "hours": [6.0], "side": 48, "budget": 0.1, "parts": False},
+    ),
+    (
+        ["atlas-ablation", "--quick", "--profile", "cascade", "--only", "ASTC", "--steps", "9"],
+        "atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC",
+        {"profile": "cascade", "only": ["ASTC"], "steps": 9},
+    ),
+    (["smoke", "--quick"], "smoke --quick --device cpu", {"quick": True}),
+    (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
+    (
+        ["smoke-network", "--network", "a/young.safetensors", "--profile", "paper"],
+        "smoke-network --device cpu --network young.safetensors --profile paper",
+        {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
+    ),
+]
 
 
 def call(*words, code=0) -> str:
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == code, result.output
     return result.output
+
+
+@pytest.mark.parametrize(("words", "command", "arguments"), COMMANDS, ids=lambda value: " ".join(value)[:40])
+def test_options_reach_the_run_and_the_result_file(words, command, arguments, given_rows, tmp_path, monkeypatch):
+    stated, options = check_command(monkeypatch, given_rows, words, tmp_path)
+    assert stated == f"python -m benchmarks {command}"
+    assert options["device"] == "cpu" and arguments.items() <= options.items()
+
+
+def test_every_command_is_tested():
+    assert {words[0] for words, *_ in COMMANDS} == _COMMANDS.keys()
+
+
+def test_some_rows_replace_those_alone(given_rows, tmp_path, monkeypatch):
+    path, other = tmp_path / "rows.json", Row("lightmap", "three", "BC7", "", {"psnr": 30.0})
+    write_json(path, [*given_rows, other], {})
+    monkeypatch.setattr("benchmarks.lightmap.run", lambda **options: [other.with_figures(psnr=1.0)])
+    call("lightmap", "--rival", "bc7", "--json", path)
+    assert read_json(path)[0] == [*given_rows, other.with_figures(psnr=1.0)]
+    call("lightmap", "--json", path)
+    assert read_json(path)[0] == [other.with_figures(psnr=1.0)]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["lightmap", "--rivals-only", "--no-rivals"], "--rivals-only: expected without --no-rivals and --profile"),
+        (["lightmap", "--rival", "jpeg"], "unknown method 'jpeg'"),
+        (["lightmap", "--set", "absent"], "no such file or folder"),
+        (["lightmap", "--device", "tpu"], "device 'tpu'"),
+        (["lightmap-ablation", "--only", "4D", "--set", "absent"], "--only: expected one of hybrid, 2D alone"),
+        (["lightmap-ablation", "--steps", "0"], "--steps"),
+        (["probe", "--volume-only", "--quick"], "--volume-only: expected without --quick"),
+        (["probe", "--rivals-at", "a.json", "--quick"], "--rivals-at: expected without --quick"),
+        (["probe", "--probes", "absent.npz"], "No such file"),
+        (["atlas", "--profile", "absent"], "profile"),
+        (["atlas", "--meshes", "absent"], "absent: no such folder"),
+        (["atlas", "--rivals-at", "a.json", "--no-rivals"], "--rivals-at: expected without --quick"),
+        (["atlas-scene"], "--set"),
+        (["atlas-ablation", "--profile", "standard"], "--profile: expected one of method cascade"),
+        (["atlas-ablation", "--only", "none", "--meshes", "absent"], "--only: expected one of whole"),
+        (["smoke", "--device", "tpu"], "device 'tpu'"),
+        (["smoke-network", "--profile", "nosuch"], "nosuch"),
+        (["report", "absent.json"], "absent.json"),
+        (["plot", "absent.json", "--system", "sound", "-o", "a.png"], "--system: expected lightmap"),
+    ],
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
+)
+def test_errors_are_one_line(words, line):
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2 and line in result.stderr
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") <= 1
 
 
 def test_report_makes_pages(tmp_path):
@@ -24,7 +124,6 @@ def test_report_makes_pages(tmp_path):
     assert "index/lightmap.md" in index.read_text(encoding="utf-8")
     assert "| 45.98 |" in (tmp_path / "index" / "lightmap.md").read_text(encoding="utf-8")
     assert "ends in" in call("report", file, "-o", tmp_path / "index.txt", code=2)
-    assert "absent.json" in call("report", tmp_path / "absent.json", code=2)
 
 
 def test_outputs_are_checked_before_the_work(tmp_path):

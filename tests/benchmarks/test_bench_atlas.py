@@ -1,17 +1,13 @@
 """The atlas benchmark on two small lightmaps: every row has its figures, and they agree with what they are of."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, constant, image, sheet, soft
-from builders.bench_rows import check_command, check_outputs, keys
+from builders.bench_rows import check_outputs, keys
 
 import benchmarks.atlas as bench
 from benchmarks import write_json
-from benchmarks.atlas import PANELS, plotted, run, run_rivals, run_rows
-from benchmarks.atlas_inputs import Lightmap, load
-from benchmarks.rivals.atlas import single_colour
+from benchmarks.atlas import PANELS, Lightmap, plotted, read_lightmaps, rival_rows, run_rows
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
@@ -26,18 +22,9 @@ PROFILES = [
     Profile(name="bc6h", colour="bc6h", budget=0.3, fallback=False, **FEW),
     Profile(name="paper", method="cascade", steps=6, resolution=32, fallback=False, colour_scale=0.6),
 ]
-RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC", "carving"]
-OWN = ("single colour", "its own size")
+RIVALS = ["downsampling", "downsampling bilinear", "BC6H", "BC6H, our encoder", "ASTC"]
 SMALLER = ["standard, CR 92.5%", "standard, CR 95%"]
 MEAN = "mean over 2 lightmaps"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_views():
-    """50 large views for single-colour merging show nothing here that two small ones don't."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(bench.OWN_SIZE, "single colour", partial(single_colour, views=2, resolution=64))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +44,7 @@ def test_every_row_has_its_figures(rows):
         measured = keys(row for row in rows if row.scene == scene)
         before = [*ours, *extra, ("lightmap", "half floats"), *((name, "bits of standard") for name in RIVALS)]
         assert measured[: len(before)] == before
-        assert measured[-1] == OWN
-        rest = measured[len(before) : -1]
+        rest = measured[len(before) :]
         for method in ("downsampling", "ASTC"):
             options = [option for name, option in rest if name == method]
             # One that has the whole lightmap in the bits of standard isn't measured in more.
@@ -71,7 +57,6 @@ def test_every_row_has_its_figures(rows):
         ("lightmap", "half floats"),
         *((name, "bits of standard") for name in RIVALS),
     ]
-    assert OWN in means
     for row in rows:
         assert row.system == "atlas" and "not measured" not in row.notes
         assert (row.method == "lightmap") == (row.get("psnr") is None)
@@ -86,7 +71,7 @@ def test_every_row_has_its_figures(rows):
 
 def test_rows_are_of_what_they_name(lightmaps, rows):
     """The same compression, scored apart from the others."""
-    mesh = lightmaps[0].mesh
+    mesh = lightmaps[0].lit
     model = compress(mesh, PROFILES[0])
     row = rows[0]
     assert row["bpp"] == pytest.approx(48 * (1 - model.compression_ratio))
@@ -142,7 +127,7 @@ def test_a_lightmap_of_one_colour_has_no_scores():
     profile = PROFILES[0].model_copy(update={"fallback": False})
     rows = run_rows([lightmap], [profile], device="cpu", views=2, resolution=32, whole=False, points=100, repeats=1)
     assert all("psnr" not in row.figures for row in rows)
-    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS, OWN[0]]
+    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS]
 
 
 def test_no_room_for_a_rival_or_a_table():
@@ -174,16 +159,16 @@ def test_folders(tmp_path):
     _files(tmp_path / "Cube", charts(), "day", "night", masked=True)
     _files(tmp_path / "Sheet", sheet(), "day")
     (tmp_path / "notes").mkdir()
-    assert [lightmap.scene for lightmap in load(tmp_path)] == ["Cube day", "Cube night", "Sheet day"]
-    assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube day", "Cube night"]
-    day, night = (lightmap.mesh.sheets[0] for lightmap in load(tmp_path / "Cube"))
+    assert [lightmap.scene for lightmap in read_lightmaps(tmp_path)] == ["Cube day", "Cube night", "Sheet day"]
+    assert [lightmap.scene for lightmap in read_lightmaps(tmp_path / "Cube")] == ["Cube day", "Cube night"]
+    day, night = (lightmap.lit.sheets[0] for lightmap in read_lightmaps(tmp_path / "Cube"))
     np.testing.assert_allclose(night.lightmap, 2 * day.lightmap, rtol=2e-3)
     np.testing.assert_array_equal(day.mask, charts().sheets[0].mask)
     mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "night.exr"
-    (named,) = load(None, mesh, [exr], tmp_path / "Cube" / "mask.png")
-    assert named.scene == "Cube night" and named.mesh.source == load(tmp_path / "Cube")[1].mesh.source
+    (named,) = read_lightmaps(None, mesh, [exr], tmp_path / "Cube" / "mask.png")
+    assert named.scene == "Cube night" and named.lit.source == read_lightmaps(tmp_path / "Cube")[1].lit.source
     exr.rename(exr.with_stem("Cube"))
-    assert [lightmap.scene for lightmap in load(tmp_path / "Cube")] == ["Cube", "Cube day"]
+    assert [lightmap.scene for lightmap in read_lightmaps(tmp_path / "Cube")] == ["Cube", "Cube day"]
 
 
 def test_what_is_refused(tmp_path, lightmaps):
@@ -197,28 +182,15 @@ def test_what_is_refused(tmp_path, lightmaps):
         ((None, tmp_path / "absent.glb", [exr]), "absent.glb"),
     ):
         with pytest.raises(WlmError, match=line):
-            load(*paths)
+            read_lightmaps(*paths)
     (tmp_path / "empty").mkdir()
     with pytest.raises(WlmError, match="expected a .glb and its .exr in it or in folders of it, found none"):
-        load(tmp_path / "empty")
+        read_lightmaps(tmp_path / "empty")
     (tmp_path / "Cube" / "second.glb").write_bytes(mesh.read_bytes())
     with pytest.raises(WlmError, match="Cube: expected one .glb a folder, found 2"):
-        load(tmp_path)
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        run(lightmaps, quick=True, device="tpu")
-    with pytest.raises(WlmError, match="profile"):
-        run(lightmaps, ["absent"], quick=True, device="cpu")
+        read_lightmaps(tmp_path)
     with pytest.raises(ValueError, match="at least one lightmap and one profile"):
         run_rows(lightmaps, [], device="cpu", views=1, resolution=32, whole=False)
-
-
-def test_the_command(rows, tmp_path, monkeypatch):
-    _files(tmp_path / "Cube", charts(), "day")
-    words = ["atlas", "--quick", "--meshes", tmp_path / "Cube", "--profile", "bc6h"]
-    command, (lightmaps, names), options = check_command(monkeypatch, bench, rows[:5], words, tmp_path)
-    assert command == "python -m benchmarks atlas --quick --device cpu --meshes Cube --profile bc6h"
-    assert [lightmap.scene for lightmap in lightmaps] == ["Cube day"] and names == ["bc6h"]
-    assert options["quick"] and options["device"] == "cpu" and options["rivals"]
 
 
 def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
@@ -226,13 +198,12 @@ def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "VIEWS", 3)
     monkeypatch.setattr(bench, "RESOLUTION", 64)
     write_json(tmp_path / "rows.json", rows, {})
-    alone = run_rivals(tmp_path / "rows.json", lightmaps[:1])
+    alone = rival_rows(tmp_path / "rows.json", lightmaps[:1])
     beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]
     beside = [row for row in beside if row.option in {f"bits of {option}" for option in ("standard", *SMALLER)}]
-    beside += [row for row in rows if row.scene == "sheet day" and row.method == OWN[0]]
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row[name] for row in alone] == [row[name] for row in beside]
     write_json(tmp_path / "few.json", [row for row in rows if row.scene == "cube night"], {})
     with pytest.raises(WlmError, match="expected a row of method ours of sheet day"):
-        run_rivals(tmp_path / "few.json", lightmaps)
+        rival_rows(tmp_path / "few.json", lightmaps)

@@ -4,18 +4,14 @@ import sys
 
 import pytest
 from builders.atlas_meshes import charts, sheet
-from builders.bench_rows import check_command, check_outputs, keys
-from typer.testing import CliRunner
+from builders.bench_rows import check_outputs, keys
 
-import benchmarks.atlas_ablation as bench
 from benchmarks import Panel
-from benchmarks.app import app
-from benchmarks.atlas_ablation import ABLATION, run, run_rows
-from benchmarks.atlas_inputs import Lightmap
+from benchmarks.atlas import Lightmap
+from benchmarks.atlas_ablation import ABLATION, run_rows
 from wlm.atlas.evaluation import evaluate
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
-from wlm.errors import WlmError
 
 PROFILE = Profile(name="small", method="cascade", steps=6, resolution=32, fallback=False, space="uv")
 VIEWS = {"views": 2, "resolution": 48}
@@ -43,7 +39,7 @@ def test_rows_and_means(rows):
 
 def test_the_whole_is_the_profile(lightmaps, rows):
     """The same compression, scored by itself under its own charts."""
-    report = evaluate(compress(lightmaps[1].mesh, PROFILE), lightmaps[1].mesh, **VIEWS)
+    report = evaluate(compress(lightmaps[1].lit, PROFILE), lightmaps[1].lit, **VIEWS)
     row = next(row for row in rows if row.scene.startswith("cube night") and row.option == "whole")
     assert row["compression_ratio"] == report.cr
     for name in ("psnr", "texel_psnr", "one_minus_ssim", "seam_ratio"):
@@ -74,21 +70,3 @@ def test_a_missing_package(lightmaps, monkeypatch):
     monkeypatch.setitem(sys.modules, "astc_encoder", None)  # as if it weren't installed
     missing, kept = run_rows(lightmaps[:1], PROFILE, ["ASTC", "no repacking"], device="cpu", **VIEWS)[::-1]
     assert not missing.figures and "astc_encoder is missing" in missing.notes and kept["psnr"] > 5.0
-
-
-def test_what_is_refused(lightmaps):
-    with pytest.raises(WlmError, match="--profile: expected one of method cascade, found half, of tiles"):
-        run(lightmaps, "half", quick=True, device="cpu")
-    with pytest.raises(WlmError, match="--only: expected one of whole, .*lut_scale 1; found 'lut_scale 0.7'"):
-        run(lightmaps, "paper", ["lut_scale 0.7"], quick=True, device="cpu")
-
-
-def test_the_command(given_rows, tmp_path, monkeypatch):
-    words = ["atlas-ablation", "--quick", "--profile", "cascade", "--only", "ASTC", "--steps", "9"]
-    command, (lightmaps, *names), options = check_command(monkeypatch, bench, given_rows[:5], words, tmp_path)
-    assert command == "python -m benchmarks atlas-ablation --quick --profile cascade --device cpu --steps 9 --only ASTC"
-    assert [lightmap.scene for lightmap in lightmaps] == ["room"] and names == ["cascade", ["ASTC"]]
-    assert options["quick"] and options["steps"] == 9
-    # Before any mesh is read.
-    result = CliRunner().invoke(app, [*words[:1], "--only", "none", "--meshes", str(tmp_path / "none")])
-    assert result.exit_code == 2 and "--only: expected one of whole" in result.stderr

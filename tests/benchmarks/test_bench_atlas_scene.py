@@ -5,15 +5,13 @@ import json
 import numpy as np
 import pytest
 import torch
-from builders.bench_rows import check_command, check_outputs, keys
+from builders.bench_rows import check_outputs, keys
 from builders.checks import error_of
 from builders.gltf_scene import box
 
-import benchmarks.atlas_scene as bench
 from benchmarks import Panel
-from benchmarks.atlas_scene import run
+from benchmarks.atlas_scene import LEAST_TEXELS, cut, read_scene, run_rows
 from benchmarks.rivals.scene_parts import scene_parts
-from benchmarks.scene_inputs import LEAST_TEXELS, cut, load
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS
@@ -63,7 +61,7 @@ def few(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(scene, few):
-    return run(scene, [few], budget=0.12, device="cpu", views=2, resolution=48)
+    return run_rows(scene, [few], budget=0.12, device="cpu", views=2, resolution=48)
 
 
 def test_objects_keep_their_light(scene):
@@ -106,12 +104,12 @@ def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
     text = {"name": "boxes", "width": SIDE, "height": SIDE, "mesh": "scene.glb"}
     text["lightmaps"] = [{"time_hours": 6.0, "file": "a.exr"}, {"time_hours": 12.0, "file": "b.exr"}]
     (tmp_path / "set.json").write_text(json.dumps(text))
-    scene = load(tmp_path, [12.0], 48)
+    scene = read_scene(tmp_path, [12.0], 48)
     assert scene.name == "boxes 48" and scene.states == ("12 h",) and len(scene.sheets) == 2
-    assert "no lightmap of 7 h; it has 6, 12" in error_of(load, tmp_path, [7.0])
-    assert "side: expected a divisor of 96, got 50" in error_of(load, tmp_path, (), 50)
+    assert "no lightmap of 7 h; it has 6, 12" in error_of(read_scene, tmp_path, [7.0])
+    assert "side: expected a divisor of 96, got 50" in error_of(read_scene, tmp_path, (), 50)
     (tmp_path / "set.json").write_text(json.dumps({k: v for k, v in text.items() if k != "mesh"}))
-    assert "expected a set with a mesh" in error_of(load, tmp_path)
+    assert "expected a set with a mesh" in error_of(read_scene, tmp_path)
 
 
 def test_rows(scene, rows):
@@ -141,17 +139,7 @@ def test_rows_make_a_file_and_tables(rows, tmp_path):
 
 
 def test_a_scene_without_its_parts_and_one_that_has_no_room(scene, few):
-    (alone,) = run(scene, [few], budget=0.12, device="cpu", parts=False, views=1, resolution=32)
+    (alone,) = run_rows(scene, [few], budget=0.12, device="cpu", parts=False, views=1, resolution=32)
     assert alone["psnr"] > 30.0 and "gain" not in alone.figures
     with pytest.raises(WlmError, match=r"budget: .* is less than"):
         compress(scene, few, budget=1e-4)
-
-
-def test_the_command(scene, rows, tmp_path, monkeypatch):
-    monkeypatch.setattr("benchmarks.scene_inputs.load", lambda *args: args)
-    words = ["atlas-scene", "--set", tmp_path / "town", "--hour", "6", "--side", "48", "--quick", "--budget", "0.1"]
-    command, ((path, hours, side), names), options = check_command(monkeypatch, bench, rows, words, tmp_path)
-    assert command == (
-        "python -m benchmarks atlas-scene --set town --hour 6.0 --side 48 --budget 0.1 --quick --device cpu"
-    )
-    assert (path.name, hours, side, names) == ("town", [6.0], 48, ()) and options["views"] == 8 and options["parts"]

@@ -4,13 +4,10 @@ import sys
 
 import numpy as np
 import pytest
-from builders.bench_rows import check_command, check_outputs, keys
-from typer.testing import CliRunner
+from builders.bench_rows import check_outputs, keys
 
 import benchmarks.lightmap as bench
-from benchmarks import read_json
-from benchmarks.app import app
-from benchmarks.lightmap import PANELS, _quick_times, run, run_rivals, run_rows
+from benchmarks.lightmap import PANELS, _quick_times, run, run_rows
 from benchmarks.rivals.lightmap import FEW, usual
 from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
@@ -100,13 +97,6 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS)
 
 
-def test_the_command(given_rows, tmp_path, monkeypatch):
-    words = ["lightmap", "--device", "cpu", "--set", tmp_path / "city"]
-    command, _, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
-    assert command == "python -m benchmarks lightmap --device cpu --set three"
-    assert options["set_path"] == tmp_path / "city" and not options["quick"]
-
-
 def test_the_score_is_that_of_the_times_asked_for(rows, lightmaps):
     frames = lightmaps.light.frames
     flat = [np.broadcast_to(frame.mean((0, 1)), frame.shape) for frame in frames]
@@ -135,9 +125,7 @@ def test_frames_have_nothing_to_fit(lightmaps):
     assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0 and rows[0]["load_ms"] > 0.0
 
 
-def test_what_is_refused(lightmaps, tmp_path):
-    with pytest.raises(WlmError, match="no such file or folder"):
-        run(quick=True, device="cpu", set_path=tmp_path / "absent")
+def test_what_is_refused(lightmaps):
     with pytest.raises(WlmError, match="device 'tpu'"):
         run_rows(lightmaps, [Profile(name="M")], device="tpu", chosen=[0])
     with pytest.raises(ValueError, match="at least one profile and one time"):
@@ -154,28 +142,17 @@ def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
     assert calls == [FEW, usual("cpu"), ()]
 
 
-def test_the_rivals_alone(rows, lightmaps, monkeypatch, tmp_path):
+def test_the_rivals_alone(rows, lightmaps, monkeypatch):
     monkeypatch.setattr(bench, "load", lambda path: lightmaps)
     monkeypatch.setattr(bench, "usual", lambda device, quick: ("bc7", "av1-75"))
     lines = []
-    alone = run_rivals(quick=True, set_path="set", progress=lines.append)
+    alone = run(quick=True, device="cpu", set_path="set", rivals_only=True, progress=lines.append)
     assert keys(alone) == [("BC7", ""), ("AV1", "75")] and len(lines) == 2
     beside = {(row.method, row.option): row for row in rows}
     for row in alone:  # 9, 12 and 21 h, as in the rows above
         assert row["psnr"] == beside[row.method, row.option]["psnr"] and row["times_scored"] == 3
-    monkeypatch.setattr(bench, "run_rivals", lambda **options: alone)
-    words = ["lightmap", "--rivals-only", "--json", str(tmp_path / "rivals.json")]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0 and "AV1" in result.output
-    command = read_json(tmp_path / "rivals.json")[1]["command"]
-    assert command == "python -m benchmarks lightmap --rivals-only --device cpu"
-    # One rival replaces its row alone.
-    replaced = alone[0].with_figures(psnr=1.0)
-    monkeypatch.setattr(bench, "run_rivals", lambda **options: [replaced])
-    assert CliRunner().invoke(app, [*words[:1], "--rival", "bc7", *words[2:]]).exit_code == 0
-    assert read_json(tmp_path / "rivals.json")[0] == [alone[1], replaced]
-    result = CliRunner().invoke(app, [*words, "--no-rivals"])
-    assert result.exit_code != 0 and "--rivals-only: expected without" in result.stderr
+    (one,) = run(quick=True, device="cpu", set_path="set", rival_names=["bc7"])
+    assert one.figures["psnr"] == alone[0]["psnr"]
 
 
 def test_quick_times():

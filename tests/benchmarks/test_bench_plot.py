@@ -122,6 +122,7 @@ def test_picture_size_suits_a_readme_and_repeats(tmp_path):
 def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
     """Eight rows in a small corner: the boxes of their labels stay apart and inside the picture."""
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
     seen = {}
     original = Figure.savefig
@@ -131,7 +132,7 @@ def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
         self.canvas.draw()
         seen["frame"] = self.axes[0].get_window_extent(renderer)
         names = [text for text in self.axes[0].texts if text.get_text() != "Pareto front"]
-        seen["boxes"] = [text.get_window_extent(renderer) for text in names]
+        seen["boxes"] = [Text.get_window_extent(text, renderer) for text in names]
         return original(self, *args, **kwargs)
 
     monkeypatch.setattr(Figure, "savefig", spy)

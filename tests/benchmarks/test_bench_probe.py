@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from builders.bench_rows import check_command, check_outputs, keys
-from typer.testing import CliRunner
+from builders.bench_rows import check_outputs, keys
 
 import benchmarks.probe as bench
-from benchmarks.app import app
-from benchmarks.probe import PANELS, run, run_rivals, run_rows, run_volume
+from benchmarks.probe import PANELS, ProbeBench, run, run_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
@@ -88,19 +86,17 @@ def test_rivals_keep_to_the_bytes(rows):
 
 
 def test_rivals_alone_are_the_same(sets, rows, monkeypatch):
-    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
+    monkeypatch.setattr(bench, "load", lambda path, key: sets[0])
     monkeypatch.setattr(bench, "SHARES", (5, 10))
-    alone = run_rivals(probes_path="room.npz")
+    alone = run(probes_path="room.npz", rivals_at="rows.json")
     beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
 
 
-def test_the_volume_alone_is_the_same(sets, rows, monkeypatch):
-    monkeypatch.setattr(bench, "_load", lambda path, keys: sets[:1])
-    alone = run_volume(device="cpu", probes_path="room.npz", frames=4)
-    lossless, components = alone
+def test_the_volume_alone_is_the_same(sets, rows):
+    lossless, components = ProbeBench(sets[0], "cpu", None).volume(frames=4)
     (beside,) = (row for row in rows if row.scene == "room" and row.option == "lossless, walk of 4 frames")
     assert components.option == "pca, walk of 4 frames" and components["light_psnr"] > 30.0
     for name in ("psnr", "light_psnr", "blocks", "coverage"):
@@ -111,18 +107,7 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS)
 
 
-def test_the_command(given_rows, tmp_path, monkeypatch):
-    words = ["probe", "--no-rivals", "--probes", tmp_path / "room.npz", "--key", "sh", "--key", "sh_noon"]
-    command, _, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
-    assert command == "python -m benchmarks probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon"
-    assert options["keys"] == ["sh", "sh_noon"] and not options["rivals"] and not options["quick"]
-
-
-def test_what_is_refused(sets, tmp_path):
-    with pytest.raises(WlmError, match="No such file"):
-        run(quick=True, device="cpu", probes_path=tmp_path / "absent.npz")
-    result = CliRunner().invoke(app, ["probe", "--volume-only", "--quick"])
-    assert result.exit_code != 0 and "--volume-only: expected without" in result.stderr
+def test_what_is_refused(sets):
     with pytest.raises(WlmError, match="device 'tpu'"):
         run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
     with pytest.raises(ValueError, match="at least one set and one profile"):

@@ -5,14 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.bench_rows import by_option, check_command, check_outputs
+from builders.bench_rows import by_option, check_outputs
 
-import benchmarks.smoke as bench
-from benchmarks.smoke import PANELS, plotted, run, run_rows
-from benchmarks.smoke_air import storage_rows
-from benchmarks.smoke_light import make_cloud, six_rows
-from benchmarks.smoke_setup import QUICK, SmokeBench
-from wlm.errors import WlmError
+from benchmarks.smoke import (
+    PANELS,
+    QUICK,
+    SmokeBench,
+    make_cloud,
+    plotted,
+    run_rows,
+    six_rows,
+    storage_rows,
+)
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.fine import bake
@@ -179,13 +183,3 @@ def test_the_plume():
 def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     check_outputs(rows, tmp_path, PANELS, plotted(rows))
     assert {row.method for row in plotted(rows)} == {"guide", "six ways"}
-
-
-def test_the_command(given_rows, tmp_path, monkeypatch):
-    command, _, options = check_command(monkeypatch, bench, given_rows, ["smoke", "--quick"], tmp_path)
-    assert command == "python -m benchmarks smoke --quick --device cpu" and options["quick"]
-
-
-def test_what_is_refused():
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        run(quick=True, device="tpu")

@@ -5,14 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.bench_rows import by_option, check_command, check_outputs
+from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
-import benchmarks.smoke_network_rivals as rivals
 from benchmarks import path_tracer
 from benchmarks.path_tracer import PathTracer, denoise
-from benchmarks.smoke_network import PANELS, plotted, run, run_rows
-from benchmarks.smoke_network_setup import QUICK, NetworkBench, Subject, open_subjects, score
+from benchmarks.smoke_network import (
+    FULL,
+    PANELS,
+    QUICK,
+    NetworkBench,
+    Subject,
+    open_subjects,
+    plotted,
+    run,
+    run_rows,
+    score,
+)
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.codec import shipped
@@ -56,7 +65,7 @@ def network(tmp_path_factory):
 def rows(network):
     """Without a path tracer, whether there is one or not."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rivals, "has_tracer", lambda: False)
+        patch.setattr(bench, "has_tracer", lambda: False)
         untrained = Subject("raw", SmokeModel(SixWayNetwork(NETWORK), {}), SETTINGS, False)
         return run_rows(TINY, [*open_subjects([network], []), untrained], device="cpu")
 
@@ -156,25 +165,14 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     assert points[0].option == "step 4" and points[-3].option == "h 0.8, nodes 4"
 
 
-def test_the_command(given_rows, network, tmp_path, monkeypatch):
-    words = ["smoke-network", "--quick", "--network", network, "--profile", "paper"]
-    command, arguments, options = check_command(monkeypatch, bench, given_rows, words, tmp_path)
-    expected = "smoke-network --quick --device cpu --network young.safetensors --profile paper"
-    assert command == f"python -m benchmarks {expected}"
-    assert arguments == ([network], ["paper"]) and options["quick"] and options["device"] == "cpu"
-    # Without any, the network that ships; a profile alone stays alone.
-    for words, expected in (([], ([shipped()], ())), (["--profile", "paper"], ([], ["paper"]))):
-        assert check_command(monkeypatch, bench, given_rows, ["smoke-network", *words], tmp_path)[1] == expected
-
-
-def test_networks_or_profiles_are_needed(monkeypatch):
+def test_networks_and_profiles_of_a_run(monkeypatch):
     calls = []
     monkeypatch.setattr(bench, "run_rows", lambda sizes, subjects, **options: calls.append((sizes, subjects)))
-    with pytest.raises(WlmError, match="^bench: expected --network FILE or --profile NAME, found neither$"):
-        run(quick=True, device="cpu")
-    run([], ["paper"], quick=True, device="cpu")
-    ((sizes, (subject,)),) = calls
-    assert sizes == QUICK and subject.name == "network-paper untrained"
+    run(quick=True, device="cpu")
+    run(profiles=["paper"], quick=False, device="cpu")
+    (first, shipped_ones), (second, untrained) = calls
+    assert (first, second) == (QUICK, FULL)
+    assert [each.name for each in (*shipped_ones, *untrained)] == [shipped().stem, "network-paper untrained"]
 
 
 def test_without_the_extra(monkeypatch):
@@ -210,7 +208,7 @@ def test_a_path_tracer_finds_the_same_light():
 
 def test_rows_of_a_path_tracer():
     pytest.importorskip("mitsuba")
-    traced = by_option(rivals.traced_rows(NetworkBench("cpu", TINY, [])), "path tracing")
+    traced = by_option(bench.traced_rows(NetworkBench("cpu", TINY, [])), "path tracing")
     plain = traced["1 sample"]
     assert 5.0 < plain["psnr"] < 30.0 and plain["time_ms"] > 0.0
     if path_tracer.has_denoiser():

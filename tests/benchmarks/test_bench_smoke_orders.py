@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.bench_rows import ENVIRONMENT, check_command
+from builders.bench_rows import ENVIRONMENT
 from builders.orders import input_alone
 from builders.smoke_plumes import facing, plume
 
@@ -16,10 +16,7 @@ from benchmarks import read_json, tables, write_json
 from benchmarks.path_tracer import denoised_picture
 from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves, three_octaves
 from benchmarks.runner import Bench
-from benchmarks.smoke_grids import METHOD as GRIDS
-from benchmarks.smoke_grids import GridSizes, grid_rows
-from benchmarks.smoke_orders import ALBEDOS, METHOD, QUICK, run, run_rows
-from benchmarks.smoke_other_light import INSIDE, PHASES
+from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, grid_rows, run_rows
 from wlm.errors import WlmError
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
@@ -135,14 +132,7 @@ def test_rows_make_a_file_and_a_table(rows, tmp_path):
     assert "| learned mix |" in tables(rows)
 
 
-def test_the_command(given_rows, tmp_path, monkeypatch):
-    command, _, options = check_command(monkeypatch, bench, given_rows, ["smoke-orders", "--quick"], tmp_path)
-    assert command == "python -m benchmarks smoke-orders --quick --device cpu" and options["quick"]
-
-
 def test_what_is_refused(monkeypatch):
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        run(quick=True, device="tpu")
     monkeypatch.setattr("benchmarks.path_tracer.has_denoiser", lambda: False)
     with pytest.raises(WlmError, match=r"needs pyoidn: install wlm\[bake\]"):
         denoised_picture(torch.zeros(4, 4, 3))

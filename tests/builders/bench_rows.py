@@ -1,4 +1,4 @@
-"""What every benchmark's rows go through: a result file, tables, a plot, and the command that asks for them."""
+"""Checks of the rows of any benchmark: a result file, tables, a plot, and the command that measures them."""
 
 from pathlib import Path
 
@@ -41,25 +41,24 @@ def check_outputs(rows, folder: Path, panels, plotted=None) -> None:
     assert (folder / "rows.png").stat().st_size > 10_000
 
 
-def check_command(monkeypatch, module, rows, words: list, folder: Path) -> tuple[str, tuple, dict]:
-    """Runs `python -m benchmarks` with a `run` that gives these rows; checks what it writes.
+def check_command(monkeypatch, rows, words: list, folder: Path) -> tuple[str, dict]:
+    """Runs `python -m benchmarks` with a `run` that gives these rows; checks what it writes and prints.
 
     Returns:
         The command line in the result file, and the arguments that `run` was called with.
     """
     calls = []
 
-    def run(*args, **options):
-        calls.append((args, options))
+    def run(**options):
+        calls.append(options)
         if "done" in options:
             options["done"](rows)
         return rows
 
-    monkeypatch.setattr(module, "run", run)
+    monkeypatch.setattr(f"benchmarks.{words[0].replace('-', '_')}.run", run)
     path = folder / "command.json"
-    path.unlink(missing_ok=True)
     result = CliRunner().invoke(app, [*map(str, words), "--json", str(path)])
     assert result.exit_code == 0, result.output
     written, environment = read_json(path)
     assert written == list(rows) and f"| {rows[0].option} |" in result.output
-    return environment["command"], *calls[-1]
+    return environment["command"], calls[-1]

@@ -9,7 +9,7 @@ import torch
 from builders.orders import input_alone
 from builders.smoke_plumes import plume
 
-from benchmarks.smoke_light import make_cloud
+from benchmarks.smoke import make_cloud
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera

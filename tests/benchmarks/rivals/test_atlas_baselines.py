@@ -1,4 +1,4 @@
-"""What a compressed lightmap of a mesh is compared with: sizes, known answers, budgets, and what is refused."""
+"""Rivals of a compressed lightmap of a mesh: sizes, known answers, budgets, and errors."""
 
 import math
 import sys
@@ -8,19 +8,17 @@ import pytest
 import torch
 from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
 
-from benchmarks.rivals.atlas import RIVALS, best_astc, block_codec, carving, downsampling, share_of, single_colour
+from benchmarks.rivals.atlas import RIVALS, best_astc, block_codec, downsampling, share_of
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import resized
-from wlm.atlas.views import Points, points_at, scene_views, visible_uv
+from wlm.atlas.views import Points
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.ops import raster
-from wlm.texels import exposure
 
 FULL = np.ones((HEIGHT, WIDTH), bool)
-SEEN = {"views": 4, "resolution": 64}
 
 
 def _sheet(lightmap, mask=None):
@@ -174,110 +172,9 @@ def test_blocks(codec):
     assert np.abs(_read(block_codec(odd, 20.0, codec), odd) - light[:13, :10]).mean() < 0.03
 
 
-def test_faces_of_one_colour_become_a_texel_each():
-    """Six faces in four colours: four texels hold them all, and at a larger threshold all share one."""
-    colours = np.array([[1, 1, 1], [1, 0.5, 0], [1, 1, 1], [0, 0, 2], [0.25, 0, 0.25], [1, 1, 1]], np.float32)
-    light = np.empty((HEIGHT, WIDTH, 3), np.float32)
-    for number, colour in enumerate(colours):
-        light[number // 3 * 32 :, number % 3 * 32 :][:32, :32] = colour
-    mesh = lit_cube(2, light)
-    exact = single_colour(mesh, threshold=0.0, floor=-math.inf)
-    assert exact.bytes == 4 * 6 and exact.size is None
-    report = compare(mesh, {"it": exact.decoded}, views=6, resolution=64)["it"]
-    assert report.psnr > 100.0
-    light[: HEIGHT // 2, : WIDTH // 3] = waves()[: HEIGHT // 2, : WIDTH // 3]
-    mesh = lit_cube(2, light)
-    one_left = single_colour(mesh, threshold=1e-4, **SEEN)
-    kept = np.count_nonzero(mesh.sheets[0].mask[: HEIGHT // 2, : WIDTH // 3])
-    assert one_left.bytes == (4 + kept) * 6
-    assert compare(mesh, {"it": one_left.decoded}, views=6, resolution=64)["it"].psnr > 70.0
-    assert single_colour(mesh, threshold=10.0, floor=-math.inf).bytes == 6
-
-
-@pytest.mark.parametrize("threshold", [0.05, 0.1, 0.3])
-def test_the_error_of_shared_colours_is_bounded(threshold):
-    """All colours of a group are within four times the threshold of each other, on the scale of a square root."""
-    mesh = lit_cube(6)
-    result = single_colour(mesh, threshold=threshold, floor=-math.inf)
-    assert 0.0 < share_of(result, mesh) < 1.0
-    weight = np.random.default_rng(0).dirichlet([1.0] * 3, len(mesh.sheets[0].triangle))
-    uv = torch.tensor((mesh.sheets[0].uv[mesh.sheets[0].triangle] * weight[..., None]).sum(1), dtype=torch.float32)
-    original = raster.texture(torch.tensor(mesh.sheets[0].lightmap), uv)
-    number = torch.arange(len(uv))
-    points = Points(uv, torch.zeros(len(uv), dtype=torch.int32), number, torch.tensor(weight).float())
-    decoded = result.decoded(points, 0)
-    factor = exposure(mesh.sheets[0].lightmap[mesh.sheets[0].mask])
-    error = ((decoded * factor).sqrt() - (original * factor).sqrt()).abs()
-    # Colours were looked at a texel apart; between these they may go a little further.
-    assert threshold * 0.5 < float(error.max()) < 4.0 * threshold * 1.1 + 2e-3
-
-
-def test_triangles_that_were_wrong_keep_their_texels():
-    mesh = lit_cube(6)
-    factor = exposure(mesh.sheets[0].lightmap[mesh.sheets[0].mask])
-
-    def worst(rival):
-        values = []
-        for drawn in visible_uv(mesh, scene_views(mesh, SEEN["views"], 1), SEEN["resolution"], "cpu"):
-            points = points_at(mesh, *drawn)[1]
-            decoded = rival.decoded(points, 0)
-            original = raster.texture(torch.tensor(mesh.sheets[0].lightmap), points.uv)
-            squares = float(((decoded * factor).sqrt() - (original * factor).sqrt()).double().square().sum())
-            values.append(-10.0 * math.log10(squares / (3 * SEEN["resolution"] ** 2)))
-        return min(values)
-
-    all_of_them, fewer = (single_colour(mesh, threshold=0.2, floor=floor, **SEEN) for floor in (-math.inf, 30.0))
-    assert worst(all_of_them) < 25.0 and all_of_them.bytes < fewer.bytes
-    # The colours of groups changed as they lost triangles.
-    assert worst(fewer) > 29.0
-    # No more than needed.
-    assert (fewer.decoded.colour >= 0).sum() > 10
-
-
-def _columns(light):
-    """A flat grid of eight columns of quads over a lightmap."""
-    x = np.linspace(0.0, 1.0, 9)
-    uv = np.stack(np.meshgrid(x, [0.0, 1.0]), -1).reshape(-1, 2)
-    quad = np.arange(8)[:, None]
-    triangle = np.concatenate([quad + [0, 1, 9], quad + [9, 1, 10]])
-    return from_arrays(np.insert(2.0 * uv - 1.0, 2, 0.0, 1), triangle, uv, light, name="columns")
-
-
-def test_carving_keeps_what_a_smaller_lightmap_loses():
-    """Stripes over an eighth of a lightmap and a ramp over the rest: seams leave the stripes alone."""
-    x = np.arange(64)
-    row = np.where(x < 8, 0.5 + 0.4 * (x % 2), 1.0 + x / 64.0)
-    light = np.broadcast_to(row[None, :, None], (64, 64, 3)).astype(np.float32)
-    mesh = _columns(light)
-    carved, smaller = (RIVALS[name](mesh, 0.17) for name in ("carving", "downsampling"))
-    scores = compare(mesh, {"carved": carved.decoded, "smaller": smaller.decoded}, views=4, resolution=64)
-    assert scores["carved"].psnr > scores["smaller"].psnr + 10.0
-    corner = carved.decoded.corner.numpy() * carved.size[::-1]
-    width = corner[:8, 1, 0] - corner[:8, 0, 0]
-    assert width[0] > 7.5 and width[1:].mean() < 4.0
-    assert carved.size[0] < 40  # rows are all alike
-
-
-def test_carving_turns_no_triangle_over():
-    """Slivers across the way of all seams: they stay as they were wound, or carving ends."""
-    random = np.random.default_rng(2)
-    y = np.sort(random.uniform(0.0, 1.0, 40))
-    left = np.stack([np.zeros(40), y], 1)
-    right = np.stack([np.ones(40), y + random.uniform(0.0, 0.002, 40)], 1).clip(0.0, 1.0)
-    uv = np.concatenate([left, right, [[0.5, 0.0], [0.5, 1.0]]])
-    number = np.arange(39)
-    triangle = np.stack([number, number + 40, number + 1], 1)
-    mesh = from_arrays(np.insert(uv, 2, 0.0, 1), triangle, uv, random.random((48, 48, 3)), name="slivers")
-    carved = RIVALS["carving"](mesh, 0.3)
-    corner = carved.decoded.corner.double().numpy()
-    before, after = (np.linalg.det(c[:, 1:] - c[:, :1]) for c in (uv[triangle], corner))
-    assert carved.size[0] * carved.size[1] < 48 * 48 and (before * after > 0.0).all()
-    assert RIVALS["carving"](mesh, 2.0).size == (48, 48)
-
-
 def test_what_is_refused(monkeypatch):
     mesh = _sheet(waves())
-    makers = (downsampling, carving, lambda mesh, share: block_codec(mesh, share, "astc12x12"))
+    makers = (downsampling, lambda mesh, share: block_codec(mesh, share, "astc12x12"))
     tiny = 0.5 / (HEIGHT * WIDTH)
     for share, message in (
         (0.0, "share"),
@@ -292,8 +189,6 @@ def test_what_is_refused(monkeypatch):
     for codec in ("bc7", "astc7x7", "astc"):
         with pytest.raises(ValueError, match=f"'{codec}'"):
             block_codec(mesh, 0.5, codec)
-    with pytest.raises(ValueError, match="threshold"):
-        single_colour(mesh, threshold=-0.1)
     for codec, package in (("bc6h", "ispc_texcomp"), ("astc5x5", "astc_encoder")):
         monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
         with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
