@@ -9,7 +9,7 @@ import pytest
 from builders.checks import error_of
 from builders.godot_bakes import Writer, bake, colours, probes, with_users
 
-from wlm.atlas.listing import read_description
+from wlm.atlas.listing import read_listing
 from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.godot import read_lmbake, read_users
@@ -59,7 +59,7 @@ def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
         ("../House/Wall", (0.5, 0.25, 0.125, 0.375), 0),
         ("Floor", (0.0, 0.0, 0.5, 0.25), 0),
     ]
-    scene = read_description(path)
+    scene = read_listing(path)
     assert [each.files for each in scene.sheets] == [["bake.exr"]]
     assert [(each.node, each.scale_offset) for each in scene.objects] == [
         ("Wall", [0.125, 0.375, 0.5, 0.25]),
@@ -71,7 +71,7 @@ def test_who_reads_which_part_of_the_lightmap(tmp_path, order, double):
     users[1] = (["Floor"], (0.0, 0.0, 0.5, 0.25), 1)
     for options in ({"slices": False}, {"slices": True}):
         path.write_bytes(writer.file(with_users(writer, points, sh, users, **options)))
-        assert "one texture of one slice without directions" in error_of(read_description, path)
+        assert "one texture of one slice without directions" in error_of(read_listing, path)
     # What stands in their place is refused, and the probes are read all the same.
     path.write_bytes(writer.file(bake(writer, points, sh)))
     assert "user_data" in error_of(read_users, path) and len(read_lmbake(path)[0]) == 5
