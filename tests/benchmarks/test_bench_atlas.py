@@ -130,6 +130,7 @@ def test_a_lightmap_of_one_colour_has_no_scores():
     assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS]
 
 
+@pytest.mark.slow
 def test_no_room_for_a_rival_or_a_table():
     """Eight texels of a lightmap: what doesn't fit is named, and the others are measured."""
     cascade = PROFILES[2].model_copy(update={"scale": 0.2, "colour_scale": 0.2, "lut_scale": 0.2})

@@ -1,0 +1,89 @@
+"""Every kind of rival of lightmaps keeps the same contract: gaps, extreme values, errors and missing packages."""
+
+import sys
+
+import numpy as np
+import pytest
+from builders.lightmaps import smooth_light
+
+from benchmarks.rivals.lightmap import RIVALS
+from wlm.errors import WlmError
+
+# One of each kind with a package that it needs; other names differ in a number.
+PACKAGES = {
+    "bc6h": "ispc_texcomp",
+    "bc6h-rdo-1": "imagecodecs",
+    "bc7": "imagecodecs",
+    "bc7-rdo-2": "ispc_texcomp",
+    "astc4": "astc_encoder",
+    "astc12": "astc_encoder",
+    "8bit": "imagecodecs",
+    "pca-bc4-4": "imagecodecs",
+    "pca-0.04": "imagecodecs",
+    "av1-85": "imagecodecs",
+}
+
+
+def decoded(name: str, frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Encodes lightmaps [T, H, W, 3] at once or one by one, and decodes them."""
+    method = RIVALS[name]
+    if not method.alone:
+        return method.encode(frames, mask).decoded
+    return np.stack([method.encode(frame, mask).decoded for frame in frames])
+
+
+def hours(height: int, width: int) -> np.ndarray:
+    light = smooth_light(height, width)
+    return np.stack([light, light[::-1]]).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_texels_in_gaps_have_no_influence(name):
+    frames, mask = hours(48, 48), np.ones((48, 48), bool)
+    mask[7:30, 18:35] = False
+    zeros, garbage = frames.copy(), frames.copy()
+    zeros[:, ~mask] = 0.0
+    garbage[:, ~mask] = np.nan
+    garbage[:, 8, 20] = 1e30
+    a, b = (decoded(name, given, mask) for given in (zeros, garbage))
+    np.testing.assert_array_equal(a, b)
+    # The ring that a filtered read reaches is like the texels beside it.
+    np.testing.assert_allclose(a[:, 7, 21:32], frames[:, 6, 21:32], atol=0.12 * frames.max())
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_empty_mask_black_constant_and_one_texel(name):
+    every = np.ones((16, 16), bool)
+    nothing = np.full((2, 16, 16, 3), np.nan, np.float32)
+    assert not decoded(name, nothing, ~every).any()
+    assert not decoded(name, np.zeros((2, 16, 16, 3)), every).any()
+    np.testing.assert_allclose(decoded(name, np.full((2, 16, 16, 3), 0.7), every), 0.7, rtol=0.01)
+    one = ~every
+    one[3, 4] = True
+    nothing[:, 3, 4] = [[3.0, 2.0, 1.0], [0.3, 0.2, 0.1]]
+    np.testing.assert_allclose(decoded(name, nothing, one)[:, 3, 4], nothing[:, 3, 4], rtol=0.03, atol=0.02)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_bright_texel_leaves_the_other_tile_alone(name):
+    frames, mask = hours(24, 256), np.ones((24, 256), bool)
+    frames[1, 12, 30] = 1e4
+    light = decoded(name, frames, mask)
+    assert light[1, 12, 30].min() > 3e3
+    np.testing.assert_allclose(light[:, :, 144:], frames[:, :, 144:], atol=0.2)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_bad_valid_texels_are_refused(name, value):
+    frames = hours(16, 16)
+    frames[1, 3, 3, 1] = value
+    with pytest.raises(WlmError, match="NaN or infinite"):
+        decoded(name, frames, np.ones((16, 16), bool))
+
+
+@pytest.mark.parametrize(("name", "package"), PACKAGES.items())
+def test_a_missing_package_names_the_extra(name, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
+    with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
+        decoded(name, hours(16, 16), np.ones((16, 16), bool))
