@@ -15,6 +15,4 @@ def test_what_is_measured():
     rival = measure("plain", lambda: b"ab" * 400, lambda data: data[:1], option=lambda data: data[:2].decode())
     assert (rival.bytes, rival.disk_bytes, rival.decoded, rival.option) == (800, None, b"a", "ab")
     assert measure("plain", lambda: b"ab" * 400, len, disk_bytes=disk_size).disk_bytes < 40
-    assert rival.encode_seconds >= 0.0 and rival.to_json().keys() == {
-        "name", "option", "encode_seconds", "decode_seconds"
-    }  # fmt: skip
+    assert rival.encode_seconds >= 0.0 and rival.decode_seconds >= 0.0
