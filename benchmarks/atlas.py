@@ -273,7 +273,7 @@ def run_rows(
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
-    """The rows that a plot shows: the means, or all where there are none."""
+    """Returns the rows that a plot shows: the means, or all rows if there are no means."""
     return [row for row in rows if row.scene.startswith(MEAN)] or list(rows)
 
 
@@ -282,7 +282,7 @@ def _smaller_name(profile: Profile, cr: float) -> str:
 
 
 def _share(row: Row) -> float:
-    """Bits of eq. 9 over the lightmap's."""
+    """Returns the bits of eq. 9 over the bits of the lightmap."""
     return row["bpp"] / SOURCE_BITS
 
 
@@ -355,7 +355,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """A cascade tuned in either space."""
+        """Measures the first cascade tuned in views and in UV space."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []

@@ -131,7 +131,7 @@ def run_rows(
 
 
 def variants(base: Profile) -> list[tuple[str, str, Profile]]:
-    """Methods, options and settings of all rows; a sweep leaves out the value that the profile has.
+    """Returns methods, options and settings of all rows; a sweep leaves out the value of the profile.
 
     Args:
         base: What each is with one change.
@@ -145,7 +145,7 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
 
 
 def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
-    """The `variants` that are asked for.
+    """Returns the requested `variants`.
 
     Args:
         base: What each is with one change.

@@ -170,7 +170,7 @@ class _SceneBench(Bench):
         return rows
 
     def _bpp(self, bits: float) -> float:
-        """Bits for each texel and state."""
+        """Returns the bits per texel and state."""
         return bits / self._scene.texels
 
 
@@ -261,7 +261,7 @@ def cut(
 def _piece(
     frames: np.ndarray, inside: np.ndarray, corner: np.ndarray, number: int, factor: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """A chart's light [M, h, w, 3] at the lower resolution, its texels [h, w], and where it was, x and y of a texel."""
+    """Returns a chart's light [M, h, w, 3] at the lower resolution, its mask [h, w], and its first texel, x and y."""
     height, width = inside.shape
     low = np.floor(corner.min(0)).clip(0, (width - 1, height - 1)).astype(int) // factor * factor
     high = np.maximum(np.ceil(corner.max(0)).astype(int), low + 1)
@@ -279,7 +279,7 @@ def _piece(
 
 
 def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The object of each chart, those of most texels first."""
+    """Returns the object of each chart; objects with more texels have lower numbers."""
     size = max(float(np.ptp(position, axis=0).max()), 1e-30)
     grid = np.round(position / (_SAME_PLACE * size)).astype(np.int64)
     corner = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)[triangle]

@@ -1,4 +1,4 @@
-"""Comparison of results with older ones."""
+"""Comparison of a result file with an older one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

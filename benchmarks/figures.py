@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Figure:
-    """How one figure is shown.
+    """The presentation of one figure.
 
     Attributes:
         title: The quantity, in a word or two.
@@ -31,7 +31,7 @@ class Figure:
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
     def text(self, value: float, form: str = "") -> str:
-        """The number without its unit, in this format or in another."""
+        """Returns the number without its unit, in the format of the figure or in another."""
         if self.unit == "%":
             value *= 100.0
         form = form or self.form or (",.0f" if abs(value) >= 100.0 else ".3g")

@@ -23,12 +23,12 @@ _LLVM = 19  # older versions can't compile Mitsuba's kernels, and end the proces
 
 
 def has_tracer() -> bool:
-    """Whether Mitsuba is installed."""
+    """Returns whether Mitsuba is installed."""
     return importlib.util.find_spec("mitsuba") is not None
 
 
 def has_denoiser() -> bool:
-    """Whether Open Image Denoise is installed."""
+    """Returns whether Open Image Denoise is installed."""
     return importlib.util.find_spec("pyoidn") is not None
 
 
@@ -102,7 +102,7 @@ class PathTracer:
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
     def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
-        """RGBA float32 [H, W, 4] under one light of irradiance 4 pi; its direction [3] is in the camera's axes."""
+        """Traces RGBA float32 [H, W, 4] under a light of irradiance 4 pi, with a direction [3] in the camera's axes."""
         light = {
             "type": "directional",
             "direction": [float(-w) for w in self._camera.axes.T @ direction],
@@ -114,7 +114,7 @@ class PathTracer:
         return np.array(self._mitsuba.render(scene, spp=samples, seed=seed))
 
     def _load_smoke(self, volume: DensityVolume, albedo: float, g: float) -> Any:
-        """The smoke, in voxels; a border of empty voxels makes Mitsuba's clamped grid end as ours does."""
+        """Loads the smoke in units of voxels; a border of empty voxels gives Mitsuba's clamped grid the end of ours."""
         transform = self._mitsuba.ScalarTransform4f
         size = np.array(volume.shape, np.float64)
         grid = np.pad(volume.density.float().cpu().numpy(), 1).transpose(2, 1, 0)[..., None]

@@ -40,7 +40,7 @@ _FRONT_COLOUR = "#707070"
 
 @dataclass(frozen=True)
 class Panel:
-    """One figure of some methods against another.
+    """A panel of a plot: one figure of some methods against another.
 
     Attributes:
         x: The cost, a figure of which less is better, such as `"decode_ms"` or `"bpp"`.
@@ -58,14 +58,14 @@ class Panel:
                 raise WlmError(f"plot: unknown figure {name!r}")
 
     def position(self, row: Row) -> tuple[float, float] | None:
-        """Where a row stands; None if it doesn't belong here, or lacks one of the two."""
+        """Returns the two figures of a row; None if the panel leaves out its method, or a figure is missing."""
         if self.methods is not None and row.method not in self.methods:
             return None
         return (row[self.x], row[self.y]) if {self.x, self.y} <= row.figures.keys() else None
 
 
 def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
-    """Points that no other dominates: none costs no more, is no worse, and is better in one of the two.
+    """Finds the points that no other point dominates: no other is at least as good in both and better in one.
 
     Args:
         points: `(cost, quality)` pairs; less cost and more quality are better. A pair with a NaN is never on the
@@ -138,7 +138,7 @@ def _style(method: str, methods: Sequence[str]) -> tuple[str, str]:
 
 
 def _ink(colour: str) -> tuple[float, ...]:
-    """The colour, dark enough for thin letters on white."""
+    """Returns a darker colour, for thin letters on white."""
     from matplotlib.colors import to_rgb
 
     return tuple(_INK * channel for channel in to_rgb(colour))
@@ -199,7 +199,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
 
 
 def _wide(values: Sequence[float]) -> bool:
-    """Whether numbers are too far apart for a linear axis."""
+    """Returns whether the range of some numbers is too large for a linear axis."""
     return min(values) > 0.0 and max(values) / min(values) > _LOG_RATIO
 
 
@@ -232,6 +232,7 @@ def _label_points(figure: Figure, axes: Axes, rows: Sequence[Row], panel: Panel,
             fontsize=_LABEL_POINTS,
             color=_ink(colour),
             zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
             arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.6, "shrinkA": 0.0, "shrinkB": 0.0},
         )
         extent = Text.get_window_extent(label, renderer)  # without the line to the marker
@@ -258,7 +259,7 @@ _Box = tuple[float, float, float, float]
 
 
 def _overlap(a: _Box, b: _Box, margin: float) -> float:
-    """Area that the first box, enlarged by a margin, shares with the second, in square pixels."""
+    """Returns the area of the intersection of a box with a margin and another box, in square pixels."""
     width = min(a[2] + margin, b[2]) - max(a[0] - margin, b[0])
     height = min(a[3] + margin, b[3]) - max(a[1] - margin, b[1])
     return max(0.0, width) * max(0.0, height)

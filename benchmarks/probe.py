@@ -371,24 +371,24 @@ class ProbeBench(Bench):
     def _decode(
         self, decoder: GaussianDecoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
-        """The score, and the errors against float64."""
+        """Returns the score of a decode, and its errors against float64."""
         decoder.run(points)
         values = points.values()
         return score(self._all(values), self.probes, size), exact_errors(values, exact)
 
     def _all(self, live: np.ndarray) -> np.ndarray:
-        """Values of all probes, the dead ones zero."""
+        """Returns the values of all probes; dead probes are zero."""
         values = np.zeros_like(self.probes.values)
         values[self.probes.live] = live
         return values
 
     def _dead_bytes(self) -> int:
-        """Bytes of the packed list of dead probes, as in our file."""
+        """Returns the bytes of the packed list of dead probes, as in our file."""
         return 0 if self.probes.live.all() else len(zstd.compress(np.packbits(~self.probes.live).tobytes()))
 
 
 def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:
-    """Sizes on a GPU, where a rival's is that of its payload, on a disk, and the error."""
+    """Returns the sizes on a GPU and on a disk, and the error; the GPU size of a rival is that of its payload."""
     sizes = {"bytes": gpu_bytes, "bpp": 8 * gpu_bytes / report.probes, "disk_bytes": report.bytes}
     return sizes | {"share_of_float32": gpu_bytes / (4 * report.probes * report.outputs), "psnr": report.psnr}
 
@@ -402,7 +402,7 @@ def _in_given_order(points: Points) -> None:
 
 
 def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
-    """Walks with the original probes and with each model, each from an empty volume.
+    """Measures walks with the original probes and with each model, each from an empty volume.
 
     Args:
         bench: Benchmark of the set, on the device of the volume.

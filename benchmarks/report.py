@@ -66,7 +66,7 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def _group(rows: list[Row]) -> str:
-    """One table if it fits the width; else several with fewer columns, and notes below them."""
+    """Writes one table if it fits the width; otherwise several with fewer columns, and notes below them."""
     labels = [[row.method, row.option] if len({row.method for row in rows}) > 1 else [row.option] for row in rows]
     figures = {name: figure for table in TABLES.values() for name, figure in table.items()}
     whole = _table(figures, "notes", rows, labels, [row.notes for row in rows])
@@ -86,7 +86,7 @@ def _group(rows: list[Row]) -> str:
 def _table(
     figures: Mapping[str, Figure], last: str, rows: Sequence[Row], labels: Sequence[list[str]], notes: Sequence[str]
 ) -> list[str]:
-    """The lines of a table, without the columns that no row fills."""
+    """Returns the lines of a table without empty columns."""
     figures = {name: figure for name, figure in figures.items() if any(name in row.figures for row in rows)}
     heads = [""] * len(labels[0])
     lines = [[*heads, *(figure.heading for figure in figures.values())]]

@@ -69,24 +69,24 @@ class Row:
         object.__setattr__(self, "figures", plain)
 
     def __getitem__(self, name: str) -> float:
-        """A figure that the row has."""
+        """Returns a figure of the row."""
         return self.figures[name]
 
     def get(self, name: str) -> float | None:
-        """A figure, or None."""
+        """Returns a figure, or None if the row has no such figure."""
         return self.figures.get(name)
 
     def with_figures(self, **figures: float | None) -> Row:
-        """A copy with more figures."""
+        """Returns a copy with more figures."""
         return replace(self, figures={**self.figures, **figures})
 
     def with_timing(self, timing: Timing, name: str = "decode_ms", calls: int = 1) -> Row:
-        """A copy with a time, and with its spread where there is more than one sample.
+        """Returns a copy with a time, and with its spread if there is more than one sample.
 
         Args:
-            timing: Of a call.
-            name: Of the figure.
-            calls: How many of what the row is about, such as steps, a timed call has.
+            timing: Time of a call.
+            name: Name of the figure.
+            calls: Number of repetitions, such as steps, inside a timed call.
         """
         spread = (timing.p90_ms - timing.p10_ms) / calls if timing.n > 1 else None
         return self.with_figures(**{name: timing.median_ms / calls, f"{name}_spread": spread})

@@ -243,7 +243,7 @@ def storage_rows(bench: SmokeBench) -> list[Row]:
 
 
 def advection_rows(bench: SmokeBench) -> list[Row]:
-    """Schemes and storages: the time of a step with and without solids, and the error after a ball's whole turn."""
+    """Measures schemes and storages: a step with and without solids, and the error after a whole turn of a ball."""
     rows = []
     n = bench.sizes.coarse
     box, cells = _box(n), (_RATIO * n) ** 3
@@ -302,7 +302,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
 
 
 def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattice:
-    """Air in through a round inlet, past a sphere, out at the other end between walls; or at rest."""
+    """Makes a lattice with a round inlet, a sphere, an outlet and walls; or with air at rest."""
     lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
     if faces != "periodic":
         for face in ("-x", "+x", "-y", "+y", "-z", "+z"):
@@ -322,7 +322,7 @@ def _sphere(mask: wp.array, moved: float) -> wp.array:
 
 
 def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
-    """Steps of a jet whose sphere goes to and fro, and how many they are."""
+    """Returns a call with steps of a jet whose sphere moves to and fro, and their number."""
     lattice, speed, steps = _jet(bench, size), 0.05, 10
     mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
     lattice.step(1)
@@ -338,7 +338,7 @@ def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
 
 
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
-    """Bytes of one cell that a step has to read and write: populations, and whether it is solid."""
+    """Returns the bytes of one cell that a step must read and write: populations and the solid flag."""
     return 2 * len(velocity_set(lattice).c) * (2 if storage == "float16" else 4) + int(faces == "all")
 
 
@@ -357,7 +357,7 @@ def _fields(density: torch.Tensor, storage: str, device: str) -> advection.Field
 
 
 def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
-    """Cells of a sphere in the middle, whose radius is a share of the edge; none for a radius of 0."""
+    """Marks the cells of a central sphere, whose radius is a share of the edge; an empty array for a radius of 0."""
     n = box.coarse[0]
     walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
     if radius:
@@ -368,7 +368,7 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
 
 
 def _swirl(n: int, device: str) -> wp.array:
-    """Eddies of the size of the box, at the speed of air on a lattice."""
+    """Makes the velocity of eddies of the size of the box, at the speed of air on a lattice."""
     at = 2 * np.pi * (np.arange(n) + 0.5) / n
     x, y, _ = np.meshgrid(at, at, at, indexing="ij")
     u = _SPEED * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0.5 * np.sin(x + y)], -1)
@@ -376,7 +376,7 @@ def _swirl(n: int, device: str) -> wp.array:
 
 
 def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
-    """A step that writes to a second field: replayed, it does the same again."""
+    """Returns a step that writes to a second field, so that a replay repeats the same work."""
 
     def step() -> None:
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
@@ -387,7 +387,7 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
 
 
 def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
-    """Smoke in a cube in the box's corner that is a share of the box."""
+    """Makes fields with smoke in a cube in a corner, whose volume is a share of the box."""
     edge = _RATIO * bench.sizes.coarse
     density = torch.zeros((edge,) * 3, device=bench.device)
     full = round(fill ** (1 / 3) * edge)
@@ -396,7 +396,7 @@ def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
-    """A step in bricks, their lists and the emptying of others; and the bricks."""
+    """Returns a step in bricks, with the update of their lists and the clearing of retired bricks; and the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
     bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
@@ -481,7 +481,7 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
 
 
 def guide_rows(bench: SmokeBench) -> list[Row]:
-    """Guiding maps by their step, with marches to the lights shared or each pixel's own, against a fine march."""
+    """Measures guiding maps by their step, with shared or separate marches to the lights, against a fine march."""
     bench.note("guide")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
@@ -527,7 +527,7 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
 
 
 def six_rows(bench: SmokeBench) -> list[Row]:
-    """The fine march of six-way lightmaps by its step, with its own estimate of its error."""
+    """Measures the fine march of six-way lightmaps by its step, with its own estimate of its error."""
     bench.note("six ways")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
@@ -557,7 +557,7 @@ def six_rows(bench: SmokeBench) -> list[Row]:
 
 
 def weight_rows(bench: SmokeBench) -> list[Row]:
-    """Rules that weight six lightmaps, against a march to each of some oblique lights, on the demo's plume."""
+    """Measures the rules that weight six lightmaps against a march to each of some oblique lights, on a plume."""
     bench.note("weights")
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
@@ -685,7 +685,7 @@ def _drawn(
 
 
 def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Callable[[], object]]:
-    """Six planes by path tracing, under lights along the camera's axes."""
+    """Returns calls that trace six planes, under lights along the axes of the camera."""
     six = [Light(tuple(map(float, sign * axis)), (4 * math.pi,) * 3) for axis in camera.axes for sign in (1.0, -1.0)]
     settings = {"samples": paths, "orders": 0}
     return {
@@ -695,7 +695,7 @@ def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Call
 
 
 def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
-    """The cloud in both storages, and a camera that looks down on it from aside."""
+    """Makes the cloud in both storages, and a camera above and beside it."""
     n, pixels = bench.sizes.cloud, bench.sizes.resolution
     density = make_cloud(n, bench.device)
     volumes = {
@@ -708,7 +708,7 @@ def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
 
 
 def _directions(count: int) -> np.ndarray:
-    """Directions spread evenly on a sphere, none along an axis: the points of Fibonacci's spiral, [count, 3]."""
+    """Returns evenly distributed directions, the points of a Fibonacci spiral on a sphere, [count, 3]."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     across = np.sqrt(1.0 - height**2)
@@ -720,7 +720,7 @@ def _rms(values: torch.Tensor) -> float:
 
 
 def _relative(values: torch.Tensor, exact: torch.Tensor) -> float:
-    """The RMS difference over the RMS of the exact values."""
+    """Returns the RMS difference over the RMS of the exact values."""
     return _rms(values.double() - exact.double()) / _rms(exact)
 
 
@@ -766,6 +766,6 @@ def run_rows(sizes: Sizes, *, device: str, progress: Note | None = None) -> list
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
-    """The rows that a plot shows."""
+    """Returns the rows that a plot shows."""
     methods = {method for panel in PANELS for method in panel.methods}
     return [row for row in rows if row.method in methods]

@@ -168,7 +168,7 @@ class Frame:
         return self.earlier, self.later
 
     def scaled(self, factor: float) -> "Frame":
-        """The pair with another density."""
+        """Returns the pair with another density."""
         parts = (replace(part, extinction=part.extinction * factor) for part in self.smoke)
         return Frame(*parts, self.motion, self.seed)
 
@@ -210,16 +210,16 @@ class NetworkBench(Bench):
 
     @property
     def trained(self) -> list[Subject]:
-        """The networks that are scored."""
+        """The trained networks."""
         return [subject for subject in self.subjects if subject.trained]
 
     def turned(self, degrees: float) -> Camera:
-        """The camera, turned about the smoke's centre."""
+        """Returns the camera turned about the centre of the smoke."""
         view = CameraSettings(extent=_EXTENT, resolution=self.sizes.resolution).turned(_TURN + degrees)
         return make_camera(view, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
-        """Planes [8, H, W] by the finest march."""
+        """Computes planes [8, H, W] by the finest march."""
         return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:
@@ -283,7 +283,7 @@ class NetworkBench(Bench):
 
 
 class Pipeline:
-    """The whole way from smoke to lightmaps by a network: guiding map, network, and planes decoded to light.
+    """All stages from smoke to lightmaps by a network: guiding map, network, and decoding of the planes.
 
     Attributes:
         subject: The network.
@@ -297,13 +297,13 @@ class Pipeline:
         self._bench = bench
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
-        """The planes that the network predicts, [8, H, W]; a copy."""
+        """Predicts planes [8, H, W]; the result is a copy."""
         look = self.subject.settings.look(volume.shape, seed)
         with stream(self._bench.device):
             return self.decoder(render_guide(volume, camera, self.decoder.guide, look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
-        """Calls that make a frame's guiding map, planes and lightmaps, each from the result of the one before."""
+        """Returns calls that make the guiding map, the planes and the lightmaps of a frame, one after the other."""
         look = self.subject.settings.look(frame.later.shape, frame.seed + 1)
         kind, hot = self.decoder.guide, frame.later.temperature is not None
         encoded = render_guide(frame.later, self.camera, kind, look)
@@ -452,7 +452,7 @@ def plotted(rows: Sequence[Row]) -> list[Row]:
 
 
 def _plane_psnr(plane: int, predicted: Sequence[torch.Tensor], references: Sequence[torch.Tensor]) -> float:
-    """PSNR of one of the planes, over all frames."""
+    """Returns the PSNR of one of the planes, over all frames."""
     squares = [float((a[plane] - b[plane]).square().mean()) for a, b in zip(predicted, references, strict=True)]
     return psnr_from_mse(sum(squares) / len(squares), 1.0)
 
@@ -586,7 +586,7 @@ def density_rows(bench: NetworkBench) -> list[Row]:
 
 
 def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, settings: DatasetSettings) -> Pool:
-    """The frames as samples with guiding maps of some settings."""
+    """Makes samples of the frames, with guiding maps of some settings."""
     guides = []
     for frame in frames:
         shape = frame.later.shape

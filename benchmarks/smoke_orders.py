@@ -214,7 +214,7 @@ def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -
 
 
 def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
-    """The rows of one scene at both albedos."""
+    """Makes the rows of one scene at both albedos."""
     found: dict[float, dict[str, list[torch.Tensor]]] = {albedo: {} for albedo in ALBEDOS}
     traced: list[tuple[dict[float, torch.Tensor], ...]] = []
     opacity = []
@@ -272,7 +272,7 @@ def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
 
 
 def _octaves_by_angle(shot: Shot) -> torch.Tensor:
-    """The octaves of each light times powers of the cosine between it and the camera, [O * 3, H, W, 3]."""
+    """Multiplies the octaves of each light by powers of the cosine between light and camera, [O * 3, H, W, 3]."""
     height, width = shot.camera.height, shot.camera.width
     parts = torch.zeros((_POWERS, len(FITTED), height, width, 3), device=shot.volume.device)
     for light in shot.lights:
@@ -284,7 +284,7 @@ def _octaves_by_angle(shot: Shot) -> torch.Tensor:
 
 
 def _filter_by_angle(shot: Shot) -> torch.Tensor:
-    """The filter's planes of each light times powers of the cosine between it and the camera, [P * 3, H, W, 3]."""
+    """Multiplies the filter planes of each light by powers of the cosine to the camera, [P * 3, H, W, 3]."""
     parts = 0.0
     for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
         cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
@@ -294,14 +294,14 @@ def _filter_by_angle(shot: Shot) -> torch.Tensor:
 
 
 def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
-    """All light at each of `ALBEDOS`, [H, W, 3]."""
+    """Traces all light at each of `ALBEDOS`, [H, W, 3]."""
     seed = 2 * shot.seed + salt
     made = trace(shot.volume, shot.camera, shot.lights, samples=samples, orders=_KEPT, seed=seed)
     return {albedo: made.total if albedo == 1.0 else made.with_albedo((albedo,) * 3).total for albedo in ALBEDOS}
 
 
 def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """The pictures that one mix of features [N, H, W, 3] is, the nearest to the truth by least squares as in sRGB."""
+    """Fits one mix of features [N, H, W, 3] to the truth by least squares as in sRGB; returns its pictures."""
     left, right = 0.0, 0.0
     for parts, wanted in zip(features, truth, strict=True):
         weights = ((wanted.clamp(min=0.0) + FAINT) ** -_CURVE).flatten().double()
@@ -314,7 +314,7 @@ def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> 
 
 
 def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
-    """The time of one picture by each way; on CUDA as a graph, where nothing on the way waits for the device."""
+    """Times one picture by each method; on CUDA as a graph, unless the method waits for the device."""
     ways, albedo = _ways(), ALBEDOS[0]
     calls = {way: lambda make=make: make(shot, albedo) for way, make in ways.items()}
     calls[_OCTAVES] = lambda: octaves(shot.volume, shot.camera, shot.lights)
@@ -344,7 +344,7 @@ def _flicker(
     halves: Sequence[tuple[torch.Tensor, torch.Tensor]],
     opacity: Sequence[torch.Tensor],
 ) -> dict[str, float]:
-    """RMS change in levels of 255, over the shots that follow on the one before, and over the references'.
+    """Computes the RMS change between consecutive shots in levels of 255, and its ratio to that of the references.
 
     References that change by no more than their noise, whose product isn't above 0, have nothing to be compared with.
     """
@@ -370,7 +370,7 @@ def _flicker(
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
-    """Lights in colours drawn at random."""
+    """Draws the colours of lights at random."""
     colours = random.dirichlet(np.ones(3), len(ways)) * 3.0 / len(ways) * _FOUR_PI
     return tuple(Light(tuple(way), tuple(map(float, colour))) for way, colour in zip(ways, colours, strict=True))
 
@@ -452,7 +452,7 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
 
 
 def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Tensor, float]]:
-    """Densities [X, Y, Z] and extinctions."""
+    """Yields densities [X, Y, Z] and extinctions."""
     for seed in _PLUMES:
         drawn = make_plume(min(cells, _DRAWN), seed=seed, hot=False).density.to(device)
         size = (cells,) * 3
@@ -491,7 +491,7 @@ def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, ce
 
 
 def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> tuple[float, float]:
-    """PSNR of a picture of a plume under three lights, and of single scattering's."""
+    """Returns the PSNR of a picture of a plume under three lights, and that of single scattering."""
     volume, camera, ways = draw_view(_SEED, number, pixels=_PIXELS, lights=3)
     volume = replace(volume, density=volume.density.to(device))
     lights = [Light(way.toward, (_FOUR_PI / 3,) * 3) for way in ways]

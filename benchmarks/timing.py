@@ -1,4 +1,4 @@
-"""How long a call takes, on the CPU or on a CUDA device.
+"""Timing of calls on the CPU or on a CUDA device.
 
 A number here is the time of one call among many, back to back, after a warm-up that compiles kernels and fills
 caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
@@ -80,7 +80,7 @@ _Sampler = Callable[[Callable[[], object], int], float]
 
 @contextlib.contextmanager
 def _clock(device: str) -> Iterator[_Sampler]:
-    """A function `(fn, calls) -> milliseconds a call` for the device."""
+    """Provides a function `(fn, calls) -> milliseconds per call` for the device."""
     # Imported here so that reading results needs neither torch nor Warp.
     from wlm import interop
 

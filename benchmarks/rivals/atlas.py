@@ -35,12 +35,12 @@ _EXTRA = "baselines"
 
 
 def share_of(rival: Rival, scene: LightmappedScene) -> float:
-    """The bits of a rival over the lightmap's at 48 per texel."""
+    """Returns the bits of a rival over the bits of the lightmap at 48 per texel."""
     return rival.bytes * 8 / (scene.texels * SOURCE_BITS)
 
 
 def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) -> Rival:
-    """The lightmap at a lower resolution in RGB9E5, read bilinearly.
+    """Stores the lightmap at a lower resolution in RGB9E5, read bilinearly.
 
     Args:
         scene: A scene of one lightmap.
@@ -63,7 +63,7 @@ def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) 
 
 
 def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
-    """The lightmap in blocks of 16 bytes, at the highest resolution, up to its own, whose blocks are within the budget.
+    """Stores the lightmap in blocks of 16 bytes, at the highest resolution whose blocks are within the budget.
 
     Args:
         scene: A scene of one lightmap.
@@ -95,7 +95,7 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
 
 
 def best_astc(scene: LightmappedScene, share: float) -> Rival:
-    """ASTC with the smallest blocks that hold the lightmap at its own size within the budget, else `astc12x12`.
+    """Stores the lightmap in the smallest ASTC blocks that keep its size within the budget, else in `astc12x12`.
 
     Resizing a lightmap by little costs more than larger blocks do.
     """

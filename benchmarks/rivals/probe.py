@@ -36,7 +36,7 @@ _ROUNDS = 10
 
 
 def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
-    """Principal components of all probes, which are one part (GPCA)."""
+    """Compresses all probes, as one part, by principal components (GPCA)."""
     position, values = _checked(position, values, components, bits)
     return _pca("global_pca", "part", position, values, components, bits, lambda: probe_pca.whole(position))
 
@@ -51,7 +51,7 @@ def clustered_pca(
     signal: bool = False,
     bits: int | None = None,
 ) -> Rival:
-    """Principal components of each cluster (CPCA).
+    """Compresses each cluster by principal components (CPCA).
 
     Args:
         position, values, components, bits: See the module.
@@ -79,7 +79,7 @@ def moving_basis(
     *,
     bits: int | None = None,
 ) -> Rival:
-    """Moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
+    """Compresses by moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
 
     Args:
         position, values, components, bits: See the module; a part is a cell, the basis vectors are at its corners.
@@ -98,7 +98,7 @@ def moving_basis(
 
 
 def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Rival:
-    """SH as the bricks of Unreal's volumetric lightmap store it, without sky occlusion: 28 bytes a probe at L2.
+    """Packs SH as the bricks of Unreal's volumetric lightmap do, without sky occlusion: 28 bytes per probe at L2.
 
     The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
     have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,
@@ -131,7 +131,7 @@ def at_bytes(
     budget_bytes: int,
     bits: Sequence[int | None] = WEIGHT_BITS,
 ) -> Rival:
-    """The settings of one method with the least squared error that a size allows, by a small search.
+    """Searches for the settings of one method with the least squared error at a size.
 
     For each number of bits the component counts are tried from the largest downwards until two in a row gain
     nothing, each with as many parts as fit, at most `MAX_PARTS` or `MAX_GRID` cells.

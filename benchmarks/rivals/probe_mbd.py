@@ -9,8 +9,8 @@ gaussian-probe-compression, section 2.2, holds against the method, ask for nothi
 
 What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D, K, cells along the
 box's longest side, scale), float16 [V, K + 1, D] means and bases in units of the scale, and the weights as in
-`probe_pca`, a cell of the grid being a part. Only corners that some probe feels and cells that hold one are stored;
-which those are follows from the positions.
+`probe_pca`, a cell of the grid being a part. Only corners with a share in a probe and cells with a probe are stored; a
+decoder finds them from the positions.
 """
 
 import struct
@@ -73,11 +73,11 @@ class Solver:
             self.solve_weights()
 
     def error(self) -> float:
-        """Sum of squared errors."""
+        """Returns the sum of squared errors."""
         return float(np.square(self._residual(self._at_probes())).sum())
 
     def solve_weights(self) -> None:
-        """The best weights for the corners, and a unit of weight that is their root mean square."""
+        """Solves for the weights at fixed corners, and normalises them to a root mean square of 1."""
         here = self._at_probes()
         basis = here[:, 1:]
         gram = basis @ basis.transpose(0, 2, 1)
@@ -90,7 +90,7 @@ class Solver:
         self.corner[:, 1:] *= size[:, None]
 
     def solve_corners(self) -> None:
-        """The best corners for the weights."""
+        """Solves for the corners at fixed weights."""
         corners, columns, width = self.corner.shape
         factor = np.concatenate([np.ones((len(self.weight), 1)), self.weight], 1)
         data = self._share[:, :, None] * factor[:, None, :]
@@ -106,7 +106,7 @@ class Solver:
         self.corner += solved.reshape(corners, columns, width)
 
     def _at_probes(self) -> np.ndarray:
-        """Mean and basis at each probe, [N, K + 1, D]."""
+        """Returns mean and basis at each probe, [N, K + 1, D]."""
         return _interpolate(self.corner, self._near, self._share)
 
     def _residual(self, here: np.ndarray) -> np.ndarray:
@@ -173,13 +173,13 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def payload_bytes(probes: int, width: int, components: int, parts: tuple[int, int], bits: int | None) -> int:
-    """Length of a payload, from N, D, K, the `grid_parts` and the bits of a weight."""
+    """Returns the length of a payload, from N, D, K, the `grid_parts` and the bits of a weight."""
     corners, cells = parts
     return _HEADER.size + corners * (components + 1) * width * 2 + weight_bytes(probes, components, cells, bits)
 
 
 def grid_parts(position: np.ndarray, grid: int) -> tuple[int, int]:
-    """V, corners of the grid that some probe feels, and the number of cells that hold a probe."""
+    """Returns V, the corners of the grid with a share in a probe, and the number of cells that contain a probe."""
     near, _, cell = _interpolation(position, grid)
     return int(near.max()) + 1, int(cell.max()) + 1
 
@@ -192,11 +192,11 @@ def _interpolate(corner: np.ndarray, near: np.ndarray, share: np.ndarray) -> np.
 
 
 def _interpolation(position: np.ndarray, grid: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the probes lie in the grid.
+    """Locates the probes in the grid.
 
     Returns:
         The 8 corners around each probe, int64 [N, 8]; their shares, float64 [N, 8]; and the cell that each probe lies
-        in, int64 [N]. Corners that are felt and cells that are in use are numbered from 0.
+        in, int64 [N]. Corners with a share and cells in use are numbered from 0.
     """
     at = (position - position.min(0)) * (grid / extent_of(position))
     # A probe on the box's far side belongs to the last cell, not to one behind it.
@@ -205,7 +205,7 @@ def _interpolation(position: np.ndarray, grid: int) -> tuple[np.ndarray, np.ndar
     offset = np.stack(np.meshgrid((0, 1), (0, 1), (0, 1), indexing="ij"), -1).reshape(8, 3)
     share = np.where(offset, inside[:, None], 1.0 - inside[:, None]).prod(2)
     key = cell_keys(cell[:, None] + offset)
-    # A corner without a share is not felt: the one with the most stands in for it.
+    # A corner without a share is replaced by the one with the largest share.
     most = np.take_along_axis(key, share.argmax(1)[:, None], 1)
     near = compact(np.where(share > 0.0, key, most).ravel())[0]
     return near.reshape(key.shape), share, compact(cell_keys(cell))[0]

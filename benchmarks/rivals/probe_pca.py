@@ -67,12 +67,12 @@ class Partition:
 
 
 def whole(position: np.ndarray) -> Partition:
-    """All probes as one part."""
+    """Returns all probes as one part."""
     return Partition(WHOLE, np.zeros(len(position), np.int64), 1, b"")
 
 
 def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
-    """K-means on the positions (gaussian-probe-compression, section 5.1); a probe belongs to the nearest centre.
+    """Divides probes by k-means on the positions (gaussian-probe-compression, section 5.1).
 
     Args:
         position: float64 [N, 3].
@@ -98,7 +98,7 @@ def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
 
 
 def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> Partition:
-    """Clustered PCA (Sloan et al. 2003): a probe belongs to the affine subspace that reconstructs it best.
+    """Divides probes by clustered PCA (Sloan et al. 2003): each probe has the affine subspace of least error.
 
     Lloyd's iteration with subspaces in place of centres, first with none of the basis vectors, which is k-means on
     the values, then with all of them. A cluster that loses all its probes falls away.
@@ -126,7 +126,7 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
 
 
 def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and principal directions of each part.
+    """Computes mean and principal directions of each part.
 
     Args:
         values: float64 [N, D].
@@ -210,29 +210,29 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def part_count(payload: bytes) -> int:
-    """C of a payload."""
+    """Returns the number of parts C of a payload."""
     return HEADER.unpack_from(payload)[4]
 
 
 def payload_bytes(kind: int, probes: int, width: int, components: int, count: int, bits: int | None) -> int:
-    """Length of a payload, from the kind of `Partition`, N, D, K, C and the bits of a weight."""
+    """Returns the length of a payload, from the kind of `Partition`, N, D, K, C and the bits of a weight."""
     size = HEADER.size + _PARTITION_BYTES[kind](probes, count) + count * (components + 1) * width * 2
     return size + weight_bytes(probes, components, count, bits)
 
 
 def scale_of(values: np.ndarray) -> float:
-    """The largest magnitude, as float32 holds it; 1 where all is zero."""
+    """Returns the largest magnitude in float32; 1 if all values are zero."""
     return float(np.float32(np.abs(values).max())) or 1.0
 
 
 def rescale(decoded: np.ndarray, scale: float) -> np.ndarray:
-    """Decoded values [N, D] times the scale, as float32 and within its range."""
+    """Multiplies decoded values [N, D] by the scale; the result is float32 within its range."""
     limit = float(np.finfo(np.float32).max)
     return np.clip(decoded.astype(np.float64) * scale, -limit, limit).astype(np.float32)
 
 
 def weight_bytes(probes: int, components: int, count: int, bits: int | None) -> int:
-    """Bytes of `write_weights` for N probes in C parts."""
+    """Returns the bytes of `write_weights` for N probes in C parts."""
     if bits is None:
         return probes * components * 2
     return count * components * 4 + -(-probes * components * bits // 8)
@@ -299,7 +299,7 @@ def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) ->
 
 
 def _levels(bounds: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest value and step [C, K] of bounds [C, 2, K]."""
+    """Returns lowest value and step [C, K] of bounds [C, 2, K]."""
     low, high = bounds.astype(np.float64).transpose(1, 0, 2)
     return low, (high - low) / (2**bits - 1)
 
@@ -309,12 +309,12 @@ def _index_bits(count: int) -> int:
 
 
 def extent_of(position: np.ndarray) -> float:
-    """Longest side of the probes' box; 1 where all are in one place."""
+    """Returns the longest side of the box of the probes; 1 if all have one position."""
     return float(np.ptp(position, axis=0).max()) or 1.0
 
 
 def cell_keys(cell: np.ndarray) -> np.ndarray:
-    """One int64 for each cell [..., 3] of a grid, whose three numbers are whole, 0 to MAX_CELLS."""
+    """Returns one int64 key for each cell [..., 3] of a grid, whose indices are integers from 0 to MAX_CELLS."""
     x, y, z = np.moveaxis(cell.astype(np.int64), -1, 0)
     return (x << 42) | (y << 21) | z
 
@@ -331,7 +331,7 @@ def compact(label: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _nearest(position: np.ndarray, code: np.ndarray) -> np.ndarray:
-    """The nearest of the stored centres, int64 [N]."""
+    """Returns the nearest of the stored centres, int64 [N]."""
     centre = position.min(0) + code.astype(np.float64) * (extent_of(position) / _CENTRE_LEVELS)
     return cKDTree(centre).query(position)[1].astype(np.int64)
 
@@ -351,7 +351,7 @@ def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.nd
 
 
 def _closest(values: np.ndarray, mean: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, float]:
-    """The subspace that reconstructs each of [N, D] best, int64 [N], and the sum of their squared errors."""
+    """Returns the subspace of least error for each of [N, D], int64 [N], and the sum of the squared errors."""
     count, rank, width = basis.shape
     flat = basis.reshape(count * rank, width)
     offset = np.einsum("ckd,cd->ck", basis, mean)

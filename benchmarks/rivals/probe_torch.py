@@ -21,7 +21,7 @@ _QUANTISE_FROM = 5 / 6  # share of the steps after which the Gaussians are used 
 
 
 class DenseFit:
-    """Probes being fitted.
+    """The fit of a probe set.
 
     Attributes:
         parameters: The tensors that the optimiser moves: centres [K, 3], logs of the scales [K, 3], quaternions
@@ -125,7 +125,7 @@ class DenseFit:
 
     @torch.no_grad()
     def decoded(self) -> np.ndarray:
-        """The probes from Gaussians on the levels of a file, float32 [N, D]."""
+        """Decodes the probes from Gaussians on the levels of a file, float32 [N, D]."""
         return (self._answer(quantised=True) * self._spread + self._mean).cpu().numpy()
 
     def _put(self, array: np.ndarray) -> torch.Tensor:
@@ -146,7 +146,7 @@ class DenseFit:
 
 
 def _features(x, centre, log_scale, rotation, latent):  # [N, 3], [K, 3], [K, 3], [K, 4], [K, L] -> [N, L]
-    """Eq. 2 to 5."""
+    """Evaluates eq. 2 to 5."""
     whiten = _matrices(rotation).transpose(1, 2) * torch.exp(-log_scale)[:, :, None]  # [K, 3, 3], S^-1 R^T
     u = torch.einsum("kij,nj->nki", whiten, x) - torch.einsum("kij,kj->ki", whiten, centre)
     return torch.exp(-0.5 * (u * u).sum(-1)) @ latent
@@ -163,7 +163,7 @@ def _matrices(rotation):  # [K, 4] -> [K, 3, 3]
 
 
 def _on_levels(values, levels):  # [K, C] -> [K, C]
-    """Eq. 13 and 14, with the gradient passed straight through."""
+    """Quantises by eq. 13 and 14, with a straight-through gradient."""
     with torch.no_grad():
         low, high = values.amin(0), values.amax(0)
         size = torch.where(high > low, (high - low) / levels, 1.0)
@@ -172,7 +172,7 @@ def _on_levels(values, levels):  # [K, C] -> [K, C]
 
 
 def _first_gaussians(x: np.ndarray, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Centres float64 [K, 3] by k-means, and scales float64 [K] from the nearest other centre (section 3.2)."""
+    """Returns centres float64 [K, 3] by k-means, and scales float64 [K] from the nearest centre (section 3.2)."""
     distinct = np.unique(x, axis=0)
     centre = distinct[random.choice(len(distinct), min(count, len(distinct)), replace=False)]
     for _ in range(_ROUNDS):

@@ -1,4 +1,4 @@
-"""The shape that every rival has, whichever system it is compared with."""
+"""The result of a rival of any system, and its measurement."""
 
 import time
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _Payload = TypeVar("_Payload")
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """An input that went through one method.
+    """An input compressed and decoded by one method.
 
     Attributes:
         name: The method, a key of its module's `RIVALS`.
@@ -60,7 +60,7 @@ def measure(
         decode: Reads it.
         bytes: The payload's size.
         disk_bytes: Its size on a disk; compressing for that takes no part in the times.
-        option: What to tell of it.
+        option: Describes the settings of the payload.
     """
     start = time.perf_counter()
     payload = encode()
@@ -72,7 +72,7 @@ def measure(
 
 
 def disk_size(data: bytes) -> int:
-    """Size of some bytes under zstd, as KTX2 files and engines' packages have them, or as they are if that is less.
+    """Returns the size of some bytes under zstd, as in KTX2 files and packages of engines, or uncompressed if smaller.
 
     Raises:
         WlmError: imagecodecs, of the extra `baselines`, is missing.

@@ -51,7 +51,7 @@ class SceneParts:
 
     @property
     def bits(self) -> float:
-        """Bits of all textures."""
+        """The bits of all textures."""
         models = (model for of_sheet in self.models for model in of_sheet)
         return sum(model.bits for model in models)
 

@@ -15,7 +15,7 @@ _SIX = GUIDES["six"]
 
 
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """The coarse march of six lights, which is a pool's guide of kind "six": what a network has to be better than.
+    """Returns the coarse march of six lights, which is a pool's guide of kind "six".
 
     Raises:
         ValueError: The pool's guides are of another kind.
@@ -90,6 +90,6 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:
-    """Where a point lies in the image, from its middle to the right and up, in the world's unit."""
+    """Returns the offset of a point from the middle of the image, to the right and up, in units of the world."""
     right, up, _ = camera.axes @ (np.asarray(pivot, np.float64) - np.asarray(camera.position, np.float64))
     return float(right), float(up)

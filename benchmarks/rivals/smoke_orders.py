@@ -52,7 +52,7 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
 
 
 def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """A picture by single scattering and diffusion alone, which the learned mix begins with, float32 [H, W, 3]."""
+    """Makes a picture by single scattering and diffusion, the inputs of the learned mix, float32 [H, W, 3]."""
     with stream(device_name(volume.device)):
         lit, inputs = make_inputs(volume, camera, lights, [albedo], orders_march(volume))
         return lit.compose(inputs.by_diffusion(albedo)[..., None].expand(-1, -1, -1, 3))
