@@ -147,7 +147,6 @@ COMPONENTS = [
 @pytest.mark.parametrize(
     ("method", "changes"),
     [*(("gaussians", changes) for changes in GAUSSIANS), *(("pca", changes) for changes in COMPONENTS)],
-    ids=str,
 )
 def test_parts_that_do_not_fit_are_one_line(method, changes, tmp_path):
     model = whole_model(positions=True) if method == "gaussians" else wlm.probe.compress(synthetic(100, dead=5))
