@@ -169,10 +169,10 @@ def read_lightmaps(
     """
     if mesh_path is not None:
         if meshes_path is not None or not lightmap_paths:
-            raise WlmError("bench atlas: expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
+            raise WlmError("expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
         return _lightmaps(Path(mesh_path), [Path(path) for path in lightmap_paths], mask_path)
     if lightmap_paths or mask_path is not None:
-        raise WlmError("bench atlas: --lightmap and --mask need --mesh FILE")
+        raise WlmError("--lightmap and --mask need --mesh FILE")
     folder = demo_data("atlas", "--meshes DIR") if meshes_path is None else Path(meshes_path)
     if not folder.is_dir():
         raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")

@@ -31,7 +31,7 @@ from benchmarks.atlas import (
     warm_up,
 )
 from benchmarks.rows import Row
-from benchmarks.runner import Bench, Note
+from benchmarks.runner import Bench, Note, check_only
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import chart_labels, compare
@@ -155,12 +155,9 @@ def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]
         WlmError: The profile is of tiles, or no row has such a name.
     """
     if base.method != "cascade":
-        raise WlmError(f"bench: --profile: expected one of method cascade, found {base.name}, of {base.method}")
+        raise WlmError(f"--profile: expected one of method cascade, found {base.name}, of {base.method}")
     rows = variants(base)
-    names = [option for _, option, _ in rows]
-    for name in only:
-        if name not in names:
-            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
+    check_only(only, [option for _, option, _ in rows])
     return [row for row in rows if not only or row[1] in only]
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.rivals.lightmap_torch import Features, PlainFit
 from benchmarks.rows import Row
-from benchmarks.runner import Bench, Note, demo_data
+from benchmarks.runner import Bench, Note, check_only, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.fit import compress, dynamic_targets
@@ -45,7 +45,10 @@ VARIANTS = {
     "8 channels of F_uv": Features(uv=2, channels=0),
     "no block simulation": Features(blocks=False),
 }
-"""The feature maps of each row but the last, at the sizes of profile M."""
+"""The feature maps of each row except the last, at the sizes of profile M."""
+
+ROWS = (*VARIANTS, KERNELS)
+"""The names of all rows."""
 
 _PROFILE = "M"
 _SEED = 0
@@ -81,7 +84,7 @@ def run(
         WlmError: The set or the device isn't there, no row has such a name, no tile is dynamic, or a fit diverged.
     """
     only = only or ()
-    _check(only)
+    check_only(only, ROWS)
     lightmaps = load(demo_data("city", "--set PATH") if set_path is None else set_path)
     profile = Profile.load(_PROFILE).override(_QUICK if quick else {})
     if steps is not None:
@@ -99,25 +102,16 @@ def run_rows(
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Fits the variants of a profile, without the sizes of its maps, to a set; other arguments as for `run`."""
-    names = _check(only)
+    check_only(only, ROWS)
     bench = _AblationBench(lightmaps, profile, device, progress)
     rows = []
-    for name in names:
+    for name in ROWS:
         if not only or name in only:
             bench.note(f"fits {name}")
             rows.append(bench.kernels_row() if name == KERNELS else bench.variant_row(name))
             if done is not None:
                 done(rows)
     return rows
-
-
-def _check(only: Sequence[str]) -> tuple[str, ...]:
-    """Checks the names of rows that are asked for; returns all there are."""
-    names = (*VARIANTS, KERNELS)
-    for name in only:
-        if name not in names:
-            raise WlmError(f"bench: --only: expected one of {', '.join(names)}; found '{name}'")
-    return names
 
 
 class _AblationBench(Bench):

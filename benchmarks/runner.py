@@ -164,6 +164,18 @@ def expect_alone(option: str, others: Mapping[str, object]) -> None:
         raise WlmError(f"{option}: expected without {' and '.join(others)}")
 
 
+def check_only(only: Sequence[str], names: Sequence[str]) -> None:
+    """Raises a `WlmError` if `--only` names a row that an ablation does not have.
+
+    Args:
+        only: The requested names.
+        names: The names of all rows.
+    """
+    for name in only:
+        if name not in names:
+            raise WlmError(f"--only: expected one of {', '.join(names)}; found '{name}'")
+
+
 def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
     """Compares a decode with the float64 decode of the same model.
 
@@ -193,5 +205,5 @@ def demo_data(name: str, option: str) -> Path:
     """
     path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / name
     if not path.exists():
-        raise WlmError(f"bench: the demo's data, {name}, come with a checkout alone; expected {option}")
+        raise WlmError(f"the demo data {name} exist only in a checkout: expected {option}")
     return path

@@ -244,7 +244,7 @@ class NetworkBench(Bench):
             if len(frames) == len(kinds):
                 break
         if len(frames) < len(kinds):
-            raise WlmError(f"bench: expected scenes of {', '.join(kinds)}, got {', '.join(frames)}; last: {trouble}")
+            raise WlmError(f"expected scenes of {', '.join(kinds)}, got {', '.join(frames)}; last: {trouble}")
         self.frames = [frame for kind in kinds for frame in frames[kind]]
 
     def _run(self, scene: Scene) -> list[Frame]:
@@ -351,7 +351,7 @@ def open_subjects(networks: Sequence[str | Path], profiles: Sequence[str]) -> li
     names = [subject.name for subject in subjects]
     for name in names:
         if names.count(name) > 1:
-            raise WlmError(f"bench: expected networks of different names, got {name} {names.count(name)} times")
+            raise WlmError(f"expected networks of different names, got {name} {names.count(name)} times")
     return subjects
 
 
