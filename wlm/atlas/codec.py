@@ -43,7 +43,7 @@ from wlm.system import Header, Name
 from wlm.texels import MOST_SIDE, check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
-_MOST_NUMBERS = 1 << 31  # along an axis of a part
+_MOST_NUMBERS = 1 << 31  # limit on the length of an axis of a part
 _GEOMETRY = ("mesh", "mask")
 
 _Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
@@ -79,10 +79,10 @@ class _Header(Header):
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Gives the settings, parts and source of a model's file. One seed gives one file: times are left out.
+    """Returns the settings, parts and source of a model's file. Times are left out, so that one seed gives one file.
 
     Raises:
-        ValueError: The model holds no triangles.
+        ValueError: The model stores no triangles.
     """
     stored = model.stored
     if stored is None:
@@ -124,19 +124,19 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def sizes(model: AtlasModel) -> tuple[int, int]:
-    """Bytes of a model's file, and of these the triangles and masks."""
+    """Returns the bytes of a model's file, and the part of them that triangles and masks take."""
     settings, parts, source = encode(model)
     whole = sum(memoryview(part).nbytes for part in encode_artifact(model.SYSTEM, settings, parts, source))
     return whole, sum(parts[name].nbytes for name in _GEOMETRY)
 
 
 def decode(artifact: Artifact) -> AtlasModel:
-    """Makes the model of an artifact, to the bit that was written.
+    """Reconstructs the model of an artifact, bit for bit as it was written.
 
     Raises:
         WlmError: A setting is wrong, a block isn't one of its format, the triangles are damaged, or a package that
             decodes blocks is missing.
-        ValueError: The parts don't fit the settings; so with LookupError, TypeError and AttributeError.
+        ValueError, LookupError, TypeError, AttributeError: The parts don't match the settings.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
     for size in header.sizes:
@@ -186,7 +186,7 @@ def decode(artifact: Artifact) -> AtlasModel:
 
 
 def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]:
-    """The parts, of the types and shapes that the settings ask for."""
+    """Returns the parts after checking their types and shapes against the settings."""
     shared, method = header.method == "shared", header.method
     texels, second = tuple(header.texels), header.block_texels
     if len(header.sizes) != len(header.sheets):
@@ -243,7 +243,7 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
 
 
 def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The masks of all sheets."""
+    """Unpacks the masks of all sheets."""
     whole = np.unpackbits(bits).astype(bool)
     ends = np.cumsum([0, *(math.prod(size) for size in header.sizes)])
     masks = tuple(whole[a:b].reshape(size) for a, b, size in zip(ends, ends[1:], header.sizes, strict=False))
@@ -253,7 +253,7 @@ def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
-    """The places of all sheets and levels, checked except for the bounds of the lookup texture."""
+    """Reads the places of all sheets and levels; the bounds of the lookup texture are not checked here."""
     if header.method != "shared":
         (size,), (name,) = header.sizes, header.sheets
         grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)
@@ -282,7 +282,7 @@ def _check_tiles(model: AtlasModel) -> None:
     """Checks that tiles lie within the textures, and sheets within the lookup texture.
 
     Raises:
-        ValueError: One does not.
+        ValueError: A tile or sheet lies outside.
     """
     pages, texels, second = len(model.texels), model.texels.shape[1:3], model.block_texels.shape[1:3]
     if model.method in ("tiles", "shared"):

@@ -28,7 +28,8 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
         for k in range(3):
             start, end = _directed(corner[:, k], corner[:, (k + 1) % 3])
-            # The edge's part within the row. Both ends of a level edge are ends of the other two edges.
+            # This is the edge's part within the row. Both ends of a horizontal edge are also ends of the other two
+            # edges.
             top, bottom = np.maximum(start[:, 1], row), np.minimum(end[:, 1], row + 1)
             meets = top <= bottom
             for y in (top, bottom):
@@ -43,7 +44,7 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Counts for every texel the triangles that hold its centre.
+    """Counts for every texel the triangles that contain its centre.
 
     A centre on an edge that two triangles share is in exactly one of them.
 
@@ -59,7 +60,7 @@ def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 
 def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str) -> torch.Tensor:
-    """`covered_texels` on a device: the ends of spans are found on the host, the spans filled there.
+    """Computes `covered_texels` on a device: the host finds the ends of spans, and the device fills them.
 
     Args:
         uv, triangle, height, width: As `covered_texels` takes them.
@@ -80,7 +81,7 @@ def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, de
 def _centre_spans(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields rows and their spans of texels, first <= column < stop, whose centres a triangle holds; int64 [N] each."""
+    """Yields rows and their spans of texels, first <= column < stop, with centres in a triangle; int64 [N] each."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -118,13 +119,13 @@ def _rows(
 
 
 def _directed(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Puts each edge's upper end first (of a level edge the left one), so that both its triangles compute alike."""
+    """Puts each edge's upper end (or left end, if horizontal) first, so that both its triangles compute alike."""
     swap = (a[:, 1] > b[:, 1]) | ((a[:, 1] == b[:, 1]) & (a[:, 0] > b[:, 0]))
     return np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The edges' x at height y: start's for a level edge, and never beyond the ends."""
+    """Computes the edges' x at height y: the start's x for a horizontal edge, and never beyond the ends."""
     drop = end[:, 1] - start[:, 1]
     share = np.divide(y - start[:, 1], drop, out=np.zeros_like(drop), where=drop > 0).clip(0.0, 1.0)
     return start[:, 0] + share * (end[:, 0] - start[:, 0])

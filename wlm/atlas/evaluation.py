@@ -1,16 +1,17 @@
 """Error of decoded lightmaps in views of the scene (lightmap-uv-clustering-cascade, section 4.1.4).
 
-The scene is drawn from cameras around it, `wlm.ops.views`, and as often by viewers who stand in it, where they can,
-`wlm.ops.indoors`. A pixel is the lightmap's linear RGB at its surface point, without any shading. The reference is the
-original lightmap read bilinearly, clamped, its gaps filled from the nearest texel of a chart. Only covered pixels
-count; a view without any is left out. A view is scored in every state, and figures are means over states and views.
+The scene is rendered from cameras around it (`wlm.ops.views`) and, where viewers can stand in it, from as many cameras
+inside it (`wlm.ops.indoors`). A pixel is the lightmap's linear RGB at its surface point, without any shading. The
+reference is the original lightmap read bilinearly, clamped, its gaps filled from the nearest texel of a chart. Only
+covered pixels count; a view without any is left out. A view is scored in every state, and figures are means over states
+and views.
 
 The peak of every PSNR and the range of SSIM are one number for each state: maximum less minimum of the reference's
 covered pixels of all views. (The paper doesn't name its peak; one per view would change with the cameras.) A maximum
 above twice the 99.9th percentile counts as that: one bright texel must not make every error small.
 
-Errors are also taken as a screen shows them: light is exposed so that nearly all of the original's charts are below
-white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
+Errors are also measured as displayed on a screen: light is exposed so that nearly all of the original's charts are
+below white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
 
 The stated behaviours:
 
@@ -24,7 +25,7 @@ a millionth                           range to measure against
 nothing covered in any view           the same, and the errors are NaN too
 no seam on any screen                 `seam_error` and `seam_ratio` are NaN
 an error at seams alone               `seam_ratio` is infinite, null in JSON
-FLIP of no covered view               NaN, null in JSON: it is taken of some of the views alone
+FLIP of no covered view               NaN, null in JSON: FLIP uses only some of the views
 NaN or Inf in decoded colours         error that names the decoder
 ====================================  ================================================================
 """
@@ -65,7 +66,7 @@ from wlm.system import Meter, OnProgress
 from wlm.texels import exposure, to_srgb
 
 Sampler = Callable[[Points, int], torch.Tensor]
-"""A decoder: points of a scene, on one device, and the number of a state, to linear RGB float [N, 3]."""
+"""A decoder maps points of a scene, on one device, and the number of a state to linear RGB float [N, 3]."""
 
 Labels = Callable[[Points], torch.Tensor]
 """Numbers of a decoder's own charts or tiles at points, int [N]."""
@@ -74,13 +75,13 @@ VIEWS, RESOLUTION = 50, 512
 """Cameras of a score, as many as in section 4.1.4, and pixels along a side of a view, which the paper doesn't state."""
 
 SHARED_VIEWS, SHARED_RESOLUTION = 24, 256
-"""The same for a scene of several lightmaps."""
+"""Number of cameras and resolution for a scene with several lightmaps."""
 
 FLIP_VIEWS = 8
 """FLIP is the mean of about this many views and states, evenly chosen: it takes longer than the rest of a score."""
 
 _PERCENTILE, _ABOVE = 0.999, 2.0  # see the peak
-_BINS, _OCTAVES = 8192, (-32.0, 32.0)  # of a histogram of light
+_BINS, _OCTAVES = 8192, (-32.0, 32.0)  # bins and range of a histogram of light
 _ON_DEVICE = 1 << 32  # bytes of reference lightmaps that stay on the device
 
 # Wang et al. 2004, as in `wlm.metrics.structural`.
@@ -98,14 +99,15 @@ class Score(system.Report):
         name: The scene's name.
         views: Number of views that show a sheet.
         pixels: Covered pixels in all of them.
-        peak: Range of the reference there, of the PSNRs and SSIM, see the module; mean over the states.
+        peak: Range of the reference there, used for PSNR and SSIM (see the module); mean over the states.
         peaks: The same, by state.
         brightest: Maximum of the reference there, in any state.
         psnr: dB, the mean over states and views.
         psnr_by_state: dB, means over the views.
         around_psnr, inside_psnr: The same as `psnr` for the views from around the scene and for those from inside.
         inside_views: Number of views from inside that show a sheet.
-        eye_height: Height of the viewers' eyes above their floor, in the scene's unit; NaN where nobody can stand.
+        eye_height: Height of the cameras inside the scene above the ground, in the scene's unit; NaN where there are
+            none.
         psnr_worst: dB, of the worst view and state.
         worst_view: Its number among the cameras; -1: no view, or no peak.
         one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over views and states: a Gaussian
@@ -113,10 +115,10 @@ class Score(system.Report):
             both pictures have the reference's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
         rest_error: Mean absolute error of all other pixels.
-        seam_ratio: `seam_error` over `rest_error`: 1 where seams don't stand out.
+        seam_ratio: `seam_error` over `rest_error`: 1 where seams are no worse than other pixels.
         texel_psnr: dB, over the texels that are in a mask and have their centre in a triangle; mean over the states.
-        tone_psnr: dB, the mean over views and states of each view's as a screen shows it.
-        flip: Mean FLIP of some of the views as a screen shows them, 0 to 1.
+        tone_psnr: dB, the mean over views and states of the PSNR as displayed on a screen.
+        flip: Mean FLIP of some of the views as displayed on a screen, 0 to 1.
     """
 
     name: str
@@ -184,7 +186,7 @@ def evaluate(
         views, resolution, device, progress: As for `compare`.
 
     Raises:
-        WlmError: There is no such device, or the model was made of another scene.
+        WlmError: There is no such device, or the model was made from another scene.
     """
     if model.source != scene.source:
         raise WlmError(
@@ -217,9 +219,9 @@ def compare(
     labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmaps. Each view is drawn twice for all of them.
+    """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders together.
 
-    On the CPU torch has one thread until it returns: 50 views of 512² take some seconds, FLIP about as much a decoder.
+    On the CPU torch uses one thread meanwhile: 50 views of 512² take some seconds, and FLIP as long again per decoder.
 
     Args:
         scene: The scene with its original lightmaps.
@@ -230,8 +232,8 @@ def compare(
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
             Seams of the others are the borders of the lightmaps' charts. Either way a border lies between neighbouring
-            pixels that show one triangle or two that share a corner in space, so that an outline in front of something
-            else is none.
+            pixels that show one triangle or two that share a corner in space, so that an outline in front of
+            another surface is no border.
         progress: Called with the views done.
 
     Returns:
@@ -253,7 +255,7 @@ def compare(
     inside = [isinstance(camera, Viewpoint) for camera in cameras]
     states, reference = range(len(scene.states)), _Reference(scene, device)
     chart = torch.tensor(_chart_numbers(scene), device=device)
-    # Corners at one place in space have one number.
+    # Corners at the same position in space share a number.
     corners = scene.triangles
     place = torch.tensor(welded(corners.position, np.zeros_like(corners.uv), corners.triangle), device=device)
     stride = max(1, len(cameras) * len(states) // FLIP_VIEWS)
@@ -289,7 +291,7 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Numbers of the charts of a model's own UVs, as `compare` takes labels.
+    """Makes the labels for `compare` from the charts of a model's own UVs.
 
     Args:
         model: A model with `uv`.
@@ -335,7 +337,7 @@ class _Reference:
         return light
 
     def exposure(self, state: int) -> float:
-        """The factor from light to what a screen shows."""
+        """Exposure factor from linear light to display values."""
         return exposure(np.concatenate([chart[state] for chart in self._charts]))
 
     def _image(self, number: int, state: int) -> torch.Tensor:
@@ -351,7 +353,7 @@ def _peaks(
 ) -> tuple[list[float], float]:
     """The range of the reference in all views, see the module, for each state, and its maximum.
 
-    Drawing twice is cheaper than storing all views.
+    Rendering each view twice is cheaper than storing all views.
     """
     states = range(len(scene.states))
     low, high = [math.inf] * len(states), [-math.inf] * len(states)
@@ -474,14 +476,14 @@ def _mean(values: Sequence[float]) -> float:
 def _texel_errors(
     scene: LightmappedScene, reference: _Reference, decoders: Mapping[str, Sampler], device: str
 ) -> dict[str, list[float]]:
-    """Mean squared errors over the texels in a mask with their centre in an active triangle, by decoder and state."""
+    """Computes mean squared errors over mask texels whose centre is in an active triangle, by decoder and state."""
     sums, total, first = {name: [0.0] * len(scene.states) for name in decoders}, 0, 0
     for number, sheet in enumerate(scene.sheets):
         height, width = sheet.mask.shape
         triangle, barycentric = texel_triangles(sheet, height, width, device)
         hit = (triangle >= 0) & torch.tensor(sheet.mask, device=device)
         row, column = torch.nonzero(hit, as_tuple=True)
-        # At the centre itself, where the reference is the texel, not at the interpolated UV.
+        # The decoder is read at the texel's centre, where the reference equals the texel, not at the interpolated UV.
         uv = torch.stack([(column + 0.5) / width, (row + 0.5) / height], dim=1).float()
         owner = torch.full((len(uv),), number, dtype=torch.int32, device=device)
         points = Points(uv, owner, triangle[hit] + first, corner_weights(barycentric[hit]))
@@ -516,7 +518,7 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
         row, column = (index[touch] for index in pairs)
         border[row, column] = True
         border[row + (axis == 0), column + (axis == 1)] = True
-    # These pixels are the first from the border; their neighbours, also diagonal ones, are the second.
+    # These pixels are adjacent to the border; their neighbours, including diagonal ones, are 2 pixels from it.
     return torch.nn.functional.max_pool2d(border[None].float(), 3, stride=1, padding=1)[0] > 0
 
 
@@ -587,7 +589,7 @@ def _blur(image: torch.Tensor) -> torch.Tensor:
 
 
 class _Screen:
-    """The original in a view, as a screen shows it.
+    """The original in a view, as displayed on a screen.
 
     Args:
         factor: The exposure.
@@ -604,7 +606,7 @@ class _Screen:
         self._flip = flip
 
     def errors(self, light: torch.Tensor) -> tuple[float, float]:
-        """Mean squared error, and FLIP or NaN, of the covered pixels.
+        """Computes the mean squared error of the covered pixels, and their FLIP or NaN.
 
         Args:
             light: float [N, 3], decoded.

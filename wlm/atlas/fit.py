@@ -1,4 +1,4 @@
-"""From a scene with lightmaps to an atlas model.
+"""Compression of a scene with lightmaps to an atlas model.
 
 One lightmap is compressed by the method of the profile, `tiles` or `cascade`; a plain smaller lightmap of as many bits
 replaces the model where that has no larger error. Several lightmaps, of several sheets or states, share tiles
@@ -48,7 +48,7 @@ from wlm.system import OnProgress
 from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
-_FEWER_VIEWS = 4  # views of the profile for each view in which the model is compared with a plain lightmap
+_FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
 _NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
 _PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # packages of the extra, by method and colour
 
@@ -77,8 +77,8 @@ def compress(
 
     Returns:
         The model. With one lightmap it is "plain", a smaller lightmap of as many bits, where that has no larger error
-        than the method. Its report has "lost light", lines, where texels lost more than half of their light and PSNR
-        doesn't show it.
+        than the method. Its report has lines under "lost light" where texels lost more than half of their light and
+        PSNR doesn't show it.
 
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
@@ -91,7 +91,7 @@ def compress(
     for sheet in scene.sheets:
         check_size(*sheet.mask.shape)
     for choice in (method, profile.colour):
-        if choice in _PACKAGES:  # reported now, and not after minutes
+        if choice in _PACKAGES:  # a missing package is reported now, not after minutes
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
     if method == "shared":
@@ -121,13 +121,13 @@ def open_checkpoint(
 ) -> Checkpoint:
     """Opens the checkpoint of a compression, the file `OUTPUT.partial`.
 
-    It keeps what takes long: errors of the tiles' sizes and components, groups of triangles and the state of a fit. The
-    other stages are done again.
+    It stores slow results: errors of the tiles' sizes and components, groups of triangles and the state of a fit. The
+    other stages are repeated.
 
     Args:
         output: The file that the compression is for.
         scene, profile, seed, settings: As for `compress`; the compression depends on them.
-        device: Only its kind matters: a compression may go on on another GPU.
+        device: Only its kind matters: a compression may resume on another GPU.
         resume: Whether to go on from the file, if there is one.
         every: Seconds between two saves of a running stage; 0: after every few steps.
 
@@ -166,7 +166,7 @@ def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, 
         model = fit_cascade(scene, group_triangles(sheet, profile, stages), profile, seed, stages)
     if profile.fallback:
         with stages("compare"):
-            # Other views than those of the fit, in which the error is less than elsewhere; fewer are enough to compare.
+            # These views differ from the fit's, where the error is smaller than elsewhere; fewer are enough to compare.
             fewer = profile.model_copy(update={"views": -(-profile.views // _FEWER_VIEWS)})
             weight = None if model is None else weights(scene, grid, fewer, seed + 1)
             model = with_fallback(scene, grid, model, profile, weight)
@@ -179,7 +179,7 @@ def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, 
 
 
 def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list[str]:
-    """Lines about texels that lost more than half of their light where PSNR doesn't show it."""
+    """Makes lines about texels that lost more than half of their light where PSNR doesn't show it."""
     lost, decoder = LostLight(), Decoder(model, device)
     for number, sheet in enumerate(scene.sheets):
         inside = torch.from_numpy(sheet.mask).to(device)
@@ -192,7 +192,7 @@ def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list
 def with_fallback(
     scene: LightmappedScene, grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
 ) -> AtlasModel:
-    """Gives the model, or a smaller lightmap of at most as many bits whose weighted error is no larger.
+    """Returns the model, or a smaller lightmap with at most as many bits and no larger weighted error.
 
     Args:
         scene: A scene of one sheet and one state.
@@ -235,7 +235,7 @@ def with_fallback(
 def _cell_centres(grid: FineGrid, weight: torch.Tensor) -> Iterator[tuple[Points, torch.Tensor]]:
     """Yields the centres of cells that are in a triangle, and their weights, some rows at a time.
 
-    Where no triangle holds a centre, because all are too small, the cells with a weight stand for their triangles.
+    Where no triangle contains a centre, because all are too small, the cells with a weight represent their triangles.
     """
     any_held = bool((grid.triangle[0] >= 0).any())
     rows = max(1, _CELLS_AT_ONCE // grid.width)

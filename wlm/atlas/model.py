@@ -1,4 +1,4 @@
-"""The model of a scene's lightmaps: its settings and its arrays, as a file and a GPU hold them.
+"""The model of a scene's lightmaps: its settings and arrays, as stored in a file and in GPU memory.
 
 A lightmap is read through a lookup texture (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), with T_c the
 lookup texture, T_p the colour texture, and F by the method:
@@ -14,10 +14,10 @@ lookup texture, T_p the colour texture, and F by the method:
                  C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place by T_c, k rectangles to the right),
 
              with f a constant and a factor of each component, for each state and channel; negative sums become 0.
-             Tiles whose light changes alike share a mixture (`shared.mixture`). Between two states f is linear. Of
-             tiles in blocks the last components may be *coarse*, of one block of 4 x 4 texels each. Where states
-             have little in common, a sheet has *separate* tiles in each state, of one component, and light is linear
-             between two states.
+             Tiles whose light changes alike share a mixture (`shared.mixture`). Between two states f is interpolated
+             linearly. In block-compressed tiles the last components may be *coarse*: each is a single block of 4 x 4
+             texels. Where states have little in common, a sheet has *separate* tiles with one component in each
+             state, and light is interpolated linearly between two states.
 
 With mips, `shared` has smaller levels of each sheet, read in the same way; the other methods have a tail (`mips`).
 """
@@ -40,8 +40,8 @@ SOURCE_BITS = 48
 """Bits per texel of a lightmap: three half floats (eq. 9)."""
 
 COLOUR_BITS = {"half": 64, "rgb9e5": 32, "bc6h": 8, "astc": 8}
-"""Bits per texel of a texture on a GPU, by format: half floats, which desktop GPUs have with four channels and not with
-three; RGB9E5; BC6H; ASTC 4x4."""
+"""Bits per texel of a texture on a GPU, by format: half floats, which desktop GPUs support with four channels but
+not with three; RGB9E5; BC6H; ASTC 4x4."""
 
 TEXELS, BLOCKS = "rgb9e5", "bc6h"
 """The formats of the two textures of colour "mixed"."""
@@ -56,18 +56,18 @@ LUT_STEPS = 65535.0
 """The integer that is a coordinate of 1 in T_c of method "cascade"."""
 
 FACTOR_BITS = 128
-"""Bits of a component's factors in a state: three floats, in a texel of four."""
+"""Bits of a component's factors in one state: three floats, stored in a texel of four floats."""
 
 SHEET_BITS = 128
 """Bits of the row of a sheet or level in the table of sheets: eight numbers of 16 bits."""
 
 ENTRY, SHORT_ENTRY = 4, 2
-"""Numbers of an entry of T_c; and of an entry where all tiles have one component on one page."""
+"""Number of integers per entry of T_c; the short entry applies where all tiles have one component on one page."""
 
 # An entry of a tile has one number per axis: the rectangle's first texel, and its number of texels less one.
 SIDE_BITS = 4
 MOST_SIZE = 1 << (16 - SIDE_BITS)
-"""Most places along an axis that entries can name: texels of T_p, or blocks."""
+"""Largest number of texels of T_p, or of blocks, that an entry can address along an axis."""
 
 COUNT_BITS, COARSE_BITS = 8, 4
 """Bits of an entry's fourth number: the lowest hold the number of components, the next the number of coarse ones; the
@@ -76,11 +76,11 @@ page is above them."""
 MOST_PAGES, MOST_COARSE = 1 << (16 - COUNT_BITS - COARSE_BITS), (1 << COARSE_BITS) - 1
 
 TAIL_OCTAVES = 2
-"""Octaves from a lightmap to the first level of its mips, which has a quarter of its sides."""
+"""Octaves from a lightmap to the first level of its mips, whose sides are a quarter as long."""
 
 FIRST_BLOCK_CODE, NO_BLOCKS = 12, 1 << SIDE_BITS
 """The size code from which on an entry of colour "mixed" names 1 to 4 blocks along an axis instead of texels; and a
-code that no entry has."""
+code that no entry uses."""
 
 _BUDGET, _SHARED_BUDGET = 0.17, 0.05
 
@@ -146,7 +146,8 @@ class Profile(Settings):
         """Replaces some settings, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: Unknown or out of range; or a budget or two textures for the cascade, which has none.
+            WlmError: A setting is unknown or out of range, or the cascade is given a budget or two textures, which it
+                lacks.
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
@@ -207,7 +208,7 @@ class SheetPlace:
         return self.height, self.width
 
 
-_FREE_TEXELS = 1 << 24  # 4,096 x 4,096, of which a decoded lightmap takes 192 MiB
+_FREE_TEXELS = 1 << 24  # 4,096 x 4,096 texels: a decoded lightmap of this size takes 192 MiB
 _MOST_SHARE = 65536
 
 
@@ -219,8 +220,8 @@ class AtlasModel(Model):
         name: The scene's name.
         source: `LightmappedScene.source`.
         profile: The settings of the compression.
-        method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also where the profile's method does
-            not pay. All but "shared" have one sheet and one state.
+        method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also where the profile's method
+            is no better. All but "shared" have one sheet and one state.
         colour: Format of T_p, as in `Profile`; "plain" is never "mixed".
         states: Names of the states.
         sheets: The places of the sheets.
@@ -231,15 +232,15 @@ class AtlasModel(Model):
         blocks: uint8 [pages, B, 16], blocks of T_p, row by row; with "mixed" those of its second texture; [0, 0, 16]
             for none.
         block_texels: half [pages, Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 0, 3] for none.
-        factor: float32 [M, C, 3], finite, of any sign, for "shared": a constant of each mixture, then its components'
-            factors; else [0, 0, 3].
+        factor: float32 [M, C, 3], finite, of any sign, for "shared": the constant of each mixture, then the factors of
+            its components; else [0, 0, 3].
         levels: For "shared" with mips, the smaller levels of all sheets, for each sheet a quarter, then halves.
         later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
         tail: uint8 [B, 16], the other methods' mips, level by level, ASTC beside ASTC and else BC6H; [0, 16] for none.
         uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
-        stored: The scene's triangles and masks; None for a model that no file holds.
-        report: Facts about the compression, for people: "seconds" by stage (not saved, since they differ from run to
-            run), groups, the reason why it is plain.
+        stored: The scene's triangles and masks; None for a model without a file.
+        report: Facts about the compression for the user: "seconds" by stage (not saved, since they differ from run to
+            run), groups, and the reason why the method is plain.
     """
 
     SYSTEM: ClassVar[str] = "atlas"
@@ -303,11 +304,11 @@ class AtlasModel(Model):
 
     @property
     def compression_ratio(self) -> float:
-        """CR of eq. 9 over all lightmaps: 1 less the bits on a GPU over theirs."""
+        """CR of eq. 9 over all lightmaps: 1 minus the ratio of bits on a GPU to source bits."""
         return 1.0 - self.bits / self.source_bits
 
     def disk_ratio(self, file_bytes: int) -> float:
-        """CR of a file without its triangles and masks: 1 less its bits over the lightmaps'.
+        """CR of a file without its triangles and masks: 1 minus the ratio of its bits to those of the lightmaps.
 
         Args:
             file_bytes: Size of the file less `stored_bytes`.
@@ -320,17 +321,17 @@ class AtlasModel(Model):
 
         Raises:
             WlmError: The stored triangles are damaged.
-            ValueError: The model has none.
+            ValueError: The model stores no triangles.
         """
-        # `stored` is above this module.
+        # `stored` imports this module, so it cannot be imported at the top.
         return import_module("wlm.atlas.stored").restore(self)
 
     def table(self) -> np.ndarray:
         """The table of sheets as kernels and shaders read it, int32 [rows, 7].
 
-        Sheets come first, then levels; with separate tiles those of one state after the other. A row holds rows and
-        columns of texels, first row and column in T_c, rows and columns of tiles, and the row of the next smaller
-        level.
+        Sheets come first, then levels; with separate tiles both are listed for each state in turn. A row contains the
+        rows and columns of texels, the first row and column in T_c, the rows and columns of tiles, and the row number
+        of the next smaller level.
         """
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
@@ -343,7 +344,7 @@ class AtlasModel(Model):
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that a lightmap is no larger than its textures can make plausible: a few bytes must not claim gigabytes.
+    """Checks that the lightmap's size is plausible for its textures: a file of a few bytes must not claim gigabytes.
 
     Args:
         size: Rows and columns of the lightmap.
@@ -351,8 +352,8 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
         entries: Number of entries of T_c.
 
     Raises:
-        WlmError: The lightmap is beyond what `wlm.texels.check_size` allows; or it has more than 2^24 texels, and more
-            than 65,536 for each texel of T_p and T_c.
+        WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels in all,
+            and more than 65,536 for each texel of T_p and T_c.
     """
     check_size(*size)
     stored = texels + entries
@@ -364,10 +365,10 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
 
 
 def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of the mips of a lightmap: a quarter, in whole blocks, then halves, rounded down, to one texel.
+    """Rows and columns of the mips of a lightmap: a quarter in whole blocks, then halves (rounded down) to one texel.
 
-    The first level is a margin larger than a quarter where a quarter isn't of whole blocks, which Direct3D and browsers
-    ask for: `tail_share` of it is the lightmap.
+    Direct3D and browsers require whole blocks, so the first level is padded where a quarter of the lightmap does not
+    consist of whole blocks; `tail_share` is the fraction that the lightmap covers.
     """
     step = BLOCK_SIDE << TAIL_OCTAVES
     height, width = (-(-side // step) * BLOCK_SIDE for side in (height, width))
@@ -376,13 +377,13 @@ def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
 
 
 def tail_share(height: int, width: int) -> tuple[float, float]:
-    """Fractions of the mips that are the lightmap, from the first texel on, along v and u."""
+    """Fractions of the mips that the lightmap covers, starting at the first texel, along v and u."""
     first = tail_shapes(height, width)[0]
     return height / (first[0] << TAIL_OCTAVES), width / (first[1] << TAIL_OCTAVES)
 
 
 def tail_codec(colour: str) -> str:
-    """The format of the mips' blocks beside a colour texture: one that the same GPUs have."""
+    """Block format of the mips: the one that GPUs with the colour texture's format support."""
     return "astc" if colour == "astc" else BLOCKS
 
 
@@ -455,8 +456,8 @@ def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, 
         code: `first_block_code`.
 
     Returns:
-        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2]: in a sound file the
-        same along both axes.
+        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2], which is equal along
+        both axes in a valid file.
     """
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
@@ -498,7 +499,7 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
         code: `first_block_code`.
 
     Returns:
-        Arrays int64 in the order of the arguments of `pack_tiles`, of these `blocks` bool [...].
+        Arrays in the order of the arguments of `pack_tiles`: int64, except `blocks`, which is bool [...].
     """
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
@@ -519,7 +520,7 @@ def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) 
         number: int [...], number of the coarse component, from 0.
 
     Returns:
-        int [..., 2], x and y of the first texel, from that of the tile's first component.
+        int [..., 2], x and y of the first texel relative to that of the tile's first component.
     """
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)

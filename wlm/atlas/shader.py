@@ -14,7 +14,7 @@ from wlm.atlas.model import (
 from wlm.bundle import sampler
 
 EXACT = "WLM_ATLAS_EXACT"
-"""Macro with which texels are fetched and mixed in floats."""
+"""Macro that makes the shader fetch texels and interpolate them in floating point."""
 
 _HEAD = """\
 // Light from a compressed lightmap: {what}
@@ -59,7 +59,7 @@ _TEXTURES = {
     "tail": "// tail: smaller levels, sampler2D, filter linear, between mips too, clamped to its edge, anisotropic.",
     "cascade": "// lut: the lookup texture of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
-"""Textures of each method, of colour "mixed" and of mips; all have that of "plain"."""
+"""Texture declarations of each method, of colour "mixed" and of mips; every model has those of "plain"."""
 
 # Coordinates are in texels, so that arithmetic within a tile stays exact.
 _READ = """
@@ -138,7 +138,7 @@ _WHAT = {
 
 
 def _one_lightmap(model: AtlasModel) -> str:
-    """The text for a model with one lightmap; the sizes of lightmap and tiles are constants in it."""
+    """Generates the text for a model with one lightmap, with the sizes of lightmap and tiles as constants."""
     height, width = model.sheets[0].size
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
     kinds = ["plain", *(["mixed"] if mixed else []), *(["tail"] if len(model.tail) else []), model.method]
@@ -326,7 +326,7 @@ _FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 
 
 
 def _shared(model: AtlasModel) -> str:
-    """The text for shared tiles, with a function of the object's rectangle, sheet and state."""
+    """Generates the text for shared tiles, with a function of the object's rectangle, sheet and state."""
     height, width = model.texels.shape[1:3]
     kinds = {"sheets": "usampler2D", "lut": "usampler2D", "factors": "sampler2D", "colour": "sampler2DArray"}
     mixed = model.colour == "mixed"
@@ -364,10 +364,10 @@ def _shared(model: AtlasModel) -> str:
 
 
 def glsl(model: AtlasModel) -> str:
-    """The shader text for a model: functions alone, to be included below `#version`.
+    """Generates the shader text for a model: only functions, to be included below `#version`.
 
     Returns:
-        GLSL 3.30, which Vulkan's dialect takes too where the bindings are defined: `wlm_atlas(uv)` for one lightmap,
+        GLSL 3.30, which is also valid Vulkan GLSL if the bindings are defined: `wlm_atlas(uv)` for one lightmap,
         `wlm_scene(uv, sheet, state)` and `wlm_object(uv, place, sheet, state)` for several; with mips also
         `wlm_atlas_grad` or `wlm_scene_grad`.
     """

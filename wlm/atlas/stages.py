@@ -1,4 +1,4 @@
-"""The stages of a compression: they are reported as they begin, timed, and the long ones kept in a checkpoint."""
+"""The stages of a compression, which are reported when they begin and timed; long ones are saved in a checkpoint."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Runs a stage inside the block; on CUDA its time includes what it has queued."""
+        """Runs a stage inside the block; on CUDA its time includes the kernels that it has queued."""
         meter = Meter(self.progress, name, 0)
         meter.report(0)
         yield
@@ -38,10 +38,10 @@ class Stages:
 
 @contextmanager
 def one_thread(device: str) -> Iterator[None]:
-    """Keeps torch to one thread on the CPU.
+    """Limits torch to one thread on the CPU.
 
-    Its calls are short: on a busy machine a second thread makes an evaluation ten times slower, while on an idle one it
-    gains little.
+    Torch's calls are short here: a second thread makes an evaluation ten times slower on a busy machine and gains
+    little on an idle one.
     """
     threads = torch.get_num_threads()
     try:

@@ -11,12 +11,12 @@ from wlm.atlas.tiles.layout import allocate, place
 from wlm.errors import WlmError
 
 WIDTHS = np.linspace(0.7, 1.5, 9)
-"""Widths of a page, or a lookup texture, that are tried, over the square root of its area."""
+"""Candidate widths of a page or a lookup texture, as multiples of the square root of its area."""
 
-_TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the fraction of the room that ends them
+_TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the used fraction of the bits that ends them
 _LEAST_GAIN = 2.0**-24
 _LESS = 0.95  # fraction of the bits at which the error is measured again, for the value of a bit
-_DROPPED = 8  # one of this many mixtures that aren't worth their factors is left out at once
+_DROPPED = 8  # one in eight of the mixtures that aren't worth their factors is removed per round
 NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: expected more"
 
 
@@ -118,7 +118,7 @@ def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocate
 def _worth(
     error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
 ) -> np.ndarray:
-    """Leaves mixtures out, the least useful first, until each saves more error than its factors' bits would elsewhere.
+    """Removes mixtures, the least useful first, until each saves more error than its factors' bits would elsewhere.
 
     Args:
         error: float64 [choices, T].
@@ -159,7 +159,7 @@ def _two(error: np.ndarray, cost: np.ndarray, bits: float) -> list[np.ndarray]:
 
 
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Packs rectangles on as few pages as hold them, which have one size.
+    """Packs rectangles on the smallest number of pages, which all have one size.
 
     Args:
         size: int [T, 2], texels along x and y of each.

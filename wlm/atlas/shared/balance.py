@@ -1,9 +1,9 @@
-"""The weights of tiles, by the error of the views that show them.
+"""Weights of tiles, derived from the error of the views that show them.
 
 A mean of PSNRs is highest where sum_v log E_v is least, with E_v the mean squared error of view v. Its bound
-sum_v E_v / E'_v, with E'_v of the last allocation, has the same slope there and is a sum over tiles: so each allocation
-gives the weights of the next one, and the sum of logarithms falls (majorisation-minimisation, Hunter and Lange 2004). A
-tile's errors are all in proportion to its weight, so they are solved for once.
+sum_v E_v / E'_v, where E'_v is the error under the last allocation, has the same slope there and is a sum over tiles.
+So each allocation gives the weights of the next one, and the sum of logarithms falls (majorisation-minimisation, Hunter
+and Lange 2004). A tile's errors are all proportional to its weight, so they are computed only once.
 
 The mean of logarithms also decides whether states have separate tiles.
 """
@@ -33,18 +33,18 @@ class ViewShares:
 
     Attributes:
         share: float64 [V, T], the fraction of each view's pixels that shows each tile; 0 for tiles of smaller levels.
-        lost: float64 [V], the error of each view that the weights of the tiles assume.
+        lost: float64 [V], the error of each view that the current tile weights assume.
     """
 
     share: csr_array
     lost: np.ndarray
 
     def by_state(self, states: int) -> "ViewShares":
-        """The same for separate tiles, one state after the other: a view's error is the mean over its states."""
+        """Repeats the shares for separate tiles, state by state; a view's error is the mean over its states."""
         return replace(self, share=hstack([self.share] * states, "csr") / states)
 
     def psnr(self, error: np.ndarray) -> float:
-        """PSNR in dB, the mean over the views, for errors of tiles over their weights [T]; the peak is 1."""
+        """PSNR in dB, the mean over the views, for errors of tiles over their weights [T]; the peak value is 1."""
         if not len(self.lost):
             return -10.0 * math.log10(float(error.mean()) + FLOOR)
         return float(-10.0 * np.log10(self.share @ error + FLOOR).mean())
@@ -59,7 +59,7 @@ def tile_shares(
     seed: int,
     device: str,
 ) -> ViewShares:
-    """Draws the views of `scene_weights` once more.
+    """Renders the views of `scene_weights` again and counts the pixels of each tile.
 
     Args:
         scene, varies, profile, seed, device: As for `scene_weights`.
@@ -98,7 +98,7 @@ def tile_shares(
 
 
 def balance(tried: list[Candidate], weight: np.ndarray, shown: ViewShares, bits: float) -> np.ndarray:
-    """Computes factors on the tiles' weights, float64 [T]; the sum of all weights stays.
+    """Computes factors on the tiles' weights, float64 [T]; the sum of all weights is unchanged.
 
     Args:
         tried: The tiles with each number of components.

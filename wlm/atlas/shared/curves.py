@@ -5,7 +5,7 @@ For a tile, a mixture and a size the squared error of all states is that of the 
     sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
 
 with r_k the error of component k after it is stored: clipped at 0 and rounded, as texels or as blocks. So each
-component has a curve of its own, and the last ones, which have the least energy, may be coarse, of one block each.
+component has a separate curve, and the last ones, which have the least energy, may be coarse, with one block each.
 """
 
 import math
@@ -35,14 +35,14 @@ from wlm.formats.dds import MOST_SIDE
 from wlm.formats.parts import Part
 from wlm.system import Meter
 
-_RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # numbers of components that are tried
+_RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # candidate numbers of components
 MOST_MIXTURES = 128
-"""Most mixtures of one number of components."""
+"""Largest number of mixtures with the same number of components."""
 
-_FACTOR_SHARE = 0.15  # fraction of the budget that the factors of all mixtures that are tried may take
-# Tiles of which mixtures are found, most numbers of their moments, and texels of each tile for the bounds.
+_FACTOR_SHARE = 0.15  # largest fraction of the budget for the factors of all candidate mixtures
+# Tiles from which mixtures are found, limit on the size of their moments, and texels per tile for the bounds.
 _SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
-_PAYS = 0.99  # fraction of the error below which more components must come, or no more are tried
+_PAYS = 0.99  # more components must reduce the error below this fraction, or no more are tried
 _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16)
 _ROUGH, _MEDIUM = 3, 10  # rounds of conjugate gradients for a curve, and for one of blocks
 _AT_ONCE = 1024  # tiles
@@ -69,7 +69,7 @@ class SceneTiles:
     device: str
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
-        """The texels of some tiles and the weights of their points, on the device."""
+        """Copies the texels of some tiles and the weights of their points to the device."""
         return self.texels[at].to(self.device), self.weight[at].to(self.device)
 
     def points(self, texels: torch.Tensor) -> torch.Tensor:
@@ -179,7 +179,8 @@ def candidates(
     moment, bounds = np.concatenate(moment), tiles.texels[few][:, row, column].numpy()
     meter, tried, before, eager = Meter(stages.progress, "curves", len(ranks) * count), [], math.inf, np.arange(count)
     for done, rank in enumerate(ranks):
-        # As many components as states represent any tile; mixtures then differ in the energy of the first components.
+        # With as many components as states any tile is exact; mixtures then differ in the energy of their first
+        # components.
         like = ranks[done - 1] if rank == states and done else rank
         mixtures = find_mixtures(moment, bounds, rank, min(max(many, 1), MOST_MIXTURES), seed, like)
         choices, number = choices_of(rank, sizes), np.zeros(count, int)
@@ -197,7 +198,7 @@ def candidates(
         tried.append(Candidate(mixtures, number, choices, error, 0.0))
         left, chosen = _left(tried, bits)
         tried[-1] = replace(tried[-1], left=left)
-        # A tile that takes fewer components than it may have won't take more, unless more represent it exactly.
+        # A tile that uses fewer components than allowed will not use more, unless more represent it exactly.
         eager = np.arange(count) if ranks[done + 1 : done + 2] == [states] else np.flatnonzero(chosen == done)
         if left > _PAYS * before or not len(eager):
             break
@@ -256,7 +257,7 @@ def costs(tried: list[Candidate]) -> np.ndarray:
 
 
 def _left(tried: list[Candidate], bits: float) -> tuple[float, np.ndarray]:
-    """Estimates the whole error; and gives the number of the candidate that each tile takes, int [T]."""
+    """Estimates the whole error, and returns the number of the candidate that each tile uses, int [T]."""
     error = np.concatenate([each.error for each in tried])
     chosen = allocate(error, costs(tried), bits, 0.0)
     of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])

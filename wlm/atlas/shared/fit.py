@@ -1,14 +1,14 @@
 """From the lightmaps of several sheets and states to one model: mixtures of the states, tiles of all sheets, and one
 allocation.
 
-The states' light is divided by how much it varies, so that each counts by its PSNR (`weights`). Tiles are dealt to
-mixtures of one, two and more components (`mixture`), each has a curve of error for each number of them (`curves`), is
-weighted by the error of the views that show it (`balance`), and numbers and sizes are allocated to the tiles of all
-sheets at once (`allocation`): one more bit gains as much in every object.
+The states' light is divided by how much it varies, so that each counts by its PSNR (`weights`). Tiles are assigned
+to mixtures of one, two and more components (`mixture`). Each tile has an error curve for each number of components
+(`curves`) and is weighted by the error of the views that show it (`balance`). Numbers of components and sizes are
+allocated to the tiles of all sheets at once (`allocation`), so that one more bit gains as much in every object.
 
-States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. So the same is
-done with separate tiles for each state, and the better of the two is kept (`sharing`). A scene so is no worse than its
-parts.
+States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. Therefore
+separate tiles for each state are tried as well, and the better result is kept (`sharing`), so that a scene is coded no
+worse than its states would be one by one.
 """
 
 import numpy as np
@@ -92,7 +92,7 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
         "error by components": {str(each.rank): each.left for each in tried},
         "units": unit.tolist(),
     }
-    # With separate tiles all states have the factors of one, times their units.
+    # With separate tiles every state has the factors of a single state, times its own unit.
     factor = (given.factors * unit[:, None] / scale[:, None]).transpose(1, 0, 2).astype(np.float32)
     return AtlasModel(
         name=scene.name,

@@ -1,18 +1,18 @@
 """Mixtures: each state of a tile's light is a sum of a few components.
 
-Over the hours the light of a whole room has many dimensions, since each place of the sun lights others; that of one
-tile has few. Tiles are dealt to mixtures, which are subspaces of the states: each subspace has the least error for its
-tiles, and each tile belongs to the subspace with the least error for it (k-plane clustering, Bradley and Mangasarian
-2000, with subspaces for planes).
+Over a day the light of a whole scene spans many dimensions, since each position of the sun lights other surfaces; the
+light of one tile spans few. Tiles are assigned to mixtures, which are subspaces of the states: each subspace has the
+least error for its tiles, and each tile is assigned to the subspace with the least error for it (k-plane clustering,
+Bradley and Mangasarian 2000, with subspaces for planes).
 
 In a mixture of K components with orthonormal directions v_0 to v_(K-1), light x in the states is close to
 
     sum_k v_k b_k = sum_k v_k c_k - sum_k v_k o_k,    b_k = v_k x,    c_k = b_k + o_k.
 
-Light isn't negative, so v_0 isn't (Perron), nor is b_0. The other b_k are often negative, and least squares samples
-overshoot. An offset o_k that is larger than most negative values makes every component c_k positive, so that unsigned
-texels can store it, while factors have any sign; a constant for each state subtracts the offsets. As the directions
-are orthonormal, errors of components are independent, and none is amplified.
+Light isn't negative, so v_0 isn't (Perron), nor is b_0. The other b_k are often negative, and least-squares
+samples overshoot. An offset o_k that is larger than most negative values makes every component c_k positive, so that
+unsigned texels can store it, while factors have any sign; a constant for each state subtracts the offsets. As the
+directions are orthonormal, errors of components are independent, and none is amplified.
 """
 
 from dataclasses import dataclass, fields
@@ -21,21 +21,21 @@ import numpy as np
 import torch
 
 _ROUNDS = 12
-_ALIKE = 1e-6  # fraction of the light's energy: smaller differences decide nothing
+_ALIKE = 1e-6  # fraction of the light's energy: smaller differences count as equal
 _PERCENT = 0.1  # percentile of a component that is its low end; its high end likewise
-_MARGIN, _MARGIN_FIRST = 0.1, 0.02  # margin of o_k: of the component's range; for the first one, of its high end
+_MARGIN, _MARGIN_FIRST = 0.1, 0.02  # margin of o_k over the component's range; for the first, over its high end
 
 
 @dataclass(frozen=True, eq=False)
 class Mixtures:
-    """Mixtures of one number of components.
+    """All mixtures with the same number of components.
 
     Attributes:
         factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
             below 0.
         offset: float32 [G, K, 3]: the states are `factor` times the components less this.
-        kept: float32 [G, 3 M M], flat projections onto the subspaces: their product with a tile's moments is the energy
-            that they keep; of the first components alone where `find_mixtures` has `like`.
+        kept: float32 [G, 3 M M], flattened projections onto the subspaces: their product with a tile's moments is the
+            energy that they keep; only the first components count where `find_mixtures` has `like`.
     """
 
     factor: torch.Tensor
@@ -43,7 +43,7 @@ class Mixtures:
     kept: torch.Tensor
 
     def to(self, device: str) -> "Mixtures":
-        """The same on a device."""
+        """Copies the mixtures to a device."""
         return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
 
     def factors(self, number: int) -> np.ndarray:
@@ -80,7 +80,7 @@ def find_mixtures(
         rank: K, 1 to M.
         count: Number of mixtures, at least 1; fewer where some would have no tile.
         seed: Seed of the tiles from which they start.
-        like: Number of components by which tiles are dealt to mixtures; None: K.
+        like: Number of components by which tiles are assigned to mixtures; None: K.
     """
     random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
     flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)
@@ -113,7 +113,7 @@ def find_mixtures(
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
     """Finds the first mixture that keeps about the most energy, int64 [T].
 
-    Rounding must not deal a tile to another mixture than the one whose offsets are made for it.
+    Rounding must not assign a tile to a mixture whose offsets were not computed for it.
 
     Args:
         kept: [T, G], the energy that each mixture keeps.

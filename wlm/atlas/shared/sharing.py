@@ -1,8 +1,8 @@
 """The choice between shared tiles, which are sums of components, and separate tiles for each state.
 
 Hours of light have much in common, which components store once. A shadow mask and the light of a sky have little in
-common, and with shared tiles each is stored at resolutions that the other needs. So both are allocated, in the same
-bits, and the better is kept, by the mean over views of the logarithm of their error, as they are scored.
+common, and with shared tiles each is stored at resolutions that the other needs. So both variants are allocated within
+the same bits, and the one with the smaller mean over views of the logarithm of the error is kept.
 
 Separate tiles multiply the count by the number of states; a random sample first decides whether their rate-distortion
 curves are worth computing.
@@ -39,14 +39,14 @@ from wlm.atlas.tiles.layout import allocate, place
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
-_SAMPLES, _SAMPLE = 1024, 8  # tiles up to which all are tried separately; of more tiles one in eight is sampled
-_SAMPLED, _SEPARATE = 100, 200  # numbers of the checkpoint's batches of sampled and of separate tiles
-_HOPELESS = 1.25  # error of a sample of separate tiles, over that of shared ones, above which the rest isn't tried
+_SAMPLES, _SAMPLE = 1024, 8  # up to this many tiles all are tried separately; beyond it one in eight is sampled
+_SAMPLED, _SEPARATE = 100, 200  # batch numbers in the checkpoint for sampled and for separate tiles
+_HOPELESS = 1.25  # ratio of sampled separate to shared error above which the rest isn't tried
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A sheet or a level of one, to be cut into tiles.
+    """A sheet or a mip level of a sheet, to be cut into tiles.
 
     Attributes:
         name: The sheet's name.
@@ -64,7 +64,7 @@ class Plane:
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
     """Lists the sheets and then, with mips, their levels: a quarter of a sheet's sides, rounded up, and halves of that.
 
-    A level's texel is the mean of the texels of charts that it covers, and counts as much as one of them.
+    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them.
 
     Args:
         scene: The scene.
@@ -130,9 +130,9 @@ class Fitted:
         tiles: Their tiles.
         tried: The tiles with each number of components, weighted by `balance`.
         given: Components, sizes and places of the tiles.
-        numbers: Numbers of an entry of T_c.
+        numbers: Number of integers per entry of T_c.
         states: Number of states with separate tiles; 1: all share tiles.
-        gain: An estimate of the dB in views by which separate tiles are ahead; None: not measured to the end.
+        gain: Estimated advantage of separate tiles in views, in dB; None: the measurement was stopped early.
     """
 
     planes: list[Plane]
@@ -210,7 +210,7 @@ def _choose_sharing(
         for plane in together.planes
     ]
     layout = _laid_out(planes, profile.tile)
-    # A constant and a factor for each of the other states.
+    # Each of the other states needs a constant and a factor.
     bits -= 2 * FACTOR_BITS * (states - 1)
     room = _room(bits, layout, len(planes), SHORT_ENTRY)
     if room < states * len(together.tiles.index) * COLOUR_BITS[TEXELS]:
@@ -241,7 +241,7 @@ def _hopeless(
     seed: int,
     stages: Stages,
 ) -> bool:
-    """Whether a sample of separate tiles has far more error than the shared tiles have in as many bits."""
+    """Tests whether sampled separate tiles have far more error than shared tiles of as many bits."""
     given, count = together.given, len(factor)
     few = np.sort(np.random.default_rng(seed).choice(count, max(count // _SAMPLE, _SAMPLES), replace=False))
     cost = costs(together.tried)
@@ -249,7 +249,7 @@ def _hopeless(
     chosen = allocate(shared, cost, room, 0.0)
     taken = cost[chosen]
     own = float(taken[few].sum()) / float(taken.sum()) * room
-    # The same tiles of each state.
+    # The sample has the same tiles in each state.
     members = (np.arange(states)[:, None] * count + few).ravel()
     piece = SceneTiles(
         tiles.texels[members],
@@ -266,7 +266,7 @@ def _hopeless(
 
 
 def _room(bits: float, layout: Layout, planes: int, numbers: int) -> float:
-    """Bits that T_c and the table of sheets leave to tiles and factors."""
+    """Bits that remain for tiles and factors after T_c and the table of sheets."""
     return bits - planes * SHEET_BITS - math.prod(layout.shape) * numbers // 2 * LUT_BITS
 
 
@@ -314,7 +314,7 @@ def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str)
             continue
         index, share = weighted(torch.from_numpy(plane.weight), tile)
         columns = tile_counts(*plane.frames.shape[1:3], tile)[1]
-        # Texels first, then states.
+        # The texel axes come first, then the states.
         frames = torch.from_numpy(plane.frames).permute(1, 2, 0, 3)
         texels.append(patches(frames, index, columns, tile) / torch.from_numpy(unit).float()[:, None])
         weights.append(share * (float(plane.weight.sum()) / total))

@@ -2,8 +2,8 @@
 
 A part of a sheet counts by the pixels of views of the whole scene that show it. Views and states are scored by PSNR, so
 a mean over them is a mean of logarithms: an error counts by its share of the whole error of its view or state. At equal
-bits that whole is in proportion to how much light varies from texel to texel, so views and states weigh by the inverse
-of the variation of their light.
+bits the whole error is proportional to how much light varies from texel to texel, so views and states are weighted by
+the inverse of the variation of their light.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def peaks_of(scene: LightmappedScene) -> np.ndarray:
     """Takes a high percentile of each state's light in charts, float64 [M], above 0."""
     light = [sheet.lightmaps[:, sheet.mask].max(axis=2) for sheet in scene.sheets]
     peak = np.percentile(np.concatenate(light, axis=1), _PERCENTILE, axis=1)
-    # A dark state is exact whatever its peak is.
+    # A black state is stored exactly whatever its peak is.
     return np.where(peak > 0, peak, float(peak.max()) or 1.0).astype(np.float64)
 
 
@@ -63,7 +63,7 @@ def _variation(light: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 
 def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
-    """Computes the divisors of light over its peaks with which it varies as much in each state.
+    """Computes the divisor of each state's normalised light that makes all states vary equally.
 
     Args:
         varies: `variation`.
@@ -83,8 +83,8 @@ def scene_weights(
 ) -> list[np.ndarray]:
     """Counts for each quarter of a texel the pixels of random views of the scene that show it.
 
-    An object that is large in the views so gets more weight than one that is small, far away or hidden. A view counts
-    by the inverse of how much the light that it shows varies, and by no more if it shows more pixels.
+    An object that is large in the views thus gets more weight than one that is small, far away or hidden. The weight of
+    a view is the inverse of the variation of the light that it shows; it does not grow with its number of pixels.
 
     Args:
         scene: The scene.
@@ -155,8 +155,8 @@ class Detail:
         return tuple(self._place[points.sheet.long()].T[:2])
 
     def lost(self, points: Points) -> float:
-        """An estimate of the error of a view that shows the points, above 0: the mean over the states, scaled so that
-        light varies alike in all of them."""
+        """Estimates the error of a view that shows the points, above 0: the mean over the states, which are scaled to
+        vary equally."""
         height, width, start = self._place[points.sheet.long()].T
         column, row = (
             (points.uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)
