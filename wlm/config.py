@@ -108,7 +108,7 @@ def profile_names(system: str) -> list[str]:
 
 
 def _profile_folders() -> Iterator[Path]:
-    """Yields the folders that hold profiles: that of a checkout, then the one installed with the package."""
+    """Yields the folders that contain profiles: the checkout's, then the one installed with the package."""
     root = Path(__file__).resolve().parents[1]
     # An installed package is in site-packages; only a checkout has a pyproject.toml beside the package.
     if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():
@@ -120,10 +120,10 @@ def _profile_folders() -> Iterator[Path]:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that refuses YAML features which settings do not need and an attacker could misuse.
+    """A safe loader that rejects YAML features which settings do not need and an attacker could misuse.
 
-    It refuses a repeated key, of which YAML would silently keep the last value; anchors, aliases and merge keys, with
-    which a few lines can stand for billions of values; integers beyond 64 bits; and unlimited nesting.
+    It rejects repeated keys, for which YAML would silently use the last value; anchors, aliases and merge keys, with
+    which a few lines can expand to billions of values; integers beyond 64 bits; and unlimited nesting.
     """
 
     _depth = 0
@@ -200,7 +200,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Lists the known keys of the mapping at a location, or the one that was probably meant."""
+    """Lists the known keys of the mapping at a location, or only the most similar one."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)

@@ -1,8 +1,8 @@
-"""The one kind of error that is meant for the user."""
+"""The error class for messages to the user."""
 
-_LIMIT = 2000  # characters: room for several long paths
+_LIMIT = 2000  # characters: enough for several long paths
 
-# Control characters, which a terminal obeys, and marks that turn the direction of text and so hide part of it.
+# Control characters, which a terminal interprets, and bidirectional marks, which can hide part of the text.
 _CONTROLS = (*range(0x20), *range(0x7F, 0xA0))
 _MARKS = (0x061C, 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A))
 _ESCAPES = {code: f"\\x{code:02x}" for code in _CONTROLS} | {code: f"\\u{code:04x}" for code in _MARKS}
@@ -10,7 +10,7 @@ _ESCAPES[ord("\t")] = " "
 
 
 def printable(text: str) -> str:
-    r"""Escapes what a terminal would obey, and halves of characters: names come from files, and files from strangers.
+    r"""Escapes control characters and lone surrogates, because names can come from untrusted files.
 
     Args:
         text: One line.
@@ -22,11 +22,11 @@ def printable(text: str) -> str:
 
 
 def one_line(text: object, limit: int = _LIMIT) -> str:
-    """Joins the lines of a message, escapes what a terminal would obey, and cuts it to a length.
+    """Joins the lines of a message, escapes control characters, and truncates the result.
 
     Args:
         text: Anything whose `str` is the message.
-        limit: The most characters to keep; a cut message ends in "...".
+        limit: Maximum number of characters; a truncated message ends in "...".
 
     Returns:
         The message on one line.

@@ -1,4 +1,4 @@
-"""Warp and torch together: devices, arrays, streams and CUDA graphs."""
+"""Interoperation of Warp and torch: devices, arrays, streams and CUDA graphs."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ _TENSORS = {
     wp.vec2: (torch.float32, (2,)),
     wp.vec4: (torch.float32, (4,)),
 }
-"""Warp's types as torch holds them: its own, and the length of its last axis."""
+"""Torch representation of Warp types: the torch type and the length of the last axis."""
 
 
 def available_devices() -> list[str]:
@@ -36,10 +36,10 @@ def check_device(name: str) -> str:
         name: "cpu", "cuda" (the first GPU) or "cuda:N".
 
     Returns:
-        The name that Warp and torch both take: "cpu" or "cuda:N".
+        The name that both Warp and torch accept: "cpu" or "cuda:N".
 
     Raises:
-        WlmError: No such device; the line lists those that there are.
+        WlmError: No such device; the line lists the available devices.
     """
     full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
@@ -52,15 +52,15 @@ def check_device(name: str) -> str:
 
 
 def device_name(device: torch.device) -> str:
-    """The name of a tensor's device as `check_device` returns it and `stream` takes it."""
+    """Returns the name of a tensor's device in the form of `check_device` and `stream`."""
     return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
 
 
 def free_memory(device: wp.Device) -> int:
-    """Bytes that can be allocated on a device.
+    """Returns the number of bytes that can be allocated on a device.
 
     Raises:
-        WlmError: The machine doesn't tell.
+        WlmError: The system doesn't report it.
     """
     if device.is_cuda:
         return device.free_memory
@@ -71,10 +71,10 @@ def free_memory(device: wp.Device) -> int:
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
-    """Wraps a tensor as a Warp array, without a copy and without a gradient of its own.
+    """Wraps a tensor as a Warp array, without a copy and without a gradient array.
 
-    Wrap once and keep the array: a raw tensor as a launch argument costs three times as much at every launch.
-    A gradient buffer is wrapped by a call of its own, `to_warp(tensor.grad)`.
+    Wrap once and keep the array: a raw tensor as a launch argument makes every launch three times as expensive.
+    A gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`.
 
     Args:
         tensor: Any strides; those of the trailing dimensions that a vector or matrix type takes up must be
@@ -87,7 +87,7 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     Raises:
         ValueError: The tensor doesn't fit the type.
     """
-    # Wrapping a tensor, unlike all else in Warp, doesn't start it.
+    # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()
     try:
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
@@ -99,12 +99,12 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
 def stream(device: str) -> Iterator[torch.cuda.Stream | None]:
     """Runs torch and Warp on one CUDA stream inside the block; on the CPU it does nothing.
 
-    The stream isn't the default one, since CUDA can't capture that one in a graph, and it is the same one at
-    every use. It waits for what both had queued before the block, and what both queue after the block
+    The stream isn't the default stream, which CUDA can't capture in a graph, and it is the same one at every use.
+    It waits for the work that both libraries queued before the block, and work that they queue after the block
     waits for it.
 
     Args:
-        device: As `check_device` returns it.
+        device: A result of `check_device`.
 
     Yields:
         The torch stream, or None on the CPU.
@@ -126,7 +126,7 @@ def stream(device: str) -> Iterator[torch.cuda.Stream | None]:
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Keeps the garbage collector off inside the block: in a capture it could free an older graph, which breaks it."""
+    """Disables garbage collection inside the block: freeing an older graph would invalidate a running capture."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -137,9 +137,9 @@ def no_collection() -> Iterator[None]:
 
 
 def torch_memory(device: torch.device) -> Callable[[tuple[int, ...], Any], wp.array]:
-    """Makes the buffers of kernels, `empty(shape, dtype)`, in torch's memory.
+    """Returns an allocator for kernel buffers, `empty(shape, dtype)`, that uses torch's memory.
 
-    That may be freed while torch's stream still uses it, and a graph may capture it; Warp's own it may not.
+    Unlike Warp's memory, it may be freed while torch's stream still uses it, and a graph may capture it.
     """
 
     def empty(shape: tuple[int, ...], dtype: Any) -> wp.array:
@@ -152,20 +152,20 @@ def torch_memory(device: torch.device) -> Callable[[tuple[int, ...], Any], wp.ar
 
 
 class StepGraph:
-    """A step that runs many times: captured once as a graph and replayed on CUDA, just called on the CPU.
+    """A repeated step: captured once as a graph and replayed on CUDA, called directly on the CPU.
 
-    Each call does the step exactly once on either device. On CUDA the first `warmup` calls run it eagerly,
+    Each call executes the step exactly once on either device. On CUDA the first `warmup` calls run it eagerly,
     which loads Warp's modules and lets torch allocate its workspaces and optimiser state; the next one
     captures it and replays it, and the later ones replay.
 
-    The step takes and returns nothing. It reads and writes tensors that stay in place: what changes between
-    steps (a learning rate, a batch) is copied into them beforehand. It must not synchronise, allocate Warp
-    arrays or branch on values that lie on the device.
+    The step has no arguments and no result. It reads and writes tensors at fixed addresses: values that change
+    between steps (a learning rate, a batch) are copied into them beforehand. It must not synchronise, allocate Warp
+    arrays or branch on values in device memory.
 
     Args:
         step: The work, in torch and Warp, on `device`.
-        device: As `check_device` returns it.
-        warmup: How many calls run eagerly first, at least 1.
+        device: A result of `check_device`.
+        warmup: Number of eager calls before the capture, at least 1.
 
     Raises:
         ValueError: `warmup` is less than 1.
@@ -185,7 +185,7 @@ class StepGraph:
         return self._graph is not None
 
     def __call__(self) -> None:
-        """Does the step once; on CUDA it is queued, not awaited."""
+        """Executes the step once; on CUDA it is queued and the call returns immediately."""
         if self._device == "cpu":
             self._step()
             return
@@ -201,7 +201,7 @@ class StepGraph:
     def _capture(self, side: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         warp_side = _side_stream(self._device)[1]
-        # torch opens the capture; Warp is told of it, so that it frees nothing in the middle of it. Both use
+        # torch starts the capture and Warp is notified, so that it frees no memory during it. Both use
         # the thread-local mode, which lets other threads (a loader, say) allocate meanwhile.
         with (
             no_collection(),
@@ -214,11 +214,11 @@ class StepGraph:
 
 @cache
 def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
-    """Makes the one side stream of a device, as torch and as Warp know it.
+    """Creates the single side stream of a device, as a torch and as a Warp object.
 
-    One for all uses: torch's allocator keeps a pool of memory for every stream.
+    All uses share it, because torch's allocator keeps a pool of memory for every stream.
     """
-    # Warp looks a stream's device up in a table that it makes when it starts, and this may be its first call.
+    # Warp looks up a stream's device in a table created at initialisation, and this may be the first Warp call.
     wp.init()
     side = torch.cuda.Stream(device)
     return side, warp_stream(side)
@@ -226,8 +226,8 @@ def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
 
 @cache
 def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """A stream of torch as Warp knows it, the same one at every use.
+    """Returns the Warp object of a torch stream, the same object at every use.
 
-    One for all uses: when a second wrapper of a stream is deleted, Warp forgets the stream and can't capture on it.
+    If a second wrapper of a stream were deleted, Warp would unregister the stream and could not capture on it.
     """
     return wp.stream_from_torch(stream)

@@ -1,4 +1,4 @@
-"""Operations on images of light that the metrics, the baselines, the systems and their pictures share."""
+"""Operations on images of linear light, shared by the metrics, the systems and the benchmarks."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -10,27 +10,27 @@ from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
 
 MOST_SIDE = 65536
-"""Texels of a lightmap along a side, at most."""
+"""Largest number of texels along a side of a lightmap."""
 
 MOST_TEXELS = 1 << 28
-"""Texels of a lightmap, at most: 16,384 x 16,384, of which one decoded frame takes 3 GiB."""
+"""Largest number of texels of a lightmap: 16,384 x 16,384; one decoded frame takes 3 GiB."""
 
 REACH = 2
-"""Texels from a chart, along rows and columns, that a filter takes in: a bilinear read one, its half-size mip two."""
+"""Distance from a chart, in texels, that filters read: 1 for a bilinear read, 2 for one of the half-size mip."""
 
 _OFFSETS = sorted(
     ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
     key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
-)  # to a texel's neighbours in the order in which they are asked: the nearest first, then by row
+)  # offsets to a texel's neighbours in search order: the nearest first, then by row
 
-_STRIP = 1024  # rows of a lightmap in which nearest texels are looked for at once
+_STRIP = 1024  # rows of a lightmap searched for nearest texels at once
 
-_WHITE, _PERCENTILE = 0.8, 99.0  # where that share of the light is on the screen
+_WHITE, _PERCENTILE = 0.8, 99.0  # display value of that percentile of the light
 _FILMIC_WHITE = 4.0
 
 
 def check_size(height: int, width: int) -> None:
-    """Checks the size of a lightmap, before memory is taken for it.
+    """Checks the size of a lightmap before memory is allocated for it.
 
     Raises:
         WlmError: It has no texel, or more than `MOST_SIDE` along a side or `MOST_TEXELS` in all.
@@ -43,19 +43,19 @@ def check_size(height: int, width: int) -> None:
 
 
 def exposure(light: np.ndarray) -> float:
-    """The factor that puts nearly all of some linear light, of any shape, below white; 1 where all is dark."""
+    """Returns the factor that scales nearly all values of linear light, of any shape, below white; 1 if all are 0."""
     lit = light[light > 0]
     return _WHITE / float(np.percentile(lit, _PERCENTILE)) if lit.size else 1.0
 
 
 def filmic(light: np.ndarray) -> np.ndarray:
-    """Linear light, at least 0, of any shape, below white: Reinhard's curve, which takes 4 to 1 (Reinhard et al. 2002,
-    eq. 4)."""
+    """Tone maps linear light, at least 0, of any shape, by Reinhard's curve with a white point of 4 (Reinhard et al.
+    2002, eq. 4)."""
     return light * (1 + light / _FILMIC_WHITE**2) / (1 + light)
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB (IEC 61966-2-1), clipped to [0, 1]."""
+    """Converts linear light to sRGB (IEC 61966-2-1), clipped to [0, 1]."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
@@ -63,8 +63,8 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Gives every texel outside the mask the value of the nearest texel inside it (Euclidean distance).
 
-    A lightmap's gaps between charts are never seen but share codec blocks and filter windows with texels that
-    are; zeros there cost a block codec 10 dB and more at chart edges.
+    The gaps between a lightmap's charts are never visible but share codec blocks and filter windows with visible
+    texels; zeros there cost a block codec 10 dB and more at chart edges.
 
     Args:
         image: `[..., H, W, C]`, any dtype; leading axes (time) are filled with one distance transform.
@@ -72,7 +72,7 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
     Returns:
         A new array of the image's shape and dtype. Valid texels are copied unchanged. With an empty mask
-        nothing is known about the image and the result is all zeros.
+        the result is zero everywhere.
 
     Raises:
         WlmError: The mask's shape is not the image's height and width.
@@ -93,11 +93,11 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Gives texels outside the mask means of ever larger neighbourhoods, so that few bits describe them.
+    """Fills texels outside the mask with means of increasingly large neighbourhoods, which compress to few bits.
 
     Args:
         images: float32 [..., H, W, C].
-        mask: bool [H, W]; what lies outside it isn't read.
+        mask: bool [H, W]; texels outside it aren't read.
 
     Returns:
         A new array; 0 where the mask is empty.
@@ -109,17 +109,17 @@ def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the texels within `REACH` of a valid one, and the nearest valid one of each.
 
-    Of several as near it is the first in reading order: every decoder, on the host, in a shader or in a page, takes the
-    same.
+    Among equally near texels it is the first in reading order, so that every decoder (host, shader, web page) uses the
+    same one.
 
     Args:
         mask: bool [H, W], true where a texel is valid.
 
     Returns:
-        Row and column of each such texel, int [G, 2], in reading order, and those of the valid texel.
+        Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
     """
     height, width = mask.shape
-    found = np.zeros(mask.shape, np.int8)  # 1 + the place in `_OFFSETS`
+    found = np.zeros(mask.shape, np.int8)  # 1 + the index in `_OFFSETS`
     if not mask.all():
         padded = np.pad(mask, REACH)
         for i, (y, x) in enumerate(_OFFSETS):
@@ -133,7 +133,7 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the valid texel that is nearest to each texel of a lightmap (Euclidean distance), itself where it is valid.
 
-    Within `REACH` it is that of `near_gaps`; further off any of several as near.
+    Within `REACH` the result equals `near_gaps`; at larger distances any of several equally near texels is chosen.
 
     Args:
         mask: bool [H, W], true where a texel is valid; at least one is.
@@ -152,7 +152,7 @@ def _nearest(mask: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """`_nearest` of strips with rows of both neighbours, by threads; None where a nearest texel may lie further off."""
+    """Computes `_nearest` by threads on overlapping strips; None if a nearest texel may lie outside the overlap."""
     height, width = mask.shape
     rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
 
@@ -166,7 +166,7 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
         row, column = np.nonzero(~mask[first:end])
         row += first
         distance = (rows[row, column] - row) ** 2 + (columns[row, column] - column) ** 2
-        far = height + width  # nothing lies beyond the lightmap's ends
+        far = height + width  # no texel lies beyond the lightmap's border
         beyond = np.minimum(row - low + 1 if low > 0 else far, high - row if high < height else far)
         return bool((distance <= beyond**2).all())
 
@@ -177,18 +177,18 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
-    """Makes a lightmap finite and in [0, 65504], half float's range, in place.
+    """Replaces non-finite values and clamps a lightmap to [0, 65504], half float's range, in place.
 
     Args:
         frame: [H, W, 3], linear.
-        mask: bool [H, W], the texels inside; what is done to others isn't told.
-        where: Names the lightmap in the error.
+        mask: bool [H, W], the valid texels; changes to other texels aren't reported.
+        where: Name of the lightmap in the error.
 
     Returns:
-        What changed inside, a line a kind with its count.
+        One line with the count for each kind of change to valid texels.
 
     Raises:
-        WlmError: No texel inside is finite.
+        WlmError: No valid texel is finite.
     """
     notes = []
     finite = np.isfinite(frame).all(axis=2)
@@ -219,7 +219,7 @@ def _texels(count: int) -> str:
 
 
 def _pull_push(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Fills values [..., h, w, C], which are multiplied by their weights [h, w, 1] in [0, 1]."""
+    """Fills gaps in values [..., h, w, C] that are premultiplied by weights [h, w, 1] in [0, 1]."""
     height, width = weight.shape[:2]
     if height == width == 1:
         return values / np.where(weight > 0.0, weight, np.float32(1.0))
@@ -228,7 +228,7 @@ def _pull_push(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         sum(np.pad(array, ((0, 0),) * (array.ndim - 3) + pad)[..., y::2, x::2, :] for y in (0, 1) for x in (0, 1))
         for array in (values, weight)
     ]
-    # A coarse texel with any weight is whole: it is the mean of what it covers.
+    # A coarse texel with any weight gets full weight: it is the mean of the valid texels that it covers.
     whole = 1.0 / np.maximum(halves[1], np.float32(1.0))
     coarse = _pull_push(halves[0] * whole, halves[1] * whole)
     fine = coarse.repeat(2, axis=-3).repeat(2, axis=-2)[..., :height, :width, :]

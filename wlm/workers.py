@@ -1,8 +1,8 @@
-"""Work done elsewhere: by threads, or by objects in this process, in others of this machine, or on a cluster of Ray.
+"""Parallel work: in threads, or by objects in this process, in other processes of this machine, or on a Ray cluster.
 
-Work is handed out as calls of their methods, one at a time to each object, and answers are taken as they come.
-Processes of this machine are started by the standard library alone: Ray takes seconds to start, brings 250 MB and
-leaves its logs behind, all in vain for one machine.
+Callers submit method calls, one at a time per object, and receive the results in order of completion.
+Processes on this machine use the standard library alone: Ray takes seconds to start, needs 250 MB and leaves log
+files behind, without a benefit on one machine.
 """
 
 import importlib
@@ -25,29 +25,29 @@ from typing import IO, Any, TypeVar
 from wlm.errors import WlmError
 
 _PROTOCOL = 5  # large arrays aren't copied
-_PATIENCE = 2.0  # seconds that a process without work gets to end by itself
-_ANSWER = 10.0  # seconds that a cluster gets to take a connection
-_THREADS = 8  # at most: each holds what its call needs
-_TOLD = 2000  # bytes of what a dead process wrote that are looked at
+_PATIENCE = 2.0  # seconds that an idle process gets to end by itself
+_ANSWER = 10.0  # seconds that a cluster gets to accept a connection
+_THREADS = 8  # maximum number: each needs the memory of its call
+_TOLD = 2000  # bytes read from the error output of a dead process
 
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 
 
 class Lost(Exception):
-    """The object is gone, and with it its answer; the text says why."""
+    """The worker object no longer exists and its result is lost; the message gives the reason."""
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_Answer]:
-    """Calls a function with each item, in threads, and yields the answers in the items' order.
+    """Calls a function with each item, in threads, and yields the results in the items' order.
 
-    It pays for NumPy, which computes without Python's lock. Where a call raises, or the caller stops, what hasn't begun
-    is dropped.
+    Threads help because NumPy releases Python's lock while it computes. If a call raises or the caller stops, calls
+    that haven't started are cancelled.
     """
     pool = ThreadPoolExecutor(min(cores(), _THREADS))
     try:
@@ -57,11 +57,11 @@ def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_
 
 
 class Workers(ABC):
-    """Objects made alike, numbered from 0.
+    """Worker objects of one class, numbered from 0.
 
     Attributes:
-        count: How many there are.
-        remote: Whether they work while this process does something else.
+        count: Number of workers.
+        remote: Whether they work in parallel with this process.
     """
 
     count: int
@@ -69,37 +69,37 @@ class Workers(ABC):
 
     @abstractmethod
     def call(self, number: int, method: str, *arguments: Any) -> None:
-        """Calls a method of an object that has answered all earlier calls."""
+        """Starts a method call on a worker that has no call in progress."""
 
     @abstractmethod
     def wait(self, seconds: float) -> tuple[int, Any] | None:
-        """Takes an answer.
+        """Waits for the next result.
 
         Args:
-            seconds: To wait for it at most.
+            seconds: Maximum time to wait.
 
         Returns:
-            The object's number and what the method returned, an exception where it raised one, `Lost` where the
-            object is gone; None where there was no answer in that time.
+            The worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
+            no longer exists; None if there was no result in that time.
         """
 
     @abstractmethod
     def renew(self, number: int) -> None:
-        """Makes an object again that is lost."""
+        """Creates a lost worker again."""
 
     @abstractmethod
     def close(self) -> None:
-        """Ends all of them, whatever they are doing."""
+        """Ends all workers, including those with a call in progress."""
 
 
 class Here(Workers):
-    """An object in this process, which works while its answer is waited for."""
+    """A single worker in this process; it executes its call in `wait`."""
 
     count = 1
     remote = False
 
     def __init__(self, worker: Any) -> None:
-        """Takes the object, which has a method `close`."""
+        """Wraps a worker object, which must have a method `close`."""
         self._worker, self._call = worker, ("", ())
 
     def call(self, number: int, method: str, *arguments: Any) -> None:
@@ -120,20 +120,20 @@ class Here(Workers):
 
 
 class Processes(Workers):
-    """Objects in processes of their own on this machine.
+    """Workers in separate processes on this machine.
 
-    A process ends with the one that started it, by whatever that one was ended: at the latest once it has answered.
+    A worker process ends when its parent process ends for any reason, at the latest after its current call.
     """
 
     def __init__(self, make: type, arguments: list[tuple[Any, ...]]) -> None:
         """Starts the processes.
 
         Args:
-            make: The class of the objects, of a module that can be imported.
-            arguments: Of each object.
+            make: The class of the workers, from an importable module.
+            arguments: Constructor arguments of each worker.
 
         Raises:
-            WlmError: The system has no room for so many.
+            WlmError: The system can't start that number of processes.
         """
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
@@ -148,7 +148,7 @@ class Processes(Workers):
             raise
 
     def call(self, number: int, method: str, *arguments: Any) -> None:
-        # Of a process that is gone the answer tells.
+        # If the process has ended, `wait` reports it.
         with suppress(OSError):
             _send(self._processes[number].stdin, (method, arguments))
 
@@ -170,14 +170,14 @@ class Processes(Workers):
             self._end(number, _PATIENCE)
 
     def kill(self, number: int) -> None:
-        """Ends one process at once, as a machine without memory does."""
+        """Kills one process immediately, like the system when it runs out of memory."""
         self._processes[number].kill()
 
     def _start(self, number: int) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-        # NumPy would start a thread for every core, in each process.
+        # Without this, NumPy would start one thread per core in each process.
         environment.setdefault("OPENBLAS_NUM_THREADS", str(max(1, cores() // self.count)))
-        # Ctrl-C in a terminal goes to a group of processes: they are asked for their state after it.
+        # Ctrl-C in a terminal signals the whole process group; workers must survive it to return their state.
         group = {"process_group": 0} if os.name == "posix" else {}
         command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -192,13 +192,13 @@ class Processes(Workers):
             _send(process.stdin, (self._make.__module__, self._make.__qualname__, self._arguments[number]))
 
     def _listen(self, number: int, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
-        """Takes a process's answers, to its end."""
+        """Receives the results of a process until it ends."""
         try:
             while True:
                 self._answers.put((number, pickle.load(process.stdout)))
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
             code = process.wait()
-            # Of a process that has been replaced or closed nobody waits for an answer.
+            # A process that was replaced or closed has no pending call.
             if self._processes.get(number) is process:
                 self._answers.put((number, Lost(_reason(code, errors))))
 
@@ -215,7 +215,7 @@ class Processes(Workers):
 
 
 class Actors(Workers):
-    """Objects on a cluster of Ray, each with its share of the machines."""
+    """Workers on a Ray cluster, each with its own resources."""
 
     def __init__(
         self,
@@ -226,18 +226,18 @@ class Actors(Workers):
         address: str,
         share: dict[str, float],
     ) -> None:
-        """Connects to the cluster and asks for the objects; those for which it has no room come as it has.
+        """Connects to the cluster and requests the workers; they start when resources become free.
 
         Args:
-            make: Their class, of a module that every machine of the cluster can import.
-            arguments: Of each object.
-            count: Objects; None: as many as the cluster has room for.
-            most: Objects at most.
-            address: Of the cluster, as `ray.init` takes it.
-            share: What an object takes: `{"CPU": 2}`, or `{"GPU": 1}`.
+            make: The class of the workers, from a module that every machine of the cluster can import.
+            arguments: Constructor arguments of each worker.
+            count: Number of workers; None uses all resources of the cluster.
+            most: Maximum number of workers.
+            address: Address of the cluster, as for `ray.init`.
+            share: Resources of one worker: `{"CPU": 2}` or `{"GPU": 1}`.
 
         Raises:
-            WlmError: There is no Ray, or no cluster at that address, or it has no room.
+            WlmError: Ray is missing, there is no cluster at that address, or it lacks the resources.
         """
         try:
             import ray
@@ -271,7 +271,7 @@ class Actors(Workers):
             return number, error.cause
         except self._ray.exceptions.RayError as error:
             lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-            # Of an object that couldn't be made the last line says why.
+            # If a worker couldn't be created, the last line of the message gives the reason.
             return number, Lost(lines[-1 if "creation task" in lines[0] else 0])
 
     def renew(self, number: int) -> None:
@@ -288,10 +288,10 @@ class Actors(Workers):
 
 
 def _connect(ray: Any, address: str) -> None:
-    """Connects to a cluster; signals do what they did before."""
+    """Connects to a cluster and restores the signal handlers that Ray replaces."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
-        # Ray tries for minutes.
+        # Ray would retry for minutes.
         try:
             socket.create_connection((host, int(port)), _ANSWER).close()
         except (OSError, OverflowError) as error:
@@ -309,11 +309,11 @@ def _connect(ray: Any, address: str) -> None:
 
 
 def serve() -> None:
-    """Makes an object and answers its calls, which come on stdin, until that ends: what each of `Processes` runs."""
+    """Runs a worker of `Processes`: creates the object and executes the calls from stdin until stdin is closed."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # output of libraries must not mix with results
     with suppress(EOFError, BrokenPipeError):
         module, name, arguments = pickle.load(sys.stdin.buffer)
         worker, answer = None, None
@@ -337,7 +337,7 @@ def _send(stream: IO[bytes], message: Any) -> None:
 
 
 def _sendable(error: Exception) -> Exception:
-    """An exception that can be sent, with the place where it was raised."""
+    """Converts an exception to one that can be pickled, with the location where it was raised."""
     if not isinstance(error, WlmError):
         error.add_note("".join(traceback.format_exception(error)))
     try:
@@ -348,7 +348,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _reason(code: int, errors: IO[bytes]) -> str:
-    """Why a process ended, in a line."""
+    """Returns the reason why a process ended, as one line."""
     with suppress(OSError, ValueError):
         size = errors.seek(0, os.SEEK_END)
         errors.seek(max(0, size - _TOLD))

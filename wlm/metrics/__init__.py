@@ -1,4 +1,4 @@
-"""Error of HDR lightmaps: PSNR, SSIM and HDR-FLIP, masked, and in tiles as the paper scores them."""
+"""Error of HDR lightmaps: PSNR, SSIM and HDR-FLIP, over masks, and per tile as in neural-dynamic-gi, section 10.2."""
 
 from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, max_abs_error, mse, psnr, psnr_from_mse
 from wlm.metrics.flip import flip_display, flip_exposures, flip_map

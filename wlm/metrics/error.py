@@ -6,9 +6,9 @@ import numpy as np
 
 from wlm.errors import WlmError
 
-# An exact reconstruction has infinite PSNR and would swallow every mean. Rounding to half float alone leaves,
-# in a tile that reaches down to black, 70 to 90 dB, so no lossy half-float codec comes near 120; a float32
-# path within rounding of its reference does, and counts as exact.
+# An exact reconstruction has infinite PSNR and would dominate every mean. Rounding to half float alone gives
+# 70 to 90 dB in a tile that contains black, so no lossy half-float codec comes near 120; a float32 path that
+# matches its reference within rounding does, and counts as exact.
 PSNR_CAP_DB = 120.0
 
 
@@ -21,7 +21,7 @@ def check_pair(
         ref: `[H, W, C]`, linear.
         test: `[H, W, C]`, linear.
         mask: `[H, W]`, or None for all texels.
-        where: What to call this pair in a message ("city 12 h").
+        where: Name of this pair in error messages ("city 12 h").
 
     Raises:
         WlmError: Shapes differ, or a valid texel of either image is NaN or infinite; the message names the
@@ -82,7 +82,7 @@ def max_abs_error(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = N
 
 
 def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Maximum less minimum over the valid texels and all channels (neural-dynamic-gi, section 10.2).
+    """Maximum minus minimum over the valid texels and all channels (neural-dynamic-gi, section 10.2).
 
     Args:
         ref: `[H, W, C]`, linear.
@@ -108,8 +108,8 @@ def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak
         peak: The signal's peak in the images' units; None takes the reference's `dynamic_range`.
 
     Returns:
-        Decibels, at most `PSNR_CAP_DB` (an exact reconstruction scores that); NaN with an empty mask or a
-        peak of zero, which give no scale to measure against.
+        Decibels, at most `PSNR_CAP_DB`, the score of an exact reconstruction; NaN with an empty mask or a
+        peak of zero, which define no scale.
 
     Raises:
         WlmError: Shapes differ, a valid texel is NaN or infinite, or the peak is negative or not finite.
@@ -124,12 +124,12 @@ def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak
 
 
 def psnr_from_mse(error: float, peak: float) -> float:
-    """`psnr` of a mean squared error, with the same cap; NaN where the error is NaN or the peak isn't above 0."""
+    """Converts a mean squared error to PSNR, with `psnr`'s cap; NaN if the error is NaN or the peak is not positive."""
     if math.isnan(error) or not peak > 0.0:
         return math.nan
     if error == 0.0:
         return PSNR_CAP_DB
-    # Two logarithms and no square: a range of 1e-7 squared is still fine, but 1e-200 would underflow to zero.
+    # Two logarithms avoid squaring the peak: the square of a peak of 1e-200 would underflow to zero.
     return min(PSNR_CAP_DB, 20.0 * math.log10(peak) - 10.0 * math.log10(error))
 
 
@@ -137,12 +137,12 @@ def half_ulp(value: float) -> float:
     """Step between neighbouring half floats at `value`: the resolution of a stored lightmap.
 
     Args:
-        value: Any finite number; magnitudes above 65,504 take the largest half float's step.
+        value: Any finite number; magnitudes above 65,504 return the step of the largest half float.
 
     Returns:
         The step in the units of `value`, at least 2**-24.
     """
     magnitude = np.float16(min(abs(float(value)), float(np.finfo(np.float16).max)))
     if magnitude == np.finfo(np.float16).max:
-        return 32.0  # np.spacing looks upwards, and above the largest half float there is only infinity
+        return 32.0  # the next larger value, to which np.spacing measures, is infinity
     return float(np.spacing(magnitude))

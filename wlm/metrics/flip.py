@@ -1,9 +1,9 @@
-"""HDR-FLIP over a whole frame, with exposures that follow from the reference alone.
+"""HDR-FLIP over a whole frame, with exposures computed from the reference alone.
 
 FLIP: Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating Images". HDR-FLIP: Andersson et al.
 2021, "Visualizing Errors in Rendered High Dynamic Range Images": the largest LDR-FLIP over a range of
-exposures, each tone mapped. The computation is NVIDIA's `flip_evaluator`; what is here is what it needs to be
-safe on lightmaps.
+exposures, each tone mapped. NVIDIA's `flip_evaluator` does the computation; this module prepares lightmaps for it
+and handles masks and extreme values.
 """
 
 import math
@@ -15,28 +15,28 @@ from wlm.metrics.error import check_pair
 from wlm.texels import fill_gaps
 
 # HDR-FLIP chooses the exposures so that the reference's brightest luminance (at the first) and its median (at
-# the last) are tone mapped to 0.85. With the ACES curve that flip_evaluator takes by default, this is the
-# input that gives 0.85.
+# the last) are tone mapped to 0.85. With the ACES curve, flip_evaluator's default, this is the input that
+# gives 0.85.
 _TONE_MAPPED_TARGET_INPUT = 2.118873
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # linear sRGB, as flip_evaluator weighs it
-# The brightest texel of a bake is often a firefly; the paper's maximum would then spend an exposure on one
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # linear sRGB, the weights of flip_evaluator
+# The brightest texel of a bake is often a firefly; the paper's maximum would then use an exposure for one
 # texel.
 _BRIGHT_PERCENTILE = 99.0
 _MEDIAN_PERCENTILE = 50.0
 # flip_evaluator returns 0 for one exposure, whatever the images, so a range of exposures needs at least two.
 _MIN_EXPOSURES = 2
-# Half float's normal numbers span 30 stops; a wider span only spends exposures on what the format can't hold.
+# Half float's normal numbers span 30 stops; a wider span wastes exposures on values that it can't represent.
 _MAX_SPAN = 30.0
-# The tone mapper squares its input in float32, so an exposed value must stay under 2**63; it is white long
-# before 2**60.
+# The tone mapper squares its input in float32, so an exposed value must stay under 2**63; values far below
+# 2**60 are already white.
 _EXPOSED_LIMIT = 60.0
 
 
 def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[float, float] | None:
     """First and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
 
-    As in HDR-FLIP, but from the 99th percentile and the median of the texels that are lit at all: at night
-    most of a lightmap is black, and a median of zero has no exposure.
+    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
+    the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
 
     Args:
         ref: `[H, W, 3]`, linear RGB.
@@ -60,12 +60,12 @@ def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[flo
 
 
 def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, exposures: int = 2) -> np.ndarray:
-    """FLIP error at every texel, at flip_evaluator's default of 67 pixels a degree.
+    """FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
 
-    Outside the mask both images take the reference's nearest valid value: the error there is zero but for
-    what the filters carry over an edge. Negative values, which no display shows, count as zero. Where no
-    valid texel of the reference is lit there is no exposure to choose: the error is zero if the test is black
-    too, else LDR-FLIP between black and the test clipped to [0, 1].
+    Outside the mask both images take the reference's nearest valid value, so the error there is zero except
+    where the filters cross a chart's edge. Negative values count as zero. If no valid texel of the reference is
+    above zero, no exposure can be chosen: the error is zero if the test is black too, else LDR-FLIP between black
+    and the test clipped to [0, 1].
 
     Args:
         ref: `[H, W, 3]`, linear RGB.
@@ -74,7 +74,7 @@ def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, 
         exposures: Number of exposures, at least 2; the time grows with it.
 
     Returns:
-        `[H, W]` float64 in [0, 1], 0 where nothing is seen to differ.
+        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
 
     Raises:
         WlmError: Shapes differ, the images are not RGB, a valid texel is NaN or infinite, or there are fewer
@@ -89,11 +89,11 @@ def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, 
 
 
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """LDR-FLIP of what a display shows, at flip_evaluator's default of 67 pixels a degree.
+    """LDR-FLIP between two display images, at flip_evaluator's default of 67 pixels per degree.
 
     Args:
         ref: `[H, W, 3]`, sRGB in [0, 1].
-        test: `[H, W, 3]`, likewise.
+        test: `[H, W, 3]`, sRGB in [0, 1].
 
     Returns:
         `[H, W]` float64 in [0, 1].
@@ -107,8 +107,8 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
 
 
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int) -> np.ndarray:
-    """`flip_map` for images that are checked and equal outside the mask; `span` is `flip_exposures`'."""
-    import flip_evaluator  # here for the same reason as scikit-image in structural.py
+    """`flip_map` for images already checked and equal outside the mask; `span` is the result of `flip_exposures`."""
+    import flip_evaluator  # imported here because the import is slow, like scikit-image's in structural.py
 
     _check_rgb(ref)
     if exposures < _MIN_EXPOSURES:
@@ -119,8 +119,8 @@ def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | N
             return np.zeros(ref.shape[:2])
         return _ldr_flip(np.zeros(ref.shape), np.clip(test, 0.0, 1.0), srgb=False)
     start, stop = span
-    # One power of two moves the images and the exposures alike, so the result is the same, while float32
-    # inputs stay far from overflow and from subnormals however bright or dim the scene is.
+    # Images and exposures are scaled by one power of two: the result is the same, and float32 inputs stay far
+    # from overflow and from subnormals for very bright and very dim scenes.
     shift = round(start)
     scale = 2.0**shift
     ceiling = 2.0 ** (_EXPOSED_LIMIT - (stop - shift))

@@ -1,25 +1,25 @@
-"""Light that an approximation lost and a mean hides.
+"""Detects light lost by compression that a mean error does not show.
 
-One texel of 16,384 that is ten thousand times the others may vanish, and PSNR, whose peak it is, still be 48 dB. Or it
-stays, and the others vanish.
+PSNR can stay at 48 dB although the one texel of 16,384 that is ten thousand times brighter than the others, and
+therefore sets the peak, decodes to black, or although that texel is kept and all the others decode to black.
 """
 
 import numpy as np
 import torch
 
-_BRIGHT = 0.5  # of the largest: what counts as among the brightest
-_KEPT = 0.5  # of its own: what is left of light that isn't lost; and by how much of its own light a point is off
-_BRIGHTER = 10.0  # times the median: what hides an error of the others
+_BRIGHT = 0.5  # share of the group's maximum above which a point counts as one of its brightest
+_KEPT = 0.5  # share of a point's own light: a bright point below it is lost, and a larger error makes a dim point lost
+_BRIGHTER = 10.0  # multiple of the median above which a bright point hides the errors of the others
 
 
 class LostLight:
-    """Counts the points of some groups that lost more than half of their light where PSNR doesn't show it.
+    """Counts the points that lost more than half of their light without a visible effect on PSNR.
 
     Attributes:
-        count: Points among the brightest of their group.
-        worst: The largest of them, what it decodes to, and where; None without any.
-        hidden: Points of groups most of which are off by more than half of their own light, beside something that is
-            ten times as bright as the median.
+        count: Number of such points among the brightest of their group.
+        worst: The largest of them: its value, its decoded value and its location; None if there is none.
+        hidden: Number of such points in groups where most points have an error of more than half of their own light
+            and the maximum is at least ten times the median.
     """
 
     def __init__(self) -> None:
@@ -27,11 +27,11 @@ class LostLight:
         self.worst: tuple[float, float, str] | None = None
 
     def add(self, reference: np.ndarray | torch.Tensor, decoded: np.ndarray | torch.Tensor, where: str = "") -> None:
-        """Looks at a group: a tile at one time, or a whole set.
+        """Adds a group of points, such as a tile at one time of day or a whole probe set.
 
         Args:
             reference, decoded: [K, C], on one device; a point's light is the largest magnitude of its channels.
-            where: Words for the group in the warning.
+            where: Name of the group in the warning.
         """
         if not len(reference):
             return
@@ -52,11 +52,11 @@ class LostLight:
                 self.hidden += off
 
     def warnings(self, name: str, point: str, group: str) -> list[str]:
-        """A line for each kind of loss that there was.
+        """Returns one line for each kind of loss that occurred.
 
         Args:
-            name: Of what was compressed.
-            point, group: Words for a point, and for what it is a part of: "texel", "its tile".
+            name: Name of the compressed data.
+            point, group: Words for a point and for its group, such as "texel" and "its tile".
         """
         lines = []
         if self.worst is not None:
@@ -74,7 +74,7 @@ class LostLight:
 
 
 def _largest(values: torch.Tensor) -> torch.Tensor:
-    """The largest magnitude of each row's channels [K]; column by column, which is faster than row by row."""
+    """Returns the largest channel magnitude of each row, [K]; looping over columns is faster than over rows."""
     result = values[:, 0].abs()
     for channel in range(1, values.shape[1]):
         torch.maximum(result, values[:, channel].abs(), out=result)

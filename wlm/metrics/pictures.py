@@ -1,4 +1,4 @@
-"""The error of pictures as they are shown, added up over views: sRGB in [0, 1], only where something is seen."""
+"""Image error of rendered views: sRGB in [0, 1], accumulated over views, only over pixels that show the object."""
 
 import math
 
@@ -10,20 +10,20 @@ from wlm.metrics.structural import ssim
 
 
 class Pictures:
-    """Pairs of pictures of one thing; every figure is a mean over the seen pixels of all of them.
+    """Image pairs of one object; every score is a mean over the covered pixels of all pairs.
 
     Attributes:
-        count: Pairs in which something is seen.
-        mse: Mean squared error over pixels and channels; NaN without a pair, as are all below.
-        flip: LDR-FLIP, in [0, 1].
-        ssim: Mean over the pixels whose window lies in the picture; NaN where it wasn't asked for.
+        count: Number of pairs with at least one covered pixel.
+        mse: Mean squared error over pixels and channels; like all scores below, NaN without a pair.
+        flip: Mean LDR-FLIP, in [0, 1].
+        ssim: Mean SSIM over the pixels whose window lies inside the image; NaN if it was not requested.
     """
 
     def __init__(self, structural: bool = False) -> None:
-        """Begins with none.
+        """Creates an empty collection.
 
         Args:
-            structural: Whether SSIM is computed too.
+            structural: Whether SSIM is also computed.
         """
         self._structural = structural
         self.count = 0
@@ -35,7 +35,7 @@ class Pictures:
 
     @property
     def psnr(self) -> float:
-        """dB, of colours in [0, 1]."""
+        """PSNR in dB for a peak of 1."""
         return psnr_from_mse(self.mse, 1.0)
 
     @property
@@ -50,17 +50,17 @@ class Pictures:
         """Adds a pair.
 
         Args:
-            reference: [H, W, 3], sRGB in [0, 1], alike in both where nothing is seen.
-            test: Likewise.
-            seen: bool [H, W].
+            reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.
+            test: [H, W, 3], sRGB in [0, 1].
+            seen: bool [H, W], true for covered pixels.
 
         Returns:
-            Its own `psnr` and `flip`; None where nothing is seen.
+            `psnr` and `flip` of this pair; None if no pixel is covered.
         """
         count = int(np.count_nonzero(seen))
         if not count:
             return None
-        # FLIP takes its time for empty pixels too.
+        # FLIP also spends time on empty pixels, so they are cropped.
         window = tuple(slice(at.min(), at.max() + 1) for at in np.nonzero(seen))
         first, second, shown = reference[window], test[window], seen[window]
         flip = float(flip_display(first, second)[shown].sum())

@@ -23,8 +23,8 @@ def ssim_map(ref: np.ndarray, test: np.ndarray, data_range: float) -> np.ndarray
         data_range: The signal's range in the images' units, above 0.
 
     Returns:
-        `[H, W]` float64 in [-1, 1]. The outermost `SSIM_WINDOW // 2` texels see mirrored data; `ssim` leaves
-        them out.
+        `[H, W]` float64 in [-1, 1]. The outermost `SSIM_WINDOW // 2` texels use mirrored data; `ssim` excludes
+        them.
 
     Raises:
         WlmError: The image is smaller than the window, or the range is not positive.
@@ -52,16 +52,15 @@ def ssim_map(ref: np.ndarray, test: np.ndarray, data_range: float) -> np.ndarray
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, data_range: float | None = None) -> float:
     """Mean SSIM over the valid texels whose window lies inside the image (Wang et al. 2004).
 
-    Outside the mask both images take the reference's nearest valid value, so that what a codec leaves there
-    neither helps nor hurts the windows that reach over a chart's edge. With a full mask this equals
-    scikit-image's mean.
+    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
+    affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
 
     Args:
         ref: `[H, W, C]`, linear.
         test: `[H, W, C]`, linear.
         mask: `[H, W]`, true where a texel counts; None for all.
-        data_range: The signal's range in the images' units; None takes the valid reference's maximum less
-            minimum.
+        data_range: The signal's range in the images' units; None takes the valid reference's maximum minus
+            its minimum.
 
     Returns:
         The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the

@@ -1,14 +1,14 @@
 """The protocol of neural-dynamic-gi, section 10.2: scores for each tile, averaged over tiles and lightmaps.
 
 Each lightmap is cut into non-overlapping tiles (128x128). In each tile the metric is taken over the texels
-that the mask calls valid, with the tile's own dynamic range (maximum less minimum of the valid reference, all
+that the mask calls valid, with the tile's own dynamic range (maximum minus minimum of the valid reference, all
 channels) as the scale, in linear RGB. The report is the mean over all tiles of all lightmaps of a scene.
 
-What the paper leaves open is settled so: a tile with fewer than `MIN_VALID_TEXELS` valid texels or a range of
-zero has no score, and is counted; PSNR is capped at `PSNR_CAP_DB`; a tile whose range is a few half-float
-steps is in the mean, and the mean without such tiles stands beside it; FLIP, which depends on a neighbourhood
-and on the display and not on a range, is computed over the whole lightmap and its map averaged in each tile;
-the paper's LPIPS, a network trained on display-referred photographs, gives way to FLIP.
+The paper does not define the following cases. A tile with fewer than `MIN_VALID_TEXELS` valid texels or a range of
+zero has no score and is counted separately. PSNR is capped at `PSNR_CAP_DB`. A tile whose range is a few half-float
+steps is part of the mean, and the mean without such tiles is reported too. FLIP depends on a neighbourhood and on the
+display but not on a range, so it is computed over the whole lightmap and its map is averaged in each tile. FLIP
+replaces the paper's LPIPS, a network trained on display-referred photographs.
 """
 
 import math
@@ -24,28 +24,28 @@ from wlm.metrics.structural import ssim_filled
 from wlm.texels import fill_gaps
 
 METRICS = ("psnr", "ssim", "flip")
-# Four 4x4 blocks: below that one bad block is the tile's whole score.
+# Four 4x4 blocks: with fewer, one bad block would determine the tile's score.
 MIN_VALID_TEXELS = 64
-# A tile that spans up to this many half-float steps at its own brightest value can't score better than
-# rounding to half lets it (about 29 dB at 8 steps), however good the codec is.
+# In a tile whose range is at most this number of half-float steps at its brightest value, rounding to half float
+# limits the score of every codec (to about 29 dB at 8 steps).
 FORMAT_LIMITED_ULPS = 8
 
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """Scores of one lightmap, one entry a tile; every array is `[ny, nx]`, tile rows from the top.
+    """Scores of one lightmap, one entry per tile; every array is `[ny, nx]`, tile rows from the top.
 
     Attributes:
-        psnr: Decibels; NaN where the tile is not scored or the metric was not asked for.
-        ssim: In [-1, 1]; NaN likewise, and where the tile is too small for the window.
-        flip: Mean FLIP error in [0, 1]; NaN likewise.
+        psnr: Decibels; NaN where the tile is not scored or the metric was not requested.
+        ssim: In [-1, 1]; NaN in the same cases and where the tile is smaller than the window.
+        flip: Mean FLIP error in [0, 1]; NaN in the same cases as `psnr`.
         max_abs_error: Largest absolute error in the images' units, for every tile with a valid texel, scored
             or not; NaN without one.
         range: Dynamic range in the images' units, or the peak that was given; NaN without a valid texel.
-        half_step: Half float's step at the tile's largest magnitude, in the images' units; NaN without a
+        half_step: Step between half floats at the tile's largest magnitude, in the images' units; NaN without a
             valid texel.
         valid: Number of valid texels.
-        metrics: The metrics that were asked for.
+        metrics: The requested metrics.
     """
 
     psnr: np.ndarray
@@ -74,19 +74,19 @@ class Summary:
 
     Attributes:
         psnr, ssim, flip: Mean over every scored tile of every lightmap.
-        psnr_unlimited: The same mean of PSNR without the tiles in `format_limited`.
+        psnr_unlimited: Mean PSNR over the scored tiles except the tiles in `format_limited`.
         psnr_by_tile, ssim_by_tile, flip_by_tile: `[ny, nx]`, mean over the lightmaps.
         psnr_by_time, ssim_by_time, flip_by_time: `[T]`, mean over the tiles of one lightmap.
         worst_psnr: Lowest PSNR of a tile.
-        worst_tile: `(lightmap, tile row, tile column)` of it; None where nothing is scored.
+        worst_tile: `(lightmap, tile row, tile column)` of that tile; None if no tile is scored.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the images' units.
-        max_abs_error_unscored: The same over the tiles left out, so that an error there does not hide.
+        max_abs_error_unscored: Largest absolute error in the tiles without a score.
         tiles: Number of tiles in all lightmaps.
-        scored: Number that count in the means.
-        few_texels: Number left out with fewer than `MIN_VALID_TEXELS` valid texels, empty ones among them.
-        zero_range: Number left out because the reference is constant.
-        no_ssim: Scored tiles without an SSIM (no valid texel has its window inside the tile); 0 if not asked
-            for.
+        scored: Number of tiles that count in the means.
+        few_texels: Number of tiles excluded for fewer than `MIN_VALID_TEXELS` valid texels, including empty tiles.
+        zero_range: Number of tiles excluded because the reference is constant.
+        no_ssim: Number of scored tiles without an SSIM (no valid texel has its window inside the tile); 0 if SSIM was
+            not requested.
         format_limited: `(lightmap, tile row, tile column)` of each scored tile that spans only a few
             half-float steps.
     """
@@ -123,19 +123,19 @@ def evaluate_frame(
     name: str = "lightmap",
     peak: float | None = None,
 ) -> FrameMetrics:
-    """Scores one lightmap tile by tile (neural-dynamic-gi, section 10.2, as this module settles it).
+    """Scores one lightmap tile by tile (neural-dynamic-gi, section 10.2, with this module's additions).
 
     Args:
         ref: `[H, W, 3]`, linear RGB, any float dtype. Texels outside the mask are ignored.
         test: `[H, W, 3]`, linear RGB.
         mask: `[H, W]`, true where a texel is valid.
-        tile: Side of a tile in texels; tiles at the right and the bottom edge are smaller where it does not
-            divide.
+        tile: Side of a tile in texels; tiles at the right and the bottom edge are smaller if it does not
+            divide the lightmap's size.
         metrics: Any of `METRICS`. FLIP takes most of the time.
         flip_exposure_count: Exposures for HDR-FLIP, at least 2.
-        name: What to call this lightmap in a message.
-        peak: The scale of every tile, above 0, where values have a range of their own and aren't light; None: the
-            tile's own range.
+        name: Name of this lightmap in error messages.
+        peak: The scale of every tile, above 0, for data with a fixed range that is not light; None uses each tile's
+            own range.
 
     Returns:
         Scores for each tile.
@@ -189,14 +189,14 @@ def evaluate_frame(
 
 
 def summarise(frames: Sequence[FrameMetrics]) -> Summary:
-    """Average the scores of a scene's lightmaps over all tiles and lightmaps.
+    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
 
     Args:
-        frames: One `FrameMetrics` a lightmap, all of one grid of tiles and the same metrics, in the order of
+        frames: One `FrameMetrics` per lightmap, all with the same grid of tiles and the same metrics, in order of
             time.
 
     Returns:
-        Means, means by tile and by time, the worst tile, and what was left out and why.
+        Means, means by tile and by time, the worst tile, and the number of excluded tiles by reason.
 
     Raises:
         WlmError: No frames, or frames of different grids or metrics.
@@ -243,7 +243,7 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
 
 
 def nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
-    """`np.nanmean` without its warning: a mean over nothing is NaN and is expected here."""
+    """`np.nanmean` without its warning for an empty mean, which is NaN and expected here."""
     valid = ~np.isnan(values)
     count = valid.sum(axis=axis)
     total = np.where(valid, values, 0.0).sum(axis=axis)

@@ -1,15 +1,15 @@
-"""Differentiable operations for torch on Warp kernels.
+"""Differentiable torch operations on Warp kernels.
 
-Functions with gradients by autograd, on the device of their tensors; on CUDA they queue work on torch's current stream.
-All floats are float32, and there is no second derivative. `plain` has each of them again in a few lines of torch, of
-any float type: the definition that the kernels are held to. The page is docs/ops.md.
+The functions support autograd, run on the device of their tensors and, on CUDA, queue work on torch's current stream.
+All floats are float32, and there is no second derivative. `plain` implements each of them in a few lines of torch, for
+any float type, as the reference for the kernels. The documentation is docs/ops.md.
 
     bc7_map, bc7_texels, bc7_blocks     feature maps in BC7 blocks
     plane, triplane, volume             feature grids, sampled linearly
     mlp                                 networks of two hidden layers
     gaussian_sum                        3D Gaussians at any points
     rasterize, rasterize_uv             triangles to pixels
-    interpolate, texture                what a pixel then shows
+    interpolate, texture                attributes and texture values per pixel
     march                               light through a density grid
 """
 

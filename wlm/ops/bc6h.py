@@ -1,4 +1,4 @@
-"""BC6H blocks of tensors: encoded on their device."""
+"""BC6H encoding of tensors on their device."""
 
 import functools
 
@@ -19,10 +19,10 @@ def bc6h_blocks(light: torch.Tensor, weight: torch.Tensor | None = None) -> tupl
 
     Args:
         light: float32 [N, 16, 3], linear, texels row by row; clamped to [0, 65504].
-        weight: float32 [N, 16], of each texel's squared error; None: all alike.
+        weight: float32 [N, 16], weight of each texel's squared error; None weights all texels equally.
 
     Returns:
-        The blocks, uint8 [N, 16], and what they decode to, float32 [N, 16, 3].
+        The blocks, uint8 [N, 16], and their decoded texels, float32 [N, 16, 3].
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit.

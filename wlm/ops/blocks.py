@@ -1,9 +1,9 @@
-"""Feature maps in simulated BC7 mode 6 blocks, of which the endpoints and the weights are trained.
+"""Feature maps in simulated BC7 mode 6 blocks with trainable endpoints and weights.
 
 A map of 4 channels is cut into blocks of 4 x 4 texels. A block has two endpoints, e0 and e1, and a weight w for each
-texel, which is (1 - w) e0 + w e1 (neural-dynamic-gi, eq. 7 and 8). `quantised` evaluates that on exactly the levels
-that a file of 16 bytes a block holds, and rounds as its decoder does; roundings and clamps are straight-through, with
-derivative 1. Train without it first, and with it at the end; `bc7_blocks` then gives the file's bytes.
+texel, which is (1 - w) e0 + w e1 (neural-dynamic-gi, eq. 7 and 8). `quantised` uses exactly the levels of the 16-byte
+block format and rounds like its decoder; rounding and clamping are straight-through, with derivative 1. Train without
+it first and with it at the end; `bc7_blocks` then returns the blocks' bytes.
 """
 
 import numpy as np
@@ -26,24 +26,24 @@ def bc7_map(
     layer: torch.Tensor | None = None,
     quantised: bool = False,
 ) -> torch.Tensor:
-    """Samples a map of blocks bilinearly, clamped at its border; `plain.bc7_map` is the twin.
+    """Samples a map of blocks bilinearly, clamped at its border; the reference is `plain.bc7_map`.
 
-    All texels are decoded, once: to read a few of a large map it is not made.
+    Each call decodes all texels once, so it is inefficient for a few samples of a large map.
 
     Args:
-        endpoints: float [H/4, W/4, 2, 4], or [L, H/4, W/4, 2, 4] with `layer`: two RGBA colours a block, used as
-            clamped to [0, 1]. With a gradient, which those outside keep.
-        weights: float [H, W] or [L, H, W], one a texel, as the endpoints.
-        uv: float [..., 2], u right, v down, the centre of texel i of n at (i + 1/2) / n; with a gradient.
-        layer: int32 or int64 [...], 0 to L - 1: the map of each point.
+        endpoints: float [H/4, W/4, 2, 4], or [L, H/4, W/4, 2, 4] with `layer`: two RGBA colours per block,
+            clamped to [0, 1] for use. Has a gradient, also for values outside [0, 1].
+        weights: float [H, W] or [L, H, W], one per texel, clamped like the endpoints; has a gradient.
+        uv: float [..., 2], u right, v down, the centre of texel i of n at (i + 1/2) / n; has a gradient.
+        layer: int32 or int64 [...], 0 to L - 1: the index of each point's map.
         quantised: Whether to evaluate on the exact levels of BC7 mode 6.
 
     Returns:
         float [..., 4].
 
     Raises:
-        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. Finding that
-            out waits for the GPU; while a CUDA graph is captured it isn't looked for.
+        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. The check of
+            numbers waits for the GPU and is skipped while a CUDA graph is captured.
     """
     if layer is None:
         check("weights", weights, (None, None))
@@ -52,7 +52,7 @@ def bc7_map(
 
 
 def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: bool = False) -> torch.Tensor:
-    """Decodes whole maps; `plain.bc7_texels` is the twin. The gradients have the same bits at each run.
+    """Decodes whole maps; the reference is `plain.bc7_texels`. Gradients are bitwise reproducible.
 
     Args:
         endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.
@@ -60,7 +60,7 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
         quantised: Whether to evaluate on the exact levels of BC7 mode 6.
 
     Returns:
-        float [H, W, 4] or [L, H, W, 4]: what `plane` samples, or `volume` if the maps are its slices.
+        float [H, W, 4] or [L, H, W, 4], an input for `plane`, or for `volume` if the maps are its slices.
 
     Raises:
         ValueError: As for `bc7_map`.
@@ -72,7 +72,7 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
 
 
 def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
-    """Packs maps into the bytes of a file, which decode to `bc7_texels` with `quantised`; without a gradient.
+    """Packs maps into BC7 blocks, which decode to the result of `bc7_texels` with `quantised`; has no gradient.
 
     Args:
         endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.

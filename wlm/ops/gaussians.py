@@ -1,4 +1,4 @@
-"""Sums of 3D Gaussians that carry latents."""
+"""Sums of 3D Gaussians with latent vectors."""
 
 from typing import Any
 
@@ -13,28 +13,28 @@ from wlm_kernels.probe import gaussian_sum as kernels
 from wlm_kernels.probe.gaussians import LATENT
 
 PAIRS_FOR_LISTS = 2**17
-"""Gaussians times points from which on a point looks only at those that a cube lists: making the lists has to pay."""
+"""Number of Gaussian-point pairs above which points only evaluate the Gaussians listed for their grid cell."""
 
 
 def gaussian_sum(
     rows: torch.Tensor, points: torch.Tensor, *, cut: float = 3.0, support: str = "ellipsoid"
 ) -> torch.Tensor:
-    """Sums Gaussians at points: F(x) = sum_k F_k exp(-|u_k|^2 / 2); `plain.gaussian_sum` is the twin.
+    """Sums Gaussians at points: F(x) = sum_k F_k exp(-|u_k|^2 / 2); reference: `plain.gaussian_sum`.
 
     u_k = S^-1 R^T (x - centre) with the scales S and the rotation R (gaussian-probe-compression, eq. 2 to 6, 11, 12),
-    over the Gaussians that reach x; which do is a constant to the gradients. Sums and gradients have the same bits at
-    each run. A length of latents has its kernels compiled at its first use, in some seconds; lengths of up to 32 are
-    tested. It can't be captured in a CUDA graph.
+    over the Gaussians that reach x; the gradients treat this set as constant. Sums and gradients are bitwise
+    reproducible. The first use of a latent length compiles its kernels, which takes several seconds; lengths up to 32
+    are tested. The function can't be captured in a CUDA graph.
 
     Args:
-        rows: float [K, 10 + L], a Gaussian each: centre (3), natural logarithm of the scale along its axes (3),
-            rotation as a quaternion w x y z of any length (4; none below 1e-12, and then without a gradient), latent
-            (L). With a gradient.
-        points: float [..., 3], in the unit of the centres; with a gradient.
-        cut: How far a Gaussian reaches, in standard deviations, above 0. It leaves out exp(-cut^2 / 2) of a latent at
-            most.
-        support: What it reaches: "ellipsoid", as far along each axis as it is long; "sphere", everywhere as far as
-            along its longest (eq. 6).
+        rows: float [K, 10 + L], one Gaussian per row: centre (3), natural logarithm of the scale along its axes (3),
+            rotation as a quaternion w x y z of any length (4; below 1e-12 it is the identity and has no gradient),
+            latent (L). Has a gradient.
+        points: float [..., 3], in the unit of the centres; has a gradient.
+        cut: Cutoff radius of a Gaussian in standard deviations, above 0. The omitted part is at most exp(-cut^2 / 2) of
+            a latent.
+        support: Shape of the cutoff: "ellipsoid" scales the radius along each axis; "sphere" uses the longest axis in
+            all directions (eq. 6).
 
     Returns:
         float [..., L].
@@ -78,7 +78,7 @@ class _GaussianSum(torch.autograd.Function):
         return on_rows, on_points, None, None
 
 
-# What Warp allocates is freed where these end, on the stream that has used it.
+# Warp frees its allocations at the end of these functions, on the stream that used them.
 
 
 def _forward(rows, points, cut: float, support: str, out) -> Any:
@@ -87,7 +87,7 @@ def _forward(rows, points, cut: float, support: str, out) -> Any:
     cubes = None
     if len(rows) * len(points) >= PAIRS_FOR_LISTS:
         cubes = cubes_kernels.build(shapes, *(ends.tolist() for ends in points.aminmax(dim=0)))
-        # The backward pass comes later, and torch frees its own memory when its stream is done with it.
+        # The backward pass runs later; torch frees its memory only when its stream has finished using it.
         cubes.start, cubes.item = (to_warp(wp.to_torch(numbers).clone()) for numbers in (cubes.start, cubes.item))
     kernels.sum(array, shapes, cubes, x, to_warp(out), cut)
     return cubes

@@ -1,17 +1,17 @@
-"""Viewers who stand in a scene: points above walkable floor from which something is seen all around.
+"""Eye positions inside a scene: points above walkable floor that are surrounded by geometry.
 
-A floor is a triangle that faces up, at most 45 degrees steep. A viewer stands on it where
+A floor is a triangle that faces up, at most 45 degrees steep. A point at eye height above it is valid if
 
-- there is nothing within the height of their eyes above the floor;
-- of directions spread evenly over the sphere at least half end on a triangle: between the walls of a room or of a
-  street, not on the roof or beside a thing;
-- three quarters of those end on a triangle's front: not in a wall or in a solid thing;
-- and none within a fifth of the height of their eyes.
+- no triangle lies between the floor and the eye;
+- at least half of the rays in evenly spread directions hit a triangle, which excludes roofs and points beside an
+  object but not rooms and streets;
+- three quarters of these rays hit a triangle's front, which excludes points inside walls and solid objects;
+- and no ray hits a triangle within a fifth of the eye height.
 
-A room whose fronts are outside can't be told from a thing, and nobody stands in it.
+A room whose triangles face outwards looks like a solid object and gets no viewpoints.
 
-Eyes are 1 m above the floor; 0.35 of the scene's height where that is less, where the unit isn't known, or where the
-scene is higher than 200 m, which says that its unit isn't the metre.
+The eye height is 1 m, or 0.35 of the scene's height if that is less, if the unit isn't known, or if the scene is higher
+than 200 m, which suggests that its unit isn't the metre.
 """
 
 import math
@@ -25,36 +25,36 @@ from wlm.ops.views import Viewpoint
 from wlm_kernels.raster.rays import first_hit
 
 EYES, EYES_SHARE = 1.0, 0.35
-"""Metres above the floor; or this share of the scene's height."""
+"""Eye height in metres above the floor, and as a share of the scene's height."""
 
 _TALLEST = 200.0  # metres
-_STEEPEST = math.sqrt(0.5)  # of a floor: the least y of its normal
+_STEEPEST = math.sqrt(0.5)  # smallest y of a floor's unit normal
 _CANDIDATES, _RAYS = 1024, 96
-_FEWEST = 16  # places among the candidates: fewer are a crack in a thing
+_FEWEST = 16  # minimum number of valid candidates: fewer suggest a gap inside an object
 _ENCLOSED, _FRONTS, _NEAREST = 0.5, 0.75, 0.2
-_PITCH = 0.6  # the largest |y| of the directions that viewers look in
+_PITCH = 0.6  # the largest |y| of the viewing directions
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Indoors:
-    """Where viewers may stand.
+    """Valid eye positions inside a scene.
 
     Attributes:
-        eye: float64 [P, 3], their eyes, in random order; empty where nobody can stand.
-        height: Of the eyes above the floor, in the scene's unit.
+        eye: float64 [P, 3], eye positions in random order; empty if there is none.
+        height: Height of the eyes above the floor, in the scene's unit.
     """
 
     eye: np.ndarray
     height: float
 
     def views(self, count: int, seed: int = 0) -> list[Viewpoint]:
-        """Makes views from the places in turn, their directions spread evenly round the horizon and a little up and
-        down; none where nobody can stand.
+        """Creates views from the eye positions in turn, with directions spread evenly around the horizon and slightly
+        up and down; the list is empty if there is no eye position.
 
         Args:
             count: Number of views.
-            seed: Turns all directions, and begins at another place.
+            seed: Selects a rotation of all directions and the first eye position.
         """
         if not len(self.eye):
             return []
@@ -69,7 +69,7 @@ class Indoors:
 
 
 def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device: str = "cpu") -> Indoors:
-    """Finds where viewers can stand in a scene, the same in every run.
+    """Finds the valid eye positions in a scene; the result is the same in every run.
 
     Args:
         position: float [V, 3], y up.
@@ -89,7 +89,7 @@ def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device:
     none = Indoors(np.empty((0, 3)), height)
     if not height > 0.0:
         return none
-    # Scaled to a size of 1: float32 and rays have no range to speak of.
+    # The scene is scaled to a size of 1, because float32 ray casting has limited range and precision.
     scale = 1.0 / float((high - low).max())
     scaled = (corner - low) * scale
     points = wp.array(scaled.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
@@ -100,7 +100,7 @@ def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device:
 
 
 def _standing(mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: float, device: str) -> np.ndarray:
-    """Eyes above the floors by the module's rules, float64 [P, 3]."""
+    """Returns the eye positions that satisfy the module's rules, float64 [P, 3]."""
     area = np.linalg.norm(normal, axis=1)
     ends = np.cumsum(np.where(normal[:, 1] >= _STEEPEST * area, area, 0.0))
     if not ends[-1] > 0.0:
@@ -111,7 +111,7 @@ def _standing(mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: flo
     a, b, c = (corner[floor, k] for k in range(3))
     place = (1.0 - root) * a + root * ((1.0 - share) * b + share * c)
     eye = place + [0.0, height, 0.0]
-    # Headroom: down from the eyes the floor is the first thing, and what is met going up is above them.
+    # Clearance: the first hit below the eyes is the floor, and the first hit of a ray up from the floor is above them.
     y = 1.0 - (2.0 * np.arange(_RAYS) + 1.0) / _RAYS
     azimuth, radius = np.arange(_RAYS) * _GOLDEN_ANGLE, np.sqrt(1.0 - y * y)
     ray = np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)

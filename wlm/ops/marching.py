@@ -1,4 +1,4 @@
-"""Light through a grid of density: transmittance, single scattering and emission along rays."""
+"""Ray marching through a density grid: transmittance, single scattering and emission."""
 
 import math
 
@@ -12,7 +12,7 @@ from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_arra
 from wlm_kernels.smoke import single_scatter
 from wlm_kernels.smoke.march import nodes_along
 
-_UNIT = (0.999, 1.001)  # what a direction's length may be
+_UNIT = (0.999, 1.001)  # accepted range of a direction's length
 
 
 def march(
@@ -26,41 +26,41 @@ def march(
     step: float = 1.0,
     g: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Marches rays through a density grid; `plain.march` is the twin.
+    """Marches rays through a density grid; the reference is `plain.march`.
 
-    Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; another albedo is a factor of the colours):
+    Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; for another albedo, scale the colours):
     each sample of a ray scatters the directional lights that reach it towards the ray's origin, by the phase function
-    of Henyey and Greenstein, and emits; both are attenuated on the way. The steps of a ray are equal, and each is
+    of Henyey and Greenstein, and emits; both are attenuated along the ray. The steps of a ray are equal, and each is
     integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes of a
-    lattice, a step apart but at least a voxel, and is trilinear between them.
+    lattice, spaced by a step but at least a voxel, and interpolated trilinearly between them.
 
-    All is in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and between
-    centres density and emission are trilinear, with zero outside the grid. Time grows with the rays times the steps,
-    and for each light with the voxels times the steps.
+    All lengths are in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
+    density and emission are trilinear between centres, with zero outside the grid. Time grows with rays times steps,
+    and for each light with voxels times steps.
 
-    Gradients reach the density, the lights' colours and the emission, each exact for the result as it is computed. The
-    rays and the directions to the lights have none: to find where light comes from, fit the colours of many lights. On
-    CUDA the samples near a voxel are added in any order, so that the last bits change from run to run.
+    The density, the lights' colours and the emission have gradients, exact for the discretised result. The rays and the
+    directions to the lights have none: to find directions of light, fit the colours of many lights. On CUDA the
+    gradients of a voxel are summed in any order, so their last bits change from run to run.
 
     Args:
         density: float [X, Y, Z], the extinction coefficient per voxel edge, at least 0.
-        origin: float [..., 3], where rays begin, in voxels; inside the grid or out of it.
+        origin: float [..., 3], origins of the rays in voxels, inside or outside the grid.
         direction: float [..., 3], of length 1.
         toward: float [L, 3], the directions to the lights, of length 1.
-        colour: float [L, 3], the lights' irradiance over 4 pi: opaque isotropic smoke in the full light of one of 1
-            scatters 1.
+        colour: float [L, 3], the lights' irradiance divided by 4 pi: opaque isotropic smoke fully lit by a light of
+            colour 1 scatters a radiance of 1.
         emission: float [X, Y, Z, 3], the radiance emitted per voxel edge.
-        step: The longest step, in voxels; the error falls with its square where the density is smooth.
+        step: The longest step, in voxels; the error is proportional to its square where the density is smooth.
         g: The phase function's mean cosine, within -1 and 1; above 0 it scatters forward.
 
     Returns:
-        The radiance that comes to the origins, float [..., 3], and the transmittance, float [...]: over a background b
-        radiance + transmittance * b. A ray that misses the grid has 0 and 1.
+        The radiance that arrives at the origins, float [..., 3], and the transmittance, float [...]; composite over a
+        background b as radiance + transmittance * b. A ray that misses the grid has radiance 0 and transmittance 1.
 
     Raises:
-        ValueError: A tensor's shape, type or device doesn't fit, lights without colours or the reverse, a gradient is
-            asked for that there is none of, or a number isn't finite or in range. Finding that out waits for the GPU;
-            while a CUDA graph is captured it isn't looked for.
+        ValueError: A tensor's shape, type or device doesn't fit, only one of `toward` and `colour` is given, an
+            argument without a gradient requires one, or a number isn't finite or in range. The check of numbers waits
+            for the GPU and is skipped while a CUDA graph is captured.
     """
     if not (math.isfinite(step) and step > 0.0):
         raise ValueError(f"step: expected a number above 0, got {step}")
@@ -100,7 +100,7 @@ def march(
 
 
 class _March(torch.autograd.Function):
-    """For each ray: what is scattered of each light of colour 1, without phase function; emitted; the optical depth."""
+    """Computes, per ray, the scattered light of each light of colour 1 without phase function, emission and depth."""
 
     @staticmethod
     def forward(ctx, density, emission, toward, origin, direction, step):

@@ -1,4 +1,4 @@
-"""Small networks of two hidden layers, many at once."""
+"""Small networks with two hidden layers, evaluated in batches of networks."""
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -8,30 +8,30 @@ from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.mlp import GELUS, MlpKernels, kernels
 
 WIDEST = 64
-"""Units of a hidden layer: a thread holds a layer in registers, and more would spill."""
+"""Largest width of a hidden layer: a thread stores a layer in registers, and a wider one would spill."""
 
 
 def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: str = "exact") -> torch.Tensor:
-    """Evaluates networks of two hidden layers of H units with GELU between; `plain.mlp` is the twin.
+    """Evaluates networks with two hidden layers of H units and GELU activations; the reference is `plain.mlp`.
 
-    y = gelu(gelu(x W1 + b1) W2 + b2) W3 + b3 (neural-dynamic-gi, section 3.3). A shape's kernels are compiled at its
-    first use, in some seconds.
+    y = gelu(gelu(x W1 + b1) W2 + b2) W3 + b3 (neural-dynamic-gi, section 3.3). The first use of a shape compiles its
+    kernels, which takes several seconds.
 
     Args:
-        x: float [B, I], or [N, B, I] for N networks with B inputs each; with a gradient, as all three.
-        hidden: float [I + H + 2, H] or [N, I + H + 2, H], one behind the other: W1 [I, H], b1 [1, H], W2 [H, H],
-            b2 [1, H]. A matrix of `torch.nn.Linear` is the transpose of these.
+        x: float [B, I], or [N, B, I] for N networks with B inputs each; has a gradient, like `hidden` and `output`.
+        hidden: float [I + H + 2, H] or [N, I + H + 2, H], concatenated: W1 [I, H], b1 [1, H], W2 [H, H],
+            b2 [1, H]. The weight of a `torch.nn.Linear` is the transpose of such a matrix.
         output: float [H + 1, O] or [N, H + 1, O]: W3 [H, O], b3 [1, O].
-        gelu: "exact" (erf); "tanh", within 4.8e-4 of it; "fast": as "tanh", with the GPU's own instruction, 2^-11
-            relative, and its gradients within 5e-3. On the CPU "fast" is "tanh".
+        gelu: "exact" (erf); "tanh", within 4.8e-4 of it; "fast": "tanh" with the GPU's instruction, with a relative
+            error of 2^-11 and gradients within 5e-3. On the CPU "fast" equals "tanh".
 
     Returns:
         float [B, O] or [N, B, O].
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit, H is above 64, I or O is 0, there is no such GELU, or
-            a number isn't finite. Finding that out waits for the GPU; while a CUDA graph is captured it isn't looked
-            for.
+            a number isn't finite. The check of numbers waits for the GPU and is skipped while a CUDA graph is
+            captured.
     """
     if gelu not in GELUS:
         raise ValueError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
@@ -74,7 +74,7 @@ class _Mlp(torch.autograd.Function):
                 to_warp(on_x, network.vec_in),
                 *(to_warp(layer, network.vec_hidden) for layer in (h1, h2, d1, d2)),
             )
-        # Matrix products over the inputs: torch's own are the quickest on either device.
+        # Matrix products over the inputs: torch's implementation is the fastest on either device.
         on_hidden = torch.cat([_weights(x, d1), _weights(h1, d2)], 1)
         return on_x, on_hidden, _weights(h2, grad_y), None
 
@@ -84,5 +84,5 @@ def _arrays(network: MlpKernels, x: torch.Tensor, hidden: torch.Tensor, output: 
 
 
 def _weights(h: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """The gradient of a layer's matrix, and of its bias below it."""
+    """Returns the gradient of a layer's matrix with the gradient of its bias as the last row."""
     return torch.cat([h.transpose(1, 2) @ d, d.sum(1, keepdim=True)], 1)

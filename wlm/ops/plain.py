@@ -1,7 +1,7 @@
-"""The operations in plain torch, of any float type and on any device: the definitions that the kernels are held to.
+"""Reference implementations of the operations in plain torch, for any float type and any device.
 
-Each has the name, the arguments and the result of its twin in `wlm.ops`, and checks nothing. They are written to be
-read, take more time and memory, and have their gradients by autograd: in float64 they are the reference in the tests.
+Each has the name, the arguments and the result of its counterpart in `wlm.ops`, without argument checks. They are
+written for readability, take more time and memory, and use autograd; in float64 they are the reference in the tests.
 """
 
 import torch
@@ -17,17 +17,17 @@ Tensor = torch.Tensor
 
 
 def straight_through(value: Tensor, used: Tensor) -> Tensor:
-    """`used` in the forward pass, the derivative of `value` in the backward pass."""
+    """Returns `used` in the forward pass and passes the gradient on to `value` in the backward pass."""
     return value + (used - value).detach()
 
 
 def bc7_map(endpoints, weights, uv, *, layer=None, quantised: bool = False) -> Tensor:
-    """Bilinear samples [..., 4] of a map of blocks at `uv` [..., 2]."""
+    """Samples a map of blocks bilinearly at `uv` [..., 2]: [..., 4]."""
     return plane(bc7_texels(endpoints, weights, quantised=quantised), uv, layer=layer)
 
 
 def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -> Tensor:
-    """Whole maps: [..., H/4, W/4, 2, 4] and [..., H, W] -> [..., H, W, 4]."""
+    """Decodes whole maps: [..., H/4, W/4, 2, 4] and [..., H, W] -> [..., H, W, 4]."""
     e, w = endpoints.clamp(0.0, 1.0), weights.clamp(0.0, 1.0)
     if quantised:
         stored = _endpoint_bytes(e.detach())
@@ -43,7 +43,7 @@ def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -
 
 
 def _endpoint_bytes(e: Tensor) -> Tensor:
-    """The nearest bytes, int64 [..., 4], whose lowest bits agree; the even ones, if both bits are as near."""
+    """Returns the nearest bytes, int64 [..., 4], with equal lowest bits; even bytes if both bits are equally near."""
     v = e * 255.0
     even, odd = (torch.floor((v - bit) / 2.0 + 0.5).clamp(0.0, 127.0) * 2.0 + bit for bit in (0.0, 1.0))
     nearer = ((odd - v) ** 2).sum(-1, keepdim=True) < ((even - v) ** 2).sum(-1, keepdim=True)
@@ -51,11 +51,11 @@ def _endpoint_bytes(e: Tensor) -> Tensor:
 
 
 def _per_texel(blocks: Tensor) -> Tensor:
-    """[..., h, w, C] -> [..., 4 h, 4 w, C]: each block's value at its 4 x 4 texels."""
+    """[..., h, w, C] -> [..., 4 h, 4 w, C]: repeats each block's value at its 4 x 4 texels."""
     return blocks.repeat_interleave(4, -3).repeat_interleave(4, -2)
 
 
-# Feature grids, by torch's own `grid_sample`
+# Feature grids, with torch's `grid_sample`
 
 
 def plane(values, points, *, layer=None, periodic: bool = False) -> Tensor:
@@ -69,7 +69,7 @@ def volume(values, points, *, layer=None, periodic: bool = False) -> Tensor:
 
 
 def triplane(xy, xz, yz, points, *, reduce: str = "sum") -> Tensor:
-    """Samples three planes at the projections of points (x, y, z), and joins the three."""
+    """Samples three planes at the projections of points (x, y, z) and combines the three results."""
     parts = [plane(values, points[..., axes]) for values, axes in ((xy, [0, 1]), (xz, [0, 2]), (yz, [1, 2]))]
     if reduce == "concatenate":
         return torch.cat(parts, -1)
@@ -103,7 +103,7 @@ def _sample(values: Tensor, points: Tensor, layer: Tensor | None, periodic: bool
 
 
 def mlp(x: Tensor, hidden: Tensor, output: Tensor, *, gelu: str = "exact") -> Tensor:
-    """gelu(gelu(x W1 + b1) W2 + b2) W3 + b3: x [..., B, I] -> [..., B, O]."""
+    """Evaluates gelu(gelu(x W1 + b1) W2 + b2) W3 + b3: x [..., B, I] -> [..., B, O]."""
     form = "none" if gelu == "exact" else "tanh"
     first, bias_1, second, bias_2 = hidden.split([x.shape[-1], 1, hidden.shape[-1], 1], -2)
     third, bias_3 = output.split([hidden.shape[-1], 1], -2)
@@ -116,7 +116,7 @@ def mlp(x: Tensor, hidden: Tensor, output: Tensor, *, gelu: str = "exact") -> Te
 
 
 def gaussian_sum(rows: Tensor, points: Tensor, *, cut: float = 3.0, support: str = "ellipsoid") -> Tensor:
-    """Rows [K, 10 + L] of centre, log of the scale, quaternion and latent, at points [..., 3]: [..., L]."""
+    """Sums rows [K, 10 + L] of centre, log of the scale, quaternion and latent at points [..., 3]: [..., L]."""
     scale = rows[:, 3:6].exp()
     d = points[..., None, :] - rows[:, :3]
     u = torch.einsum("kij,...kj->...ki", rotations(rows[:, 6:10]).transpose(1, 2), d) / scale
@@ -126,7 +126,7 @@ def gaussian_sum(rows: Tensor, points: Tensor, *, cut: float = 3.0, support: str
 
 
 def rotations(q: Tensor) -> Tensor:
-    """Rotation matrices [K, 3, 3] of quaternions w x y z of any length [K, 4]; one below 1e-12 doesn't turn."""
+    """Converts quaternions w x y z [K, 4] of any length to matrices [K, 3, 3]; below 1e-12 to the identity."""
     n = q.norm(dim=1, keepdim=True)
     turns = n >= 1e-12
     still = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=q.dtype, device=q.device)
@@ -141,19 +141,19 @@ def rotations(q: Tensor) -> Tensor:
 
 # Triangles to pixels
 #
-# With P the pixel centre as (x, y, 1) and the corners (x, y, w) as columns of M, b = M^-1 P has no negative part where
+# With P the pixel centre as (x, y, 1) and the corners (x, y, w) as columns of M, b = M^-1 P has no negative entry where
 # a pixel is covered from the front, b / sum(b) are the barycentrics, and b . z is z / w.
 
 
 def pixel_centres(height: int, width: int) -> Tensor:
-    """Pixel centres (column, row) in pixels: float64 [H, W, 2]."""
+    """Returns pixel centres (column, row) in pixels: float64 [H, W, 2]."""
     axes = [torch.arange(size, dtype=torch.float64) + 0.5 for size in (height, width)]
     row, column = torch.meshgrid(*axes, indexing="ij")
     return torch.stack([column, row], -1)
 
 
 def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """B of triangles at places in pixels, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
+    """Computes b of triangles at pixel positions, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
 
     `position` is [V, 4] in clip space or [V, 2] in UV space.
     """
@@ -168,10 +168,10 @@ def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: i
 
 
 def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
-    """Looks at all triangles in all pixels, and sees the nearest.
+    """Tests all triangles at all pixels and selects the nearest.
 
-    No triangle may be of no area. A centre on an edge belongs to both sides, where `wlm.ops.rasterize` gives it to
-    one of them.
+    Degenerate triangles are not allowed. A pixel centre on an edge is covered by both triangles, while
+    `wlm.ops.rasterize` assigns it to one of them.
     """
     pixels = pixel_centres(height, width).to(clip)
     with torch.no_grad():
@@ -186,12 +186,12 @@ def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster
 
 
 def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
-    """As `rasterize`, for corners [V, 2] in a texture; of triangles that overlap the first is seen."""
+    """Rasterizes like `rasterize`, for corners [V, 2] in a texture; the first of overlapping triangles is visible."""
     return rasterize(uv, triangle, height, width)
 
 
 def interpolate(attribute: Tensor, triangle: Tensor, raster: Raster) -> Tensor:
-    """The corners' attributes [V, C] at the point that each pixel sees, 0 where it sees none: [H, W, C]."""
+    """Interpolates vertex attributes [V, C] at each pixel's surface point, 0 in uncovered pixels: [H, W, C]."""
     share = torch.cat([raster.barycentric, 1.0 - raster.barycentric.sum(-1, keepdim=True)], -1)
     mixed = (share[..., None] * attribute[triangle[raster.triangle.clamp(min=0)]]).sum(-2)
     return torch.where((raster.triangle >= 0)[..., None], mixed, 0.0)
@@ -201,7 +201,7 @@ def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str 
     """Reads [H, W, C] at uv [..., 2]: [..., C]."""
     padding = "reflection" if boundary == "mirror" else "border"
     if boundary == "wrap":
-        # A texel of the other side on each side, and the texture smaller by those.
+        # Each side is padded with a texel of the opposite side, and coordinates are rescaled accordingly.
         size = torch.tensor([image.shape[1], image.shape[0]], dtype=uv.dtype, device=uv.device)
         image = torch.cat([image[-1:], image, image[:1]], 0)
         image = torch.cat([image[:, -1:], image, image[:, :1]], 1)
@@ -212,19 +212,19 @@ def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str 
     return texels[0, :, 0].T.reshape(*uv.shape[:-1], -1)
 
 
-# Light through a grid of density (neural-six-way-lightmaps, eq. 1 to 3)
+# Ray marching through a density grid (neural-six-way-lightmaps, eq. 1 to 3)
 
-_SLACK = 1.0001  # a step may be so much longer than asked for, lest rounding cut a whole number of them into one more
+_SLACK = 1.0001  # tolerance on the step length, so that rounding adds no extra step to a whole number of steps
 
 
 def march(
     density, origin, direction, *, toward=None, colour=None, emission=None, step: float = 1.0, g: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Radiance [..., 3] and transmittance [...] of rays [..., 3] through a grid [X, Y, Z], in voxels."""
+    """Computes radiance [..., 3] and transmittance [...] of rays [..., 3] through a grid [X, Y, Z], in voxels."""
     size = torch.tensor(density.shape, dtype=density.dtype, device=density.device)
     if toward is None:
         toward = colour = density.new_zeros(0, 3)
-    # The lattice: its first and last nodes lie half a voxel out of the grid.
+    # The first and last nodes of the lattice lie half a voxel outside the grid.
     counts = torch.ceil((size + 1.0) / max(step, 1.0)) + 1.0
     axes = [torch.linspace(-0.5, n + 0.5, int(c)).to(size) for n, c in zip(size.tolist(), counts, strict=True)]
     nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
@@ -250,12 +250,12 @@ def march(
 
 
 def henyey_greenstein(g: float, cosine: Tensor) -> Tensor:
-    """The phase function times 4 pi; `cosine` is 1 where the light goes straight on."""
+    """Returns the phase function times 4 pi; `cosine` is 1 for unscattered light."""
     return (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5
 
 
 def _steps(size: Tensor, origin: Tensor, direction: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Equal steps through the box that density reaches into: where they begin, their length and number, [...] each."""
+    """Returns equal steps through the box of non-zero density: their start, length and number, [...] each."""
     flat = direction.abs() <= 1e-9
     way = torch.where(flat, 1.0, direction)
     low, high = (-0.5 - origin) / way, (size + 0.5 - origin) / way
@@ -268,7 +268,7 @@ def _steps(size: Tensor, origin: Tensor, direction: Tensor, step: float) -> tupl
 
 
 def _optical_depth(density: Tensor, p: Tensor, toward: Tensor, step: float) -> Tensor:
-    """From points [..., 3] out of the grid, in equal steps, each sampled at its middle."""
+    """Integrates from points [..., 3] to the grid's boundary in equal steps, each sampled at its middle."""
     size = torch.tensor(density.shape, dtype=density.dtype, device=density.device)
     first, length, count = _steps(size, p, toward.expand_as(p), step)
     total = torch.zeros_like(first)
@@ -279,7 +279,7 @@ def _optical_depth(density: Tensor, p: Tensor, toward: Tensor, step: float) -> T
 
 
 def _trilinear(grid: Tensor, p: Tensor) -> Tensor:
-    """[X, Y, Z] or [X, Y, Z, C] at points [..., 3]: [...] or [..., C]; the centre of voxel i is at i + 1/2."""
+    """Samples [X, Y, Z] or [X, Y, Z, C] at points [..., 3]: [...] or [..., C]; the centre of voxel i is at i + 1/2."""
     values = pad(grid.reshape(*grid.shape[:3], -1), (0, 0, 1, 1, 1, 1, 1, 1))
     shape = values.shape[:3]
     q = p + 0.5

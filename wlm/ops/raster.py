@@ -1,7 +1,7 @@
-"""Triangles to pixels: rasterization, attributes and textures at the point that each pixel sees.
+"""Rasterization, and attributes and textures at the surface point visible in each pixel.
 
-Row 0 of an image is its top row. `wlm_kernels.raster.rasterize` says where pixel centres are and what covers them,
-`wlm_kernels.raster.texture` how a texture is read. On CUDA gradients that many pixels give to one number are added in
+Row 0 of an image is its top row. `wlm_kernels.raster.rasterize` defines pixel centres and coverage, and
+`wlm_kernels.raster.texture` defines texture reads. On CUDA the gradients of several pixels for one value are summed in
 any order, so that its last bits change from run to run.
 """
 
@@ -20,16 +20,17 @@ from wlm_kernels.raster import texture as texture_kernels
 
 @dataclass(frozen=True)
 class Raster:
-    """The triangle that each pixel sees, and where in it.
+    """The visible triangle of each pixel and the barycentrics of the surface point.
 
     Attributes:
-        triangle: int32 [H, W], the number of the triangle, -1: none.
-        barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the point seen;
-            corner 2 has the rest. Where there is no triangle it is 0, as is all below. It has a gradient.
+        triangle: int32 [H, W], index of the visible triangle, -1 for none.
+        barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the visible point;
+            corner 2 has the rest. It and all attributes below are 0 in uncovered pixels. It has a gradient.
         depth: float [H, W], z / w; 0 everywhere in UV space. It has no gradient.
-        derivative: float [H, W, 4], what the weights change by from pixel to pixel: du/dx, du/dy, dv/dx, dv/dy, x to
-            the right and y down; None: not asked for. It has no gradient.
-        coverage: int32 [H, W], how many triangles cover the pixel's centre, hidden ones too; None: not asked for.
+        derivative: float [H, W, 4], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right
+            and y down; None if not requested. It has no gradient.
+        coverage: int32 [H, W], number of triangles that cover the pixel's centre, including hidden ones; None if not
+            requested.
     """
 
     triangle: torch.Tensor
@@ -49,22 +50,22 @@ def rasterize(
     derivative: bool = False,
     coverage: bool = False,
 ) -> Raster:
-    """Draws triangles given in clip space; each pixel sees the one of least z / w in front of the viewer (w > 0).
+    """Draws triangles given in clip space; the one of least z / w in front of the viewer (w > 0) is visible.
 
-    There is no near and no far plane, and a triangle may reach behind the viewer. Of triangles as deep as each other
-    the first is seen. One with a corner that isn't finite, or of no area, isn't drawn.
+    There is no near and no far plane, and a triangle may reach behind the viewer. The first of several triangles of
+    equal depth is visible. A triangle with a non-finite corner or without area isn't drawn.
 
     Args:
         clip: float [V, 4], x, y, z, w; the image shows x/w and y/w in [-1, 1], y up. The barycentrics' gradient reaches
-            x, y and w, for the triangle that is seen; that another may come to be seen has none.
+            x, y and w of the visible triangle; changes of visibility have no gradient.
         triangle: int32 or int64 [F, 3], rows of `clip`, with either winding.
         height, width: H and W in pixels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise on the screen.
-        derivative, coverage: Whether to fill these of `Raster`.
+        derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
         ValueError: A tensor's shape, type, device or size doesn't fit, or a triangle has a corner that isn't in
-            `clip`. Finding that out waits for the GPU; while a CUDA graph is captured it isn't looked for, and such
+            `clip`. The check of corners waits for the GPU; while a CUDA graph is captured it is skipped, and such
             triangles aren't drawn.
     """
     return _rasterize(clip, triangle, height, width, "clip", cull, derivative, coverage)
@@ -80,15 +81,15 @@ def rasterize_uv(
     derivative: bool = False,
     coverage: bool = False,
 ) -> Raster:
-    """Draws triangles into the texels of a texture; where some overlap the first one is seen.
+    """Draws triangles into the texels of a texture; the first of several overlapping triangles is visible.
 
     Args:
         uv: float [V, 2], u right, v down (glTF): the texture is [0, 1] x [0, 1], row 0 is v = 0, and texel i of n has
-            its centre at (i + 1/2) / n. What lies outside isn't drawn. The barycentrics' gradient reaches it.
+            its centre at (i + 1/2) / n. Parts outside aren't drawn. The barycentrics pass gradients to `uv`.
         triangle: int32 or int64 [F, 3], rows of `uv`.
         height, width: H and W in texels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise where u points right and v up.
-        derivative, coverage: Whether to fill these of `Raster`.
+        derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
         ValueError: As for `rasterize`.
@@ -97,13 +98,13 @@ def rasterize_uv(
 
 
 def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster) -> torch.Tensor:
-    """The corners' attributes at the point that each pixel sees, 0 where it sees none.
+    """Interpolates vertex attributes at the visible point of each pixel; the result is 0 in uncovered pixels.
 
     Args:
-        attribute: float [V, C], with a gradient.
-        triangle: int32 or int64 [F, 3], rows of `attribute`: as many triangles as were drawn, but a corner may have
-            other numbers here than there.
-        raster: What was drawn; its barycentrics have a gradient.
+        attribute: float [V, C], has a gradient.
+        triangle: int32 or int64 [F, 3], rows of `attribute`: the same number of triangles as were drawn, but their
+            corners may have other indices.
+        raster: Result of the rasterization; its barycentrics have a gradient.
 
     Returns:
         float [H, W, C].
@@ -118,17 +119,17 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
 
 
 def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", boundary: str = "clamp") -> torch.Tensor:
-    """Reads a texture.
+    """Samples a texture.
 
-    A coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
+    A coordinate that is NaN, or infinite and not clamped, reads NaN; it neither has nor passes on a gradient.
 
     Args:
-        image: float [H, W, C], none of them 0, with a gradient.
-        uv: float [..., 2], u right, v down, texel i of n at (i + 1/2) / n; any number. With a gradient, for the filter
-            "linear": the slope between the texels that it lies between.
+        image: float [H, W, C], no size 0, has a gradient.
+        uv: float [..., 2], u right, v down, texel i of n at (i + 1/2) / n; any value. With the filter "linear" it has a
+            gradient: the slope between the adjacent texels.
         filter: "linear" or "nearest".
-        boundary: What lies outside [0, 1]: "clamp", the border's texels; "wrap", the texture again; "mirror", the
-            texture turned round and again, a triangle wave (lightmap-uv-clustering-cascade, eq. 8).
+        boundary: Addressing outside [0, 1]: "clamp" to the border's texels, "wrap" (repeat) or "mirror" (mirrored
+            repeat, a triangle wave; lightmap-uv-clustering-cascade, eq. 8).
 
     Returns:
         float [..., C].
@@ -246,6 +247,6 @@ class _Texture(torch.autograd.Function):
 
 
 def _checked_triangles(triangle: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """The triangles as int32, their numbers among those of the corners."""
+    """Returns the triangles as int32, after checking that all indices refer to existing corners."""
     check_index("triangle", triangle, len(corners), (None, 3), corners.device)
     return triangle.to(torch.int32)

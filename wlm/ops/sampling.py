@@ -1,9 +1,9 @@
-"""Feature grids sampled linearly: planes, triplanes and volumes, with gradients to their values and to the points.
+"""Linear sampling of feature grids (planes, triplanes and volumes), with gradients for their values and the points.
 
-A coordinate is in [0, 1], the centre of cell i of n at (i + 1/2) / n. Beyond the outermost centres, and so outside
-[0, 1] too, the border goes on, without a slope; a periodic axis goes on with its next period instead.
+A coordinate is in [0, 1], the centre of cell i of n at (i + 1/2) / n. Beyond the outermost centres the value is clamped
+to the border and has no slope; a periodic axis repeats instead.
 
-On CUDA the points of a cell are added to its gradient in any order, so that the last bits change from run to run.
+On CUDA a cell's gradient is summed over points in any order, so that the last bits change from run to run.
 """
 
 import torch
@@ -20,12 +20,12 @@ REDUCTIONS = ("sum", "product", "concatenate")
 def plane(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a plane of features bilinearly; `plain.plane` is the twin.
+    """Samples a plane of features bilinearly; the reference is `plain.plane`.
 
     Args:
         values: float [H, W, C], or [L, H, W, C] with `layer`; with a gradient.
         points: float [..., 2], u along the width, v along the height (the time, in a lightmap's planes;
-            neural-dynamic-gi, eq. 5). With a gradient: the slope between the cells that a point lies between.
+            neural-dynamic-gi, eq. 5). Has a gradient: the slope between the adjacent cells.
         layer: int32 or int64 [...], 0 to L - 1: the plane of each point.
         periodic: Whether v wraps round: row 0 is the neighbour of row H - 1.
 
@@ -34,7 +34,7 @@ def plane(
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. Finding that
-            out waits for the GPU; while a CUDA graph is captured it isn't looked for.
+            out waits for the GPU and is skipped while a CUDA graph is captured.
     """
     return sample(values, points, layer, periodic, axes=2)
 
@@ -42,7 +42,7 @@ def plane(
 def volume(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a volume of features trilinearly; `plain.volume` is the twin.
+    """Samples a volume of features trilinearly; the reference is `plain.volume`.
 
     Args:
         values: float [D, H, W, C], or [L, D, H, W, C] with `layer`; with a gradient.
@@ -62,16 +62,16 @@ def volume(
 def triplane(
     xy: torch.Tensor, xz: torch.Tensor, yz: torch.Tensor, points: torch.Tensor, *, reduce: str = "sum"
 ) -> torch.Tensor:
-    """Samples three planes at the projections of points in space; `plain.triplane` is the twin.
+    """Samples three planes at the projections of points in space; the reference is `plain.triplane`.
 
     Args:
         xy: float [H, W, C], u is x and v is y (the tri-plane of Chan et al. 2022, "Efficient Geometry-aware 3D
-            Generative Adversarial Networks"); with a gradient, as all of these.
+            Generative Adversarial Networks"); has a gradient, like `xz`, `yz` and `points`.
         xz: float [H', W', C], u is x and v is z.
         yz: float [H'', W'', C], u is y and v is z.
         points: float [..., 3], x, y, z in [0, 1].
-        reduce: How the three are joined: "sum"; "product" (Fridovich-Keil et al. 2023, "K-Planes"); or
-            "concatenate", in the order of the arguments, where each plane may have a C of its own.
+        reduce: Combination of the three samples: "sum"; "product" (Fridovich-Keil et al. 2023, "K-Planes"); or
+            "concatenate", in the order of the arguments, where C may differ between the planes.
 
     Returns:
         float [..., C], or [..., the sum of the three C].
@@ -87,7 +87,7 @@ def triplane(
     check("yz", yz, (None, None, channels), xy.device)
     check("points", points, (*points.shape[:-1], 3), xy.device)
     x, y, z = points.unbind(-1)
-    # The adjoint of a stack of columns is cheaper than that of a choice by index.
+    # The backward pass of a stack of columns is cheaper than that of indexing.
     projections = {"xy": (xy, x, y), "xz": (xz, x, z), "yz": (yz, y, z)}
     parts = [
         sample(values, torch.stack(at, -1), axes=2, names=(name, "points"))
@@ -107,7 +107,7 @@ def sample(
     axes: int,
     names: tuple[str, str] = ("values", "points"),
 ) -> torch.Tensor:
-    """`plane` for 2 axes, `volume` for 3; `names` are what messages call the values and the points."""
+    """`plane` for 2 axes, `volume` for 3; `names` are the names of the values and the points in messages."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
         raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")
@@ -120,7 +120,7 @@ def sample(
         check_index("layer", layer, len(values), tuple(shape), values.device)
     times, width, channels = values.shape[-axes - 1], values.shape[-2], values.shape[-1]
     height = values.shape[-3] if axes == 3 else 1
-    # Warp arrays have at most four dimensions: layers stand one behind the other.
+    # Warp arrays have at most four dimensions, so layers are concatenated along the first axis.
     joined = values.reshape(-1, height, width, channels)
     sampled = _Sample.apply(joined, times, layer.reshape(-1).to(torch.int32), points.reshape(-1, axes), periodic)
     return sampled.reshape(*shape, channels)

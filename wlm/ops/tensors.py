@@ -1,4 +1,4 @@
-"""What all operations share: the checks of their tensors, torch's stream, and buffers for gradients."""
+"""Helpers shared by all operations: tensor checks, torch's stream, and gradient buffers."""
 
 import math
 from contextlib import AbstractContextManager, nullcontext
@@ -10,17 +10,17 @@ import warp as wp
 from wlm.interop import to_warp, warp_stream
 
 Shape = tuple[int | None, ...]
-"""Sizes of a tensor's axes; None: any."""
+"""Sizes of a tensor's axes; None allows any size."""
 
 
 def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
     """Checks a float32 tensor.
 
     Args:
-        name: What the message calls it.
-        tensor: On `device`, or on any that Warp has.
-        shape: Its sizes.
-        device: Where it has to be.
+        name: Name of the tensor in the message.
+        tensor: The tensor, on `device`, or on any device that Warp supports.
+        shape: Expected sizes.
+        device: Expected device; None allows any.
 
     Raises:
         ValueError: Its shape, type or device doesn't fit.
@@ -31,7 +31,7 @@ def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | 
 
 
 def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device: torch.device) -> None:
-    """Checks an integer tensor of numbers from 0 to `count` - 1; the numbers not while a CUDA graph is captured.
+    """Checks a tensor of indices from 0 to `count` - 1; values are not checked while a CUDA graph is captured.
 
     Raises:
         ValueError: Its shape, type, device or a number doesn't fit.
@@ -46,19 +46,19 @@ def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device
 
 
 def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors: torch.Tensor | None) -> None:
-    """Checks that tensors of one device hold finite numbers; not while a CUDA graph is captured.
+    """Checks that tensors of one device contain finite numbers; skipped while a CUDA graph is captured.
 
     Args:
-        ranges: The least and the greatest number that some may hold.
-        **tensors: By the names that the message calls them; None and empty ones are left out.
+        ranges: Least and greatest allowed value of a tensor, by name.
+        **tensors: Tensors by their name in the message; None and empty tensors are skipped.
 
     Raises:
-        ValueError: A number isn't finite or in range. Finding that out waits for the GPU, once for all tensors.
+        ValueError: A number isn't finite or in range. The check waits for the GPU once for all tensors.
     """
     present = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None and tensor.numel()}
     if not present or any(_capturing(tensor) for tensor in present.values()):
         return
-    # Both extremes are NaN where a number is.
+    # Both extremes are NaN if any number is NaN.
     extremes = torch.stack([torch.stack(tensor.aminmax()) for tensor in present.values()]).tolist()
     for name, (low, high) in zip(present, extremes, strict=True):
         least, most = (ranges or {}).get(name, (-math.inf, math.inf))
@@ -71,7 +71,7 @@ def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors
 
 def on_stream(device: torch.device) -> AbstractContextManager:
     """Puts Warp's work on torch's current stream."""
-    # Wrapping a tensor, unlike all else in Warp, doesn't start it.
+    # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()
     if device.type == "cpu":
         return nullcontext()
@@ -79,18 +79,18 @@ def on_stream(device: torch.device) -> AbstractContextManager:
 
 
 def dense(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensor in C order, as Warp wants it for vectors."""
-    # To torch a tensor of nothing is contiguous whatever its strides, to Warp it isn't.
+    """Returns the tensor in C order, which Warp requires for vectors."""
+    # torch treats an empty tensor with any strides as contiguous, Warp doesn't.
     return tensor.contiguous() if tensor.numel() else tensor.new_empty(tensor.shape)
 
 
 def zeros_for(tensor: torch.Tensor, needed: bool = True) -> torch.Tensor | None:
-    """A gradient to add to, in C order whatever the tensor's strides; None where it isn't needed."""
+    """Returns a zero gradient buffer in C order for a tensor of any strides; None if it isn't needed."""
     return torch.zeros_like(tensor, memory_format=torch.contiguous_format) if needed else None
 
 
 def optional_array(tensor: torch.Tensor | None, dimensions: int, dtype: Any, device: torch.device) -> wp.array:
-    """A buffer as Warp's, or the empty array that tells a kernel that there is none."""
+    """Wraps a buffer as a Warp array; None becomes the empty array, which tells a kernel that there is no buffer."""
     if tensor is None:
         return wp.empty((0,) * dimensions, dtype=dtype, device=wp.device_from_torch(device))
     return to_warp(tensor, dtype)

@@ -1,11 +1,11 @@
-"""Views of a mesh from all around: cameras on a sphere, and the surface point at each pixel.
+"""Views of a mesh from cameras on a sphere around it, and the visible surface point of each pixel.
 
 The mesh is scaled into [-1, 1]³: the longest side of its box is 2 long, the box's centre is the origin. Cameras are at
-a distance of 3 and look at the origin (lightmap-uv-clustering-cascade, section 4.1.4). Their field of view just holds
-the sphere around that cube, of radius sqrt 3: 2 asin(sqrt 3 / 3), 70.5 degrees both ways, so that nothing is ever cut
-off. Pictures are square; row 0 is their top.
+a distance of 3 and look at the origin (lightmap-uv-clustering-cascade, section 4.1.4). Their field of view is
+the smallest that contains the cube's circumscribed sphere of radius sqrt 3: 2 asin(sqrt 3 / 3), 70.5 degrees in both
+directions, so that nothing is cut off. Images are square; row 0 is the top row.
 
-A `Viewpoint` is a viewer who stands in the scene instead.
+A `Viewpoint` is a camera inside the scene instead.
 """
 
 import math
@@ -28,20 +28,20 @@ DISTANCE = 3.0
 _SPHERE = math.sqrt(3.0)
 
 ZOOM = math.sqrt(DISTANCE**2 - _SPHERE**2) / _SPHERE
-"""Clip x over the distance from the camera's axis; w is the distance along it."""
+"""Ratio of clip x to the distance from the camera's axis; w is the distance along the axis."""
 
 _NEAR, _FAR = DISTANCE - _SPHERE, DISTANCE + _SPHERE
-# Where y in the direction is larger, within 26 degrees of a pole, the picture's up is z instead of y.
+# If y of the direction is larger (within 26 degrees of a pole), the image's up axis is z instead of y.
 _STEEP = 0.9
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera.
+    """A camera outside the mesh.
 
     Attributes:
-        axes: float64 [3, 3], rows of unit length at right angles: the picture's right and up, and the direction from
+        axes: float64 [3, 3], orthonormal rows: the image's right and up, and the direction from
             the origin to the camera.
     """
 
@@ -49,10 +49,10 @@ class View:
 
     @classmethod
     def of(cls, direction: Sequence[float] | np.ndarray) -> Self:
-        """Makes the camera in a direction from the origin.
+        """Creates the camera in a direction from the origin.
 
         Args:
-            direction: [3], of any length but 0. The picture's up is +y, or +z where the direction is near y's axis.
+            direction: [3], of any length except 0. The image's up axis is +y, or +z for directions near the y axis.
 
         Raises:
             ValueError: The direction has no length or isn't finite.
@@ -69,11 +69,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A viewer in the scene, who sees 90 degrees both ways.
+    """A camera inside the scene with a field of view of 90 degrees in both directions.
 
     Attributes:
-        eye: float64 [3], where they are, in the mesh's space and unit.
-        forward: float64 [3], where they look; not straight up or down.
+        eye: float64 [3], the camera's position in the mesh's space and unit.
+        forward: float64 [3], the viewing direction; not straight up or down.
     """
 
     eye: np.ndarray
@@ -81,12 +81,12 @@ class Viewpoint:
 
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
-    """Makes cameras on the sphere.
+    """Creates cameras on the sphere.
 
     Args:
         count: Number of cameras, at least 0.
-        seed: None spreads them evenly (a Fibonacci sphere); else they are random, independent and uniform. A generator
-            goes on where it was.
+        seed: None spreads them evenly (a Fibonacci sphere); otherwise they are random, independent and uniform. A
+            generator continues from its current state.
 
     Raises:
         ValueError: A negative count.
@@ -111,7 +111,7 @@ def normalised(position: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
     Args:
         position: float [V, 3].
-        triangle: int [F, 3], at least one; the box is that of all triangles, and has a size.
+        triangle: int [F, 3], at least one; the bounding box of all triangles must not be empty.
 
     Returns:
         The positions, float64 [V, 3].
@@ -122,7 +122,7 @@ def normalised(position: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
 
 def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
-    """The vertices in a camera's clip space, for `wlm.ops.rasterize`.
+    """Transforms vertices into a camera's clip space, for `wlm.ops.rasterize`.
 
     Args:
         position: float64 [V, 3], `normalised`.
@@ -130,9 +130,9 @@ def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
 
     Returns:
         float32 [V, 4]: x, y, z, w; w is the distance along the camera's axis, z / w is -1 and 1 where the sphere
-        around the cube is nearest and farthest. Vertices at one place have equal numbers.
+        around the cube is nearest and farthest. Vertices at equal positions have equal results.
     """
-    # Written out: a matrix product may round rows differently, and shared edges would come apart.
+    # A matrix product may round rows differently, which would open cracks along shared edges.
     x, y, back = (position[:, 0] * a + position[:, 1] * b + position[:, 2] * c for a, b, c in view.axes)
     w = DISTANCE - back
     z = ((_FAR + _NEAR) * w - 2.0 * _FAR * _NEAR) / (_FAR - _NEAR)
@@ -140,12 +140,12 @@ def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
 
 
 def clip_from(position: np.ndarray, eye: np.ndarray, forward: np.ndarray, up: int = 1) -> np.ndarray:
-    """The vertices in the clip space of a viewer who stands in the scene, 90 degrees wide and high.
+    """Transforms vertices into the clip space of a camera inside the scene, 90 degrees wide and high.
 
     Args:
         position: [V, 3], in any unit.
-        eye: [3], where the viewer is.
-        forward: [3], where they look, of any length but 0, and not along `up`.
+        eye: [3], the camera's position.
+        forward: [3], the viewing direction, of any length except 0, and not along `up`.
         up: The axis that points up, 0 to 2.
 
     Returns:
@@ -155,7 +155,7 @@ def clip_from(position: np.ndarray, eye: np.ndarray, forward: np.ndarray, up: in
     right = np.cross(forward, np.eye(3)[up])
     right /= np.linalg.norm(right)
     offset = np.asarray(position, np.float64) - eye
-    # Written out, as there.
+    # No matrix product, for the same reason as in `clip_positions`.
     x, y, w = (
         offset[:, 0] * a + offset[:, 1] * b + offset[:, 2] * c for a, b, c in (right, np.cross(right, forward), forward)
     )
@@ -182,7 +182,7 @@ def visible_points(
         views: The cameras.
         resolution: Pixels along a side, 1 to 16,384.
         device: "cpu" or "cuda:N".
-        cull: Whether triangles that are seen from behind are left out, so that a room is seen through its walls.
+        cull: Whether to skip back faces, so that an interior is visible through its walls.
 
     Yields:
         For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
@@ -204,7 +204,7 @@ def visible_points(
 
 
 class _Drawing:
-    """A mesh that is drawn many times: checked and allocated for once, on CUDA one graph."""
+    """Draws a mesh repeatedly; checks and allocations happen once, and on CUDA a draw is one graph."""
 
     def __init__(self, triangle: np.ndarray, uv: np.ndarray, resolution: int, cull: bool, device: str) -> None:
         corner = torch.tensor(triangle.astype(np.int32), device=device)
