@@ -1,9 +1,9 @@
-"""Encodes blocks of 4 x 4 texels as unsigned BC6H: the least weighted squared error in linear light.
+"""Encodes blocks of 4 x 4 texels as unsigned BC6H with a small weighted squared error in linear light.
 
-BC6H interpolates between two colours in a space that is about the logarithm of light. A block is fitted there by
-weighted least squares, each texel with the square of the slope of light as a further weight, and the levels that its
-texels take are then chosen by their error in light itself. The finest mode that holds the line is used, once with one
-line for all texels and once each with the two best of the 32 partitions into two lines; the best of all is kept.
+BC6H interpolates between two colours in a space that is roughly the logarithm of light. A block is fitted there by
+weighted least squares, with the squared slope of light as a further weight of each texel; the texels' levels are then
+chosen by their error in linear light. The most precise mode that can represent the endpoints is used. One line for all
+texels and the two best of the 32 partitions into two lines are encoded, and the best of these blocks is kept.
 
 The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
 """
@@ -19,13 +19,13 @@ _ALL = wp.constant(0xFFFF)
 _LARGEST = wp.constant(65504.0)
 _TOP = wp.constant(65535.0)
 _LEAST_NORMAL = wp.constant(6.103515625e-05)  # 2 ** -14
-_STRETCH = wp.constant(64.0 / 31.0)  # from a half float's bits to BC6H's 16
+_STRETCH = wp.constant(64.0 / 31.0)  # factor from a half float's bits to BC6H's 16-bit space
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
-_REFINED = wp.constant(2)  # times that a line is fitted to its texels' levels
-_REFITTED = wp.constant(2)  # times that a block's ends are fitted to the indices that it took
-_TRIED = wp.constant(2)  # partitions
-_LEAST_WEIGHT = wp.constant(1.0e-4)  # of the heaviest texel's
+_REFINED = wp.constant(2)  # number of fits of a line to its texels' levels
+_REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
+_TRIED = wp.constant(2)  # partitions that are encoded
+_LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
 _HUGE = wp.constant(3.4e38)
 
 _Numbers = wp.types.vector(length=16, dtype=float)
@@ -35,15 +35,15 @@ _Moments = wp.types.vector(length=10, dtype=float)
 
 @wp.struct
 class _Texels:
-    """What a block is fitted to.
+    """The target texels of a block.
 
     Attributes:
-        light: Of each texel.
-        weight: Of each texel's squared error.
-        place: The light in BC6H's space of 16 bits, not rounded.
-        pull: Weight of each channel's squared error there.
+        light: Linear light of each texel.
+        weight: Weight of each texel's squared error.
+        place: The light in BC6H's 16-bit space, not rounded.
+        pull: Weight of each channel's squared error in that space.
         middle: Mean of the places.
-        metric: What a channel's distance from it is scaled by: the root of the mean pull.
+        metric: Scale of each channel's distance from the mean: the root of the mean pull.
     """
 
     light: Colours
@@ -60,7 +60,7 @@ class _Sums:
 
     Attributes:
         aa, ab, bb: Weighted products of the texels' shares of the first and of the second end.
-        ay, by: Weighted sums of their places, by these shares.
+        ay, by: Weighted sums of their places times these shares.
     """
 
     aa: wp.vec3
@@ -72,12 +72,12 @@ class _Sums:
 
 @wp.func
 def _place_of(light: float) -> wp.vec2:
-    """Light in BC6H's space, and the slope of light there."""
+    """Returns light in BC6H's space, and the slope of light there."""
     if light < _LEAST_NORMAL:
         return wp.vec2(light * 16777216.0 * _STRETCH, 1.0 / (16777216.0 * _STRETCH))
     exponent = wp.floor(wp.log2(light))
     scale = wp.pow(2.0, exponent)
-    # The logarithm may round to the next whole number: the curve has a bend there, and no step.
+    # The logarithm may round to the next integer, where the curve has a kink but no step.
     bits = 1024.0 * (exponent + 14.0 + light / scale)
     return wp.vec2(wp.min(bits * _STRETCH, _TOP), scale / (1024.0 * _STRETCH))
 
@@ -89,7 +89,7 @@ def _in(mask: int, texel: int) -> bool:
 
 @wp.func
 def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
-    """Principal axis of moments, and the variance along it times the weight; moments are those of `_moments`."""
+    """Computes the principal axis of `_moments`, and the variance along it times the weight."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
     yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
@@ -112,20 +112,20 @@ def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
 
 @wp.func
 def _spread(m: _Moments) -> float:
-    """Trace of the scatter about the mean."""
+    """Computes the trace of the scatter matrix about the mean."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     return wp.max(m[4] + m[7] + m[9] - (m[1] * m[1] + m[2] * m[2] + m[3] * m[3]) * inverse, 0.0)
 
 
 @wp.func
 def _scaled(texels: _Texels, texel: int) -> wp.vec3:
-    """A texel's place about the middle, in the metric."""
+    """Computes a texel's place relative to the middle, scaled by the metric."""
     return wp.cw_mul(texels.place[texel] - texels.middle, texels.metric)
 
 
 @wp.func
 def _moments(texels: _Texels, mask: int) -> _Moments:
-    """Weight, weighted sum and the six weighted products of the channels of some texels' scaled places."""
+    """Computes weight, weighted sum and the six weighted channel products of some texels' scaled places."""
     total = _Moments()
     square = wp.cw_mul(texels.metric, texels.metric)
     for i in range(_TEXELS):
@@ -139,13 +139,13 @@ def _moments(texels: _Texels, mask: int) -> _Moments:
 
 @wp.func
 def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
-    """The ends of a line through some texels: the outermost along their principal axis, then twice by least squares.
+    """Fits a line through some texels: the extremes along their principal axis, refined twice by least squares.
 
     Args:
         texels: The block.
         mask: The texels.
-        ends: Where the result is put, at rows 2 `line` and 2 `line` + 1.
-        moments: Of these texels.
+        ends: The endpoints of both lines; rows 2 `line` and 2 `line` + 1 are replaced.
+        moments: The moments of these texels.
         steps: The index of the line's far end.
     """
     principal = _axis_of(moments, _AXIS_ROUNDS)
@@ -170,14 +170,14 @@ def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moment
 
 @wp.func
 def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
-    """Both ends of a channel by least squares, within the format's range; those of before where texels tell but one."""
+    """Solves for both ends of a channel within the format's range; returns `before` if they are underdetermined."""
     aa, ab, bb = products[0], products[1], products[2]
     determinant = aa * bb - ab * ab
     if not (determinant > 1.0e-5 * aa * bb and determinant > 0.0):
         return wp.vec2(wp.clamp(before[0], 0.0, _TOP), wp.clamp(before[1], 0.0, _TOP))
     a = (right[0] * bb - right[1] * ab) / determinant
     b = (right[1] * aa - right[0] * ab) / determinant
-    # Where one end is held at the range's, the other is the best beside it.
+    # Where one end is clamped to the range, the other is optimal given it.
     if a < 0.0 or a > _TOP:
         a = wp.clamp(a, 0.0, _TOP)
         b = (right[1] - ab * a) / wp.max(bb, 1.0e-30)
@@ -189,7 +189,7 @@ def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
 
 @wp.func
 def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
-    """The normal equations with one more texel, at share `t` of the way from the first end to the second."""
+    """Adds a texel at share `t` of the way from the first end to the second to the normal equations."""
     s = 1.0 - t
     sums.aa += pull * (s * s)
     sums.ab += pull * (s * t)
@@ -202,7 +202,7 @@ def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
 
 @wp.func
 def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
-    """The ends that solve the normal equations; `a` and `b` are those before."""
+    """Solves the normal equations for the ends; `a` and `b` are the previous ends."""
     for c in range(3):
         products = wp.vec3(sums.aa[c], sums.ab[c], sums.bb[c])
         pair = _solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
@@ -213,7 +213,7 @@ def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
 
 @wp.func
 def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
-    """A line's ends by least squares, its texels at the nearest of the levels between the ends they had."""
+    """Fits a line's ends by least squares, with each texel at the nearest level between the previous ends."""
     along = b - a
     sums = _Sums()
     for i in range(_TEXELS):
@@ -232,7 +232,7 @@ def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
 
 @wp.func
 def _whole(code: int, bits: int) -> int:
-    """An endpoint's channel in 16 bits."""
+    """Expands an endpoint's channel to 16 bits."""
     if bits == 16 or code == 0:
         return code
     if code == (1 << bits) - 1:
@@ -242,7 +242,7 @@ def _whole(code: int, bits: int) -> int:
 
 @wp.func
 def _coded(place: float, bits: int) -> int:
-    """The code of `bits` bits whose 16 bits are nearest to a place."""
+    """Returns the code of `bits` bits that expands to the 16-bit value nearest to a place."""
     top = (1 << bits) - 1
     if bits == 16:
         return wp.clamp(int(place + 0.5), 0, top)
@@ -256,16 +256,16 @@ def _coded(place: float, bits: int) -> int:
 
 @wp.func
 def _share(index: int, steps: int) -> int:
-    """The far end's share at an index, in 64ths; 3 and 4 bits round alike."""
+    """Returns the far end's share at an index, in 64ths; 3 and 4 bits round alike."""
     return (index * 64 + steps // 2) // steps
 
 
 @wp.func
 def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> int:
-    """The mode of most bits in `first`..`last` whose differences hold the ends, -1 for none.
+    """Finds the most precise mode from `first` to `last` - 1 whose differences can store the ends, -1 for none.
 
     Args:
-        ends: `count` of them.
+        ends: The endpoints, of which `count` are used.
     """
     best = int(-1)
     for mode in range(first, last):
@@ -285,7 +285,7 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 @wp.func
 def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
-    """A block in a mode: rounded ends, and the best index of each texel."""
+    """Encodes a block in a mode: rounds the ends and chooses the best index of each texel."""
     block = Block()
     block.mode = mode
     block.partition = partition
@@ -335,7 +335,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
 
 @wp.func
 def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
-    """Ends of which the first is the nearer to the line's anchor texel, whose index has a bit less."""
+    """Orders the ends so that the first is nearer to the line's anchor texel, whose index has one bit less."""
     a, b = ends[2 * line], ends[2 * line + 1]
     pull = texels.pull[anchor]
     along = wp.cw_mul(pull, b - a)
@@ -347,7 +347,7 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 
 @wp.func
 def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
-    """Ends by least squares of the levels that the texels of a line took."""
+    """Refits the ends of a line by least squares to the indices of its texels."""
     sums = _Sums()
     for i in range(_TEXELS):
         if _in(mask, i):
@@ -361,14 +361,14 @@ def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, 
 
 @wp.func
 def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int) -> _Texels:
-    """The texels of a block."""
+    """Loads the texels of a block."""
     texels = _Texels()
     heaviest = float(0.0)
     for i in range(_TEXELS):
         heaviest = wp.max(heaviest, weight[number, i])
     metric = wp.vec3(0.0)
     for i in range(_TEXELS):
-        # A texel without weight counts for very little, and not for nothing: it is read next to others.
+        # A texel without weight gets a very small weight, since interpolation still reads it.
         w = float(1.0)
         if heaviest > 0.0:
             w = wp.max(weight[number, i] / heaviest, _LEAST_WEIGHT)
@@ -388,7 +388,7 @@ def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int
 
 @wp.func
 def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
-    """The partition of the least scatter off its two lines, among those whose bit isn't set in `tried`; and that."""
+    """Finds the partition with the least scatter about its two lines among those not in `tried`, and the scatter."""
     least = float(_HUGE)
     partition = int(0)
     for p in range(32):
@@ -402,7 +402,7 @@ def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.v
                     part = whole - second
                 left += _spread(part)
                 along += _axis_of(part, _POWER_ROUNDS)[3]
-            # Of a line's scatter, an index of three bits leaves 1/49.
+            # An index of three bits leaves 1/49 of the scatter along a line.
             left = left - along * (48.0 / 49.0)
             if left < least:
                 least = left
@@ -422,17 +422,17 @@ def _encode(
 ):
     """One block per thread.
 
-    Every function is called at one place, in loops over ways, lines and rounds: compilers inline each call, and ten
-    copies of the same took CUDA's half a minute.
+    Every function is called at one place, in loops over partitions, lines and rounds: compilers inline each call, and
+    ten copies of a function took the CUDA compiler half a minute.
     """
     number = wp.tid()
     texels = _gathered(light, weight, number)
     whole = _moments(texels, _ALL)
-    # Of a line's scatter, an index of four bits leaves 1/225.
+    # An index of four bits leaves 1/225 of the scatter along a line.
     alone = _spread(whole) - _axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
     best = Block()
     best.error = _HUGE
-    tried = int(0)  # a bit a partition
+    tried = int(0)  # one bit per partition
     for attempt in range(1 + _TRIED):  # one line, then two
         lines = int(1)
         steps = int(15)
@@ -487,9 +487,9 @@ def encode(light, weight, tables: Tables, blocks, decoded) -> None:
 
     Args:
         light: vec3 [N, 16], texels row by row, finite; clamped to [0, 65504].
-        weight: float [N, 16], of each texel's squared error, 0 or more.
-        tables: On the same device.
-        blocks: uint32 [N, 4], written: 16 bytes a block, the lowest first.
-        decoded: vec3 [N, 16], written: what the blocks decode to.
+        weight: float [N, 16], weight of each texel's squared error, 0 or more.
+        tables: The format's tables, on the same device.
+        blocks: uint32 [N, 4], written: 16 bytes per block, the lowest first.
+        decoded: vec3 [N, 16], written: the decoded texels of the blocks.
     """
     wp.launch(_encode, len(light), inputs=[light, weight, tables], outputs=[blocks, decoded], device=light.device)

@@ -1,4 +1,4 @@
-"""A BC6H block as an encoder makes it, and its 128 bits."""
+"""A BC6H block during encoding, and its packing into 128 bits."""
 
 import warp as wp
 
@@ -12,14 +12,14 @@ Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 
 @wp.struct
 class Tables:
-    """The format, from `wlm.formats.bc6h`.
+    """The tables of the format, from `wlm.formats.bc6h`.
 
     Attributes:
         modes: int [14, 7], `MODES`.
         layout: int [14, 82], `LAYOUT`.
         masks: int [32], `MASKS`.
         anchors: int [32], `SECOND_ANCHORS`.
-        halves: float [31,744], the half float of each number of bits.
+        halves: float [31,744], the value of each half float by its bit pattern.
     """
 
     modes: wp.array2d[int]
@@ -34,11 +34,11 @@ class Block:
     """A block in one mode.
 
     Attributes:
-        error: Of its texels, weighted.
-        mode, partition: Their rows.
+        error: Weighted squared error of its texels.
+        mode, partition: Rows of the mode and the partition in the tables.
         code: The endpoints w, x, y and z as the mode stores them, without differences.
-        index: Of each texel.
-        light: What it decodes to.
+        index: Index of each texel.
+        light: Decoded light of each texel.
     """
 
     error: float

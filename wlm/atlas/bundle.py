@@ -1,4 +1,4 @@
-"""An atlas model as a GPU holds it: the lookup texture, the colour textures, mips, the shader and the mesh."""
+"""The GPU form of an atlas model: the lookup texture, the colour textures, mips, the shader and the mesh."""
 
 import math
 from typing import Any
@@ -84,7 +84,7 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_texels(model: AtlasModel) -> np.ndarray:
-    """The texture `sheets`, uint16 [rows, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
+    """Makes the texture `sheets`, uint16 [rows, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
     table = model.table()
     texels = np.zeros((len(table), 2, 4), "<u2")
     texels[:, 0] = table[:, [1, 0, 3, 2]]
@@ -93,11 +93,11 @@ def sheet_texels(model: AtlasModel) -> np.ndarray:
 
 
 def _colour(model: AtlasModel, layered: bool) -> Texture:
-    """T_p; with "mixed" its texture of single texels."""
+    """Makes T_p; with "mixed" its texture of single texels."""
     layers = len(model.texels) if layered else 0
     format = TEXELS if model.colour == "mixed" else model.colour
     if format == "half":
-        # DXGI has no half floats of three channels.
+        # DXGI has no format of three half floats.
         whole = np.concatenate([model.texels.astype("<f2"), np.ones((*model.texels.shape[:3], 1), "<f2")], 3)
         return _texture(whole, format, model.texels, layers)
     if format == TEXELS:
@@ -106,14 +106,14 @@ def _colour(model: AtlasModel, layered: bool) -> Texture:
 
 
 def _texture(data: np.ndarray, format: str, texels: np.ndarray, layers: int) -> Texture:
-    """A colour texture, with the decoded texels of blocks."""
+    """Makes a colour texture, with the decoded texels of its blocks."""
     rows, columns = texels.shape[1:3]
     image = (texels if layers else texels[0]).astype(np.float32) if format in ("bc6h", "astc") else None
     return Texture(data, _FORMATS[format], columns, rows, layers, image=image)
 
 
 def _lookup(model: AtlasModel) -> Texture:
-    """T_c: whole numbers for tiles, else coordinates."""
+    """Makes T_c: integers for tiles, else coordinates."""
     numbers = model.lut.shape[2]
     format = "R16G16B16A16_UINT" if numbers == 4 else "R16G16_UNORM" if model.method == "cascade" else "R16G16_UINT"
     return Texture.from_texels(np.ascontiguousarray(model.lut, "<u2"), format)

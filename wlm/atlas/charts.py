@@ -18,14 +18,14 @@ def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.nda
     Returns:
         int32 [F, 3], numbers from 0.
     """
-    # Adding 0 makes -0 into 0, which has other bits.
+    # Adding 0 turns -0 into 0, which has other bits.
     values = np.ascontiguousarray(np.concatenate([position, uv], 1, dtype=np.float64) + 0.0)
     row = values.view([("", np.float64)] * values.shape[1])[:, 0]
     return np.unique(row, return_inverse=True)[1].astype(np.int32)[triangle]
 
 
 def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-    """Numbers the charts: triangles that share an edge are in one chart, those that share a corner alone are not.
+    """Numbers the charts: triangles that share an edge are in one chart, but not triangles that share only a corner.
 
     Args:
         corner: int [F, 3], the corners' numbers, `welded`.

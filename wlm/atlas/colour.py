@@ -1,11 +1,11 @@
 """The colour texture as stored: half floats, RGB9E5, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
 
-RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which have them of four
-channels and not of three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
+RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which support
+them with four channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
 lightmap-uv-clustering-cascade, section 4.4, counts 6 for ASTC 4x4, which the format doesn't have; we count 8. ASTC
 needs the extra `atlas`.
 
-Half floats hold exactly what each of them decodes to.
+Half floats represent the decoded texels of every format exactly.
 """
 
 import math
@@ -23,13 +23,13 @@ from wlm.ops.bc6h import bc6h_blocks
 
 BLOCK_CODECS = ("bc6h", "astc")
 _EXTRA = "atlas"
-_MANTISSA = 512  # of RGB9E5, and its least exponent, of a largest channel below 2 ** -15
+_MANTISSA = 512  # mantissa steps of RGB9E5, and its least exponent, where the largest channel is below 2 ** -15
 _LEAST_EXPONENT = -15
 _FRACTION = 24
 
 
 def block_grid(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of blocks that hold a texture."""
+    """Computes the rows and columns of blocks that cover a texture."""
     return math.ceil(height / BLOCK_SIDE), math.ceil(width / BLOCK_SIDE)
 
 
@@ -44,11 +44,11 @@ def quantise(
     Args:
         texels: numbers [H, W, 3], linear, on any device.
         colour: "half", "rgb9e5", "bc6h" or "astc".
-        weight: numbers [H, W], for "bc6h": of each texel's squared error; None: all alike.
+        weight: numbers [H, W], for "bc6h": the weight of each texel's squared error; None: equal weights.
         device: Where BC6H is encoded.
 
     Returns:
-        `texels` and, of a block format, `blocks` of `AtlasModel`.
+        `texels` and, for a block format, `blocks` of `AtlasModel`.
 
     Raises:
         WlmError: A package is missing; the line names the extra.
@@ -63,11 +63,11 @@ def quantise(
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
-    """What tiles decode to, once stored.
+    """Computes the samples that tiles decode to after they are stored.
 
     Args:
-        samples: float32 [T, ny, nx, 3], finite, not negative; of blocks ny and nx are multiples of 4.
-        weight: float32 [T, ny, nx], of each sample's squared error.
+        samples: float32 [T, ny, nx, 3], finite, not negative; for blocks ny and nx are multiples of 4.
+        weight: float32 [T, ny, nx], weight of each sample's squared error.
         colour: As for `quantise`.
 
     Returns:
@@ -90,7 +90,7 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
 
 
 def _rounded(samples: torch.Tensor) -> torch.Tensor:
-    """What RGB9E5 decodes to: `wlm.formats.shared_exponent` for tensors."""
+    """Rounds samples to RGB9E5, as `wlm.formats.shared_exponent` does, for tensors."""
     samples = samples.clamp(0.0, LARGEST)
     largest = samples.amax(-1, keepdim=True)
     # The exponent of a number from 1/2 to 1 times a power of two.
@@ -101,14 +101,14 @@ def _rounded(samples: torch.Tensor) -> torch.Tensor:
 
 
 def _by_block(texels: torch.Tensor) -> torch.Tensor:
-    """Blocks [N, 16, C] of tiles [T, ny, nx, C], tile by tile and row by row."""
+    """Cuts tiles [T, ny, nx, C] into blocks [N, 16, C], tile by tile and row by row."""
     count, ny, nx, channels = texels.shape
     cells = texels.reshape(count, ny // BLOCK_SIDE, BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, channels)
     return cells.transpose(2, 3).reshape(-1, BLOCK_SIDE * BLOCK_SIDE, channels)
 
 
 def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tensor:
-    """Tiles [T, ny, nx, 3] of blocks [N, 16, 3], `_by_block` turned round."""
+    """Inverts `_by_block`: makes tiles [T, ny, nx, 3] from blocks [N, 16, 3]."""
     cells = texels.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
     return cells.transpose(2, 3).reshape(count, ny, nx, 3)
 
@@ -161,7 +161,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
     Args:
         blocks: uint8 [B, 16], row by row.
-        height, width: Of the texture, at least 1.
+        height, width: Size of the texture in texels, at least 1.
         codec: "bc6h" or "astc".
 
     Returns:
@@ -192,7 +192,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
-    """A tensor on the device; a copy of an array, which may be read backwards or not be written to."""
+    """Makes a tensor on the device; an array, which may have negative strides or be read-only, is copied."""
     return (
         values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
     )

@@ -1,8 +1,9 @@
-"""New UVs of triangles' corners in a file: each place once, and triangles that share texels once.
+"""Storage of new UVs of triangles' corners: each place once, and triangles that share texels once.
 
 A place has 16 bits along each axis. Triangles of a group read the same texels, in one of the six orders of the corners:
-three places are one stored triangle, in rising order, and each triangle of the mesh names it and its order. Places and
-stored triangles are in the order of their first use. Bytes of equal weight are stored together, which packs better.
+a stored triangle is three places in rising order, and each triangle of the mesh refers to one and states its order.
+Places and stored triangles are in the order of their first use. Bytes of equal weight are stored together, which packs
+better.
 """
 
 import itertools
@@ -26,7 +27,7 @@ _ORDERS = np.array(list(itertools.permutations(range(3))))
 
 
 def snapped(uv: np.ndarray) -> np.ndarray:
-    """Rounds UVs in [0, 1] to the nearest places that a file holds, float32."""
+    """Rounds UVs in [0, 1] to the nearest places that a file can store, float32."""
     return (np.rint(np.asarray(uv, np.float64) * STEPS) / STEPS).astype(np.float32)
 
 
@@ -40,7 +41,7 @@ def encode_corners(uv: np.ndarray) -> dict[str, np.ndarray]:
         The parts; none for no corners.
 
     Raises:
-        ValueError: The corners are not at places that a file holds.
+        ValueError: The corners are not at places that a file can store.
     """
     if not len(uv):
         return {}
@@ -51,7 +52,7 @@ def encode_corners(uv: np.ndarray) -> dict[str, np.ndarray]:
     triangle = corner.reshape(-1, 3)
     order = np.argsort(triangle, axis=1, kind="stable")
     stored, index = _by_first_use(np.take_along_axis(triangle, order, 1))
-    # Steps modulo 65,536 as numbers of 16 bits with a sign, and these with the sign as the lowest bit.
+    # Steps modulo 65,536 become signed 16-bit integers, which are stored with the sign as the lowest bit (zigzag).
     step = np.diff(place, axis=0, prepend=0).astype(np.int16).astype(np.int32)
     folded = (step << 1) ^ (step >> 31)
     return {
@@ -92,7 +93,7 @@ def decode_corners(parts: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _by_first_use(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gives the distinct rows in the order of their first use, and the number of each row among them."""
+    """Returns the distinct rows in the order of their first use, and the index of each row among them."""
     _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return rows[np.sort(first)], rank[number.reshape(-1)]

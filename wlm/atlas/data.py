@@ -4,19 +4,19 @@ A scene has sheets. A sheet is one layout of charts with a lightmap for each sta
 shadow mask); the triangles of one object or of many read it. One mesh with one lightmap is a scene of one sheet and one
 state.
 
-The stated behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of `warnings`, with its
-count.
+The table states the behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of `warnings`
+with its count.
 
 ====================================  ================================================================
 input                                 behaviour
 ====================================  ================================================================
 no triangle, no UVs                   error
-several meshes that overlap in UV     the one that the lightmap fits best (`matching`), the others left out;
-                                      warning. Error where none fits clearly better: `node` says which
+several meshes that overlap in UV     the mesh that the lightmap fits best is used (`matching`); warning.
+                                      Error where none fits clearly better: `node` selects one
 a lightmap that fits its charts       warning: `flip` turns it
 better upside down
-six times as long as wide             warning: it may be the faces of a cube, of a reflection probe
-a primitive without the UV set        left out, and unchanged in what is written; warning
+six times as long as wide             warning: it may be the cube faces of a reflection probe
+a primitive without the UV set        left out, and written unchanged; warning
 nodes without a lightmap, beside a    hide what is behind them, and nothing else
 list of lightmaps
 a node that the list names and the    error that lists the nodes that the mesh has
@@ -27,11 +27,11 @@ in size
 a position or UV NaN or infinite,     error that names the primitive and the vertex
 a position beyond float32
 a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
-triangles without area, in space or   kept, but not `active`: they take no part; warning
+triangles without area, in space or   kept, but not `active`: they are ignored; warning
 in UV
 no triangle with area                 error
 UVs of less than a texel in all       warning
-overlapping UVs, a mesh drawn twice   read: all that share texels have one light; warning
+overlapping UVs, a mesh drawn twice   read: all that share texels have the same light; warning
 NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
 a speck inside, less than 3 texels    the same
 wide, above 16 times the light's
@@ -76,14 +76,14 @@ from wlm.formats.meshes import SUFFIXES, read_mesh
 from wlm.ops.indoors import Indoors, indoors
 from wlm.texels import fill_gaps, repair
 
-_FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't tell a triangle from one without area
-_FACES = 6  # of a cube
+_FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't distinguish the area from 0
+_FACES = 6  # faces of a cube
 _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The place of one primitive's vertices and triangles in a sheet; they keep their order.
+    """Position of one primitive's vertices and triangles in a sheet, in their original order.
 
     Attributes:
         primitive: The primitive.
@@ -196,7 +196,7 @@ class LightmappedScene:
 
     @property
     def texels(self) -> int:
-        """Texels of all lightmaps: of all sheets in all states."""
+        """Number of texels of all lightmaps, over all sheets and states."""
         return max(len(self.states), 1) * sum(sheet.mask.size for sheet in self.sheets)
 
     @cached_property
@@ -305,7 +305,7 @@ def from_arrays(
     """Makes a scene of one sheet of arrays, under the same rules as `load`.
 
     Args:
-        position: [V, 3] of numbers, in any unit; rounded to float32, as files hold it.
+        position: [V, 3] of numbers, in any unit; rounded to float32, as in files.
         triangle: [F, 3] of integers, 0 to V - 1.
         uv: [V, 2] of numbers; u right, v down from the lightmap's top row; rounded to float32.
         lightmap: [H, W, 3] of numbers, linear RGB, or [M, H, W, 3] for M states; copied.
@@ -339,10 +339,11 @@ def from_arrays(
 
 
 def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> LightmappedScene:
-    """Makes one scene of several, with the sheets of all of them.
+    """Joins several scenes into one that has all their sheets.
 
     Args:
-        scenes: At least one, in one space and with the same number of states, whose names are those of the first.
+        scenes: At least one, in the same space and with equally many states; the states' names are taken from the
+            first.
         name: The name of the new scene.
 
     Raises:
@@ -370,11 +371,11 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
 def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
-    """Makes the sheets of a model, without lightmaps, of the triangles that its file holds.
+    """Makes the sheets of a model, without lightmaps, from the triangles in its file.
 
     Args:
         where: The file, for messages.
-        primitives: As read.
+        primitives: The primitives of the file.
         uv_set: n of the lightmaps' `TEXCOORD_n`.
         objects: The nodes that read the sheets, in the order of the sheets.
         masks: bool [H, W] for each sheet.
@@ -458,7 +459,7 @@ def _listed(path: Path, document: GltfDocument, lights_path: str | os.PathLike[s
 def _select(
     where: str, primitives: list[GltfPrimitive], uv_set: int | None
 ) -> tuple[list[GltfPrimitive], int, list[str]]:
-    """Selects the UV set and the primitives that have it; and a warning if some have not."""
+    """Selects the UV set and the primitives that have it; returns a warning if some lack it."""
     sets = sorted({number for each in primitives for number in each.uv})
     if not sets:
         raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
@@ -479,7 +480,7 @@ def _select(
 
 
 def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[tuple[GltfPrimitive, Placed]]:
-    """The primitives that the objects of a list name, and their places."""
+    """Finds the primitives that the objects of a list name, and their places."""
     pairs = []
     for each in listing.objects or ():
         for primitive in named(where, readers, each.node):
@@ -492,7 +493,7 @@ def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[
 
 
 def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitive:
-    """A primitive with UVs of the sheet."""
+    """Transforms the UVs of a primitive to those of the sheet."""
     sx, sy, x, y = place.scale_offset
     if (sx, sy, x, y) == (1.0, 1.0, 0.0, 0.0):
         return primitive
@@ -503,14 +504,14 @@ def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitiv
 def _read_lightmaps(
     listing: Listing, files: SheetFiles, trust: bool
 ) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask if it has one; and the names of these files."""
+    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask if any; also returns the names of these files."""
     lightmaps: list[np.ndarray] = []
     names = [str(listing.file(name, trust)) for name in files.files]
     for path in names:
         light = read_light(path)[0] if files.encoding is None else read_encoded(path, files.encoding)
         light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32, order="C")
         if files.intensity != 1.0:
-            with np.errstate(invalid="ignore", over="ignore"):  # repaired as infinity, as it may be in the file
+            with np.errstate(invalid="ignore", over="ignore"):  # an overflow is repaired like an infinity in the file
                 light *= np.float32(files.intensity)
         if lightmaps and light.shape != lightmaps[0].shape:
             size, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
@@ -536,9 +537,9 @@ def _checked(
 
     Args:
         where, name: The mesh file and the sheet, for messages.
-        primitives: Those that read the sheet, with UVs of it.
+        primitives: The primitives that read the sheet, with its UVs.
         uv_set: n of `TEXCOORD_n`.
-        lightmaps: float32 [M, H, W, 3]. With M = 0 the mask has to be given, and no light is checked.
+        lightmaps: float32 [M, H, W, 3]. With M = 0 the mask is required, and no light is checked.
         mask: bool [H, W]; None: derived.
         names: Names of the M lightmaps and of the mask, for messages.
         warnings: Lines that come first.
@@ -577,13 +578,13 @@ def _checked_light(
     name: str,
     position: np.ndarray,
     uv: np.ndarray,
-    triangle: np.ndarray,  # active ones
+    triangle: np.ndarray,  # only active triangles
     uv_set: int,
     lightmaps: np.ndarray,
     mask: np.ndarray | None,
     names: Sequence[str],
 ) -> tuple[np.ndarray, list[str]]:
-    """Derives or checks the mask and repairs the lightmaps in place; gives the mask and the warnings."""
+    """Derives or checks the mask and repairs the lightmaps in place; returns the mask and the warnings."""
     warnings = []
     height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):
@@ -635,11 +636,11 @@ def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
 
 
 def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Whether each triangle of points [V, 2 or 3] has an area, whatever its size: bool [F]."""
+    """Tests whether each triangle of points [V, 2 or 3] has an area, whatever its size: bool [F]."""
     a, b, c = (point[triangle[:, k]] for k in range(3))
     ab, ac = b - a, c - a
     longest = np.sqrt(np.maximum.reduce([(edge * edge).sum(axis=1) for edge in (ab, ac, c - b)]))
-    # Scaled to a longest side of 1, so that neither tiny nor huge triangles leave float64's range.
+    # Triangles are scaled to a longest side of 1, so that neither tiny nor huge ones leave float64's range.
     scale = np.divide(1.0, longest, out=np.zeros_like(longest), where=longest > 0)[:, None]
     ab, ac = ab * scale, ac * scale
     if point.shape[1] == 2:
@@ -650,7 +651,7 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
 
 def _uv_area(uv: np.ndarray, triangle: np.ndarray) -> float:
-    """The sum of the triangles' areas in UV."""
+    """Sums the triangles' areas in UV."""
     ab, ac = uv[triangle[:, 1]] - uv[triangle[:, 0]], uv[triangle[:, 2]] - uv[triangle[:, 0]]
     return 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum())
 

@@ -1,4 +1,4 @@
-"""The runtime path: light from compressed lightmaps (lightmap-uv-clustering-cascade, eq. 7)."""
+"""The runtime decoder of compressed lightmaps (lightmap-uv-clustering-cascade, eq. 7)."""
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ class Decoder:
         """
         self.model, self.device = model, interop.check_device(device)
         if model.method in ("tiles", "shared"):
-            # As stored: two bytes per number.
+            # Numbers stay as stored, with two bytes each.
             self._texels = self._blocks = self._halves(model.texels)
             if model.colour == "mixed":
                 self._blocks = self._halves(model.block_texels)
@@ -61,7 +61,7 @@ class Decoder:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """Factors of a state for shared tiles, float32 [C, 3]; between two states, 0.5 for example, they are mixed.
+        """Computes the factors of a state for shared tiles, float32 [C, 3], interpolated between two states (0.5).
 
         Raises:
             ValueError: The state is below 0 or above the last.
@@ -87,14 +87,15 @@ class Decoder:
             uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the sheets'.
             sheet: int [N], or one number for all points, 0 to S - 1.
             state: 0 to M - 1, or between two states.
-            lod: float32 [N], octaves of the lightmap's texels along a pixel, for a model with mips; None: up close.
-            own: With `lod` and new UVs: the sheet's own UVs, under which the mips are read.
+            lod: float32 [N], base-2 logarithm of lightmap texels per pixel, for a model with mips; None: full
+                resolution.
+            own: With `lod` and new UVs: the sheet's original UVs, with which the mips are read.
 
         Returns:
             float32 [N, 3].
 
         Raises:
-            ValueError: No such state, the model has no mips, or the sheet's own UVs are missing.
+            ValueError: No such state, the model has no mips, or the sheet's original UVs are missing.
         """
         if lod is not None and not self.model.mips:
             raise ValueError("lod: expected a model with mips")
@@ -138,7 +139,7 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Light of shared or separate tiles."""
+        """Reads light of shared or separate tiles."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -154,7 +155,7 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Light of rows of the table of sheets, with a state's factors."""
+        """Reads light of rows of the table of sheets, with a state's factors."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()
@@ -168,7 +169,7 @@ class Decoder:
         return out
 
     def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
-        """Light between two levels of each row; level 0 is the row itself."""
+        """Interpolates light between two levels of each row; level 0 is the row itself."""
         smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
         near, far = row, torch.where(smaller[row] > 0, smaller[row], row)
         for number in range(1, 1 + len(self.model.levels)):
@@ -182,11 +183,11 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the texels of a sheet's mask, as `lightmap`.
+        """Decodes the texels of a sheet's mask, with the values of `lightmap`.
 
         Args:
             sheet: The sheet that was compressed.
-            number: Its number.
+            number: The sheet's number.
             state: As for `read`.
 
         Returns:
@@ -225,7 +226,7 @@ class Decoder:
         return result
 
     def _under_new_uvs(self, sheet: Sheet) -> np.ndarray:
-        """The lightmap of a model with new UVs, float32 [H, W, 3]; texels that no triangle holds are filled."""
+        """Decodes the lightmap of a model with new UVs, float32 [H, W, 3]; texels outside all triangles are filled."""
         height, width = sheet.mask.shape
         result = np.zeros((height, width, 3), np.float32)
         triangle, barycentric = texel_triangles(sheet, height, width, self.device)

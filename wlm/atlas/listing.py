@@ -9,9 +9,10 @@ A JSON file:
      "convention": "gltf"
     }
 
-A sheet is one layout of charts and has a file for each state. `name`, `encoding`, `flip` and `mask` of a sheet are as
-for `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
-UV * (scale x, y) + (offset x, y). Without `objects` every sheet goes to the mesh that it fits (`matching`).
+A sheet is one layout of charts and has a file for each state. Its fields `name`, `encoding`, `flip` and `mask` mean the
+same as in `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
+UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits
+(`matching`).
 `convention` states how the rectangles are written:
 
     gltf     v runs down, as in glTF.
@@ -51,7 +52,7 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet; the module says what the fields mean."""
+    """The files of a sheet, with fields as in the module docstring."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -91,7 +92,7 @@ class Listing:
         path: The file that names the lightmaps.
         states: Names of the states; each sheet has a file for each.
         sheets: The files.
-        objects: Nodes and their rectangles; None: every sheet goes to the mesh that it fits.
+        objects: Nodes and their rectangles; None: every sheet is assigned to the mesh that it fits.
         uv_set: n of `TEXCOORD_n`; None: 1 where there is one, else 0.
         direct: Whether the names of files are paths that the caller gave, and not names in a file.
     """
@@ -104,7 +105,7 @@ class Listing:
     direct: bool = False
 
     def file(self, name: str, trust: bool) -> Path:
-        """The path of a file of the list.
+        """Resolves the path of a file of the list.
 
         Raises:
             WlmError: It lies outside the list's folder, and the list isn't trusted.
@@ -170,7 +171,7 @@ def material_lightmaps(document: GltfDocument) -> Listing | None:
     """Lists the lightmaps that the materials of a glTF file name; None: no material names one.
 
     Raises:
-        WlmError: A texture is malformed, of another UV set than the others', or within the file: not beside it.
+        WlmError: A texture is malformed, uses another UV set than the others, or is embedded in the file.
     """
     sheets: dict[tuple[int, float], SheetFiles] = {}
     objects, sets = [], set()
@@ -237,7 +238,7 @@ def _object(entry: Any, convention: str, where: str) -> Any:
     name = "lightmapScaleOffset" if "lightmapScaleOffset" in entry else "scale_offset"
     if name in entry:
         sx, sy, x, y = _numbers(entry.pop(name), f"{where}.{name}", ("x", "y", "z", "w"))
-        entry["scale_offset"] = [sx, sy, x, 1.0 - sy - y]  # of 1 - v
+        entry["scale_offset"] = [sx, sy, x, 1.0 - sy - y]  # the rectangle applies to 1 - v
     return entry
 
 

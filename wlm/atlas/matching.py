@@ -1,8 +1,8 @@
-"""Whether a lightmap is a mesh's own: of which node, which way up, and which of its texels are stray.
+"""Matching of a lightmap to a mesh: its node, its vertical orientation, and its stray texels.
 
-All of it is read from the light itself. Within a chart light is smooth but for the edges of shadows; gaps, other charts
-and what a baker leaves between them are not. So the mean step between neighbouring texels of one chart is least under
-the UVs that the lightmap was baked for.
+Everything is derived from the light itself. Within a chart light is smooth except at the edges of shadows; it is not
+smooth across gaps, other charts and leftovers of a baker between them. So the mean step between neighbouring texels of
+one chart is least under the UVs that the lightmap was baked for.
 """
 
 from collections.abc import Sequence
@@ -18,25 +18,25 @@ from wlm.formats.gltf import GltfPrimitive
 from wlm.ops.raster import rasterize_uv
 from wlm.texels import fill_gaps
 
-_STEP = 3.0  # octaves: a larger step counts as this, as does one to NaN or infinity
-_DARK = 0.02  # of the median light, added before a step is measured: darkness has no steps
-# Measured on 15 lightmaps, both ways up: the right one has at most 0.82 of the other's roughness.
+_STEP = 3.0  # octaves: larger steps, and steps to NaN or infinity, are clamped to this
+_DARK = 0.02  # fraction of the median light that is added first, so that dark texels have no steps
+# On 15 lightmaps, in both orientations, the right one has at most 0.82 of the other's roughness.
 _BETTER = 0.85
-_LOOKED_AT, _BAND = 1 << 22, 16  # texels of a lightmap, in bands of so many rows: enough to tell, in a second
-_LEAST, _FEWEST = 0.005, 1024  # octaves; texels in charts, of which the mean says something
-_SHARED = 0.02  # of the texels under several meshes: fewer are the rounding of neighbours in one atlas
-_BRIGHT, _PERCENTILE = 16.0, 99.5  # times this percentile of a chart's light, and in a speck: no light
-_WIDEST = 3  # texels along a side of what is no speck
-_FRINGE, _REACH = 4.0, 5  # times the brightest texel of a chart in a window of so many texels
+_LOOKED_AT, _BAND = 1 << 22, 16  # texels examined per lightmap, and rows per band: enough, within a second
+_LEAST, _FEWEST = 0.005, 1024  # smallest roughness in octaves; fewest texels in charts for a meaningful mean
+_SHARED = 0.02  # fraction of texels under several meshes; a smaller one is rounding at neighbouring charts
+_BRIGHT, _PERCENTILE = 16.0, 99.5  # a speck is brighter than this multiple of this percentile of the light
+_WIDEST = 3  # a speck is narrower than this number of texels
+_FRINGE, _REACH = 4.0, 5  # limit over the brightest chart texel nearby, and the window's side in texels
 
 
 def choose_mesh(
     where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
 ) -> tuple[list[GltfPrimitive], list[str]]:
-    """Chooses the meshes of a scene that a lightmap belongs to.
+    """Chooses the meshes of a scene for which a lightmap was baked.
 
-    Meshes that lie side by side in UV space share it. Where they lie on each other it is of one of them, the one whose
-    charts it is smoothest in; a mesh that several nodes draw counts once.
+    Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts
+    the lightmap is smoothest is chosen; a mesh that several nodes draw counts once.
 
     Args:
         where, name: The file and the mesh, for messages.
@@ -58,7 +58,7 @@ def choose_mesh(
     covered = np.zeros((height, width), np.int32)
     for group in groups:
         _, uv, triangle = _joined(group, uv_set)
-        if not np.isfinite(uv).all():  # told where the primitives are checked
+        if not np.isfinite(uv).all():  # reported where the primitives are checked
             return primitives, []
         covered += covered_texels(uv.clip(0.0, 1.0), triangle, height, width) > 0
     if np.count_nonzero(covered > 1) <= _SHARED * np.count_nonzero(covered):
@@ -81,10 +81,10 @@ def choose_mesh(
 
 
 def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPrimitive]:
-    """The primitives of one node, by its name, its mesh's name or its number.
+    """Selects the primitives of one node, by its name, its mesh's name or its number.
 
     Raises:
-        WlmError: There is none; the line names those that there are.
+        WlmError: There is no such node; the line lists the nodes that exist.
     """
     found = [each for each in primitives if node in (each.label, each.mesh_label, str(each.node))]
     if not found:
@@ -95,7 +95,7 @@ def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPr
 
 
 def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The number of the chart that holds each texel's centre, int32 [height, width], -1 for none."""
+    """Computes the number of the chart at each texel's centre, int32 [height, width], -1 for none."""
     uv = np.asarray(uv, np.float64).clip(0.0, 1.0)
     number = charts(welded(position, uv, triangle))
     corners = torch.from_numpy(np.ascontiguousarray(triangle, np.int32))
@@ -104,9 +104,9 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 
 
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
-    """The mean step, in octaves, between neighbouring texels of one chart; infinite where there are none.
+    """Computes the mean step, in octaves, between neighbouring texels of one chart; infinite if there are none.
 
-    Of a large lightmap it is that of evenly spread bands of rows, of `_LOOKED_AT` texels in all.
+    A large lightmap is sampled in evenly spread bands of rows, `_LOOKED_AT` texels in all.
 
     Args:
         lightmap: float [H, W, 3]; NaN and infinity are steps.
@@ -132,7 +132,7 @@ def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
 
 
 def _bands(height: int, width: int) -> list[slice]:
-    """Rows of a lightmap that are looked at: all, or bands of them."""
+    """Selects the rows of a lightmap that are examined: all, or evenly spread bands."""
     count = max(_LOOKED_AT // (_BAND * width), 4)
     if count * _BAND >= height:
         return [slice(0, height)]
@@ -141,7 +141,7 @@ def _bands(height: int, width: int) -> list[slice]:
 
 
 def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
-    """Whether a lightmap fits its charts clearly better upside down.
+    """Tests whether a lightmap fits its charts clearly better upside down.
 
     Args:
         lightmap: float [H, W, 3].
@@ -154,19 +154,19 @@ def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
 
 
 def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:
-    """Gives texels that are no light the value of the nearest that is, in place.
+    """Replaces stray texels by the nearest valid texel, in place.
 
-    No light is, of texels without their centre in a triangle, NaN, infinity and what is brighter than 4 times the
-    brightest texel near it that has: bakers and denoisers leave such in gutters. Of the others it is a speck, less than
-    3 texels wide, brighter than 16 times the 99.5th percentile of them all.
+    A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4 times as bright as the
+    brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values in gutters. Other
+    texels are stray in a speck: less than 3 texels wide, above 16 times the 99.5th percentile of all of them.
 
     Args:
         lightmap: float32 [H, W, 3].
         mask: bool [H, W], the texels that count.
-        covered: bool [H, W], those with their centre in a triangle.
+        covered: bool [H, W], the texels with their centre in a triangle.
 
     Returns:
-        How many specks there were.
+        Number of specks.
     """
     brightest = lightmap.max(axis=2)
     finite = np.isfinite(lightmap).all(axis=2)
@@ -175,7 +175,7 @@ def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) 
     if not light.size:
         return 0
     high = inside & finite & (brightest > _BRIGHT * np.percentile(light, _PERCENTILE))
-    # What lies beside a bright area and is bright too is that area's end.
+    # A bright texel beside a bright area is part of that area.
     speck = high & ~binary_opening(high, np.ones((_WIDEST, _WIDEST)))
     known = np.where(inside & finite & ~speck, brightest, 0.0)
     near = maximum_filter(known, _REACH)
@@ -188,7 +188,7 @@ def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) 
 
 
 def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, UVs and triangles of some primitives as one mesh."""
+    """Joins positions, UVs and triangles of some primitives into one mesh."""
     first = np.cumsum([0, *(len(each.position) for each in primitives)])
     triangle = [each.triangle + start for each, start in zip(primitives, first[:-1], strict=True)]
     uv = np.concatenate([each.uv[uv_set] for each in primitives]).astype(np.float64)
@@ -196,5 +196,5 @@ def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarra
 
 
 def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each but the last along an axis, and each but the first."""
+    """Returns all values except the last along an axis, and all except the first."""
     return values.take(range(values.shape[axis] - 1), axis), values.take(range(1, values.shape[axis]), axis)

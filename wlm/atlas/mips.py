@@ -1,13 +1,13 @@
 """Mips of one lightmap, the tail: a small lightmap for surfaces that are far away.
 
 Neighbours in the lightmap are not neighbours in T_p, so mip levels of T_p would mix unrelated texels. Instead, the tail
-is the lightmap at a quarter of its resolution with all smaller levels, one texture under the mesh's own UVs, in blocks
-of BC6H, or of ASTC beside ASTC. With `lod` the octaves of the lightmap's texels along a pixel, light is
+is the lightmap at a quarter of its resolution with all smaller levels, one texture under the mesh's own UVs, in BC6H
+blocks, or in ASTC blocks if T_p is ASTC. With `lod`, the base-2 logarithm of lightmap texels per pixel, light is
 
     mix(tiles, tail, clamp(lod - 1, 0, 1)),    the tail read at its own level lod - 2,
 
-which is continuous: up to 1, where a bilinear read still meets all texels, it is that of the tiles, from 2 on that of
-the tail. The tail takes 1.4% of the lightmap's bits.
+which is continuous: up to lod 1, where a bilinear read still reaches all texels, light comes from the tiles, and from
+lod 2 on from the tail. The tail takes 1.4% of the lightmap's bits.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ def make_tail(sheet: Sheet, codec: str, device: str = "cpu") -> np.ndarray:
 def tail_light(light: np.ndarray, mask: np.ndarray, device: str = "cpu") -> list[tuple[np.ndarray, np.ndarray]]:
     """Computes the levels of a tail before they are stored.
 
-    A texel is the mean of the texels of the mask that it covers; one that covers none takes the nearest.
+    A texel is the mean of the mask texels that it covers; a texel that covers none takes the nearest one.
 
     Args:
         light: [H, W, 3].
@@ -93,8 +93,8 @@ class Tail:
         """Reads light between two levels.
 
         Args:
-            uv: float32 [N, 2], the mesh's own.
-            lod: float32 [N], octaves of the lightmap; up to 2 reads the tail's first level.
+            uv: float32 [N, 2], the mesh's original UVs.
+            lod: float32 [N], mip level relative to the lightmap; values up to 2 read the tail's first level.
 
         Returns:
             float32 [N, 3].
@@ -104,7 +104,7 @@ class Tail:
         low = place.floor().long()
         light = torch.zeros((len(uv), 3), device=uv.device)
         for number, level in enumerate(self._levels):
-            # The level above or below has the rest of the weight.
+            # The adjacent level has the rest of the weight.
             weight = torch.where(low == number, 1.0 - (place - low), torch.where(low + 1 == number, place - low, 0.0))
             at = torch.nonzero(weight)[:, 0]
             if len(at):

@@ -8,9 +8,9 @@ from scipy import sparse
 
 from wlm.formats.exr import HALF_MAX
 
-# Rounds of conjugate gradients: 5 are within 0.1 dB of these, and three times as many gain nothing.
+# Conjugate gradient rounds: 5 are within 0.1 dB of this number, and three times as many gain nothing.
 _ROUNDS = 20
-# Regularisation towards the box filter's result: it decides texels that no chart reads, and hardly changes the others.
+# Regularisation towards the box filter's result: it determines texels that no chart reads, and hardly changes others.
 _PULL = 1e-4
 
 
@@ -18,7 +18,7 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
     """Finds the largest size of a given aspect ratio whose blocks are within a budget.
 
     Args:
-        height, width: The shape, and the largest size.
+        height, width: The shape, which is also the largest size.
         budget: Bits.
         block: Rows and columns of texels in a block, 1 and 1 for none.
         bits: Bits per texel; blocks count whole.
@@ -101,7 +101,7 @@ def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:
-    """The matrix [new, old] that reads `old` texels at the centres of `new` ones, clamped."""
+    """Makes the matrix [new, old] that reads `old` texels at the centres of `new` ones, clamped."""
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place).astype(np.int64)
     column = np.clip(np.stack([first, first + 1]), 0, old - 1)
@@ -111,7 +111,7 @@ def _bilinear(new: int, old: int) -> sparse.csr_matrix:
 
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
-    """The matrix [new, old] of means of `old` texels over the squares of `new` ones."""
+    """Makes the matrix [new, old] that averages `old` texels over the squares of `new` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     return _normalised(np.maximum(weight, 0.0))

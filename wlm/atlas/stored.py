@@ -1,7 +1,7 @@
-"""The triangles and masks that a model's file holds beside its textures.
+"""The triangles and masks that a model's file stores beside its textures.
 
-The file holds the whole glTF document of the input, as a `.glb`, so that a copy of it with new UVs keeps materials and
-everything else. `extras.wlm` of a node names the sheet that it reads, its rectangle and the UV set.
+The file contains the whole glTF document of the input, as a `.glb`, so that a copy of it with new UVs keeps materials
+and everything else. `extras.wlm` of a node names the sheet that it reads, its rectangle and the UV set.
 """
 
 import copy
@@ -54,11 +54,11 @@ def store(scene: LightmappedScene) -> StoredScene:
 
 
 def restore(model: AtlasModel) -> LightmappedScene:
-    """Makes the scene, without lightmaps, that a model was made of.
+    """Reconstructs the scene, without lightmaps, from which a model was made.
 
     Raises:
         WlmError: The document is damaged, or doesn't have the triangles of the model.
-        ValueError: The model holds no triangles.
+        ValueError: The model stores no triangles.
     """
     stored = model.stored
     if stored is None:
@@ -72,16 +72,16 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 
 def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
-    """Makes the mesh that an engine draws: the stored document and, where the model has new UVs, these as one more set.
+    """Makes the mesh for an engine: the stored document and, where the model has new UVs, an additional UV set.
 
-    Corners of one vertex that have the same new UV stay one vertex; the others become vertices of their own with the
-    same attributes.
+    Corners of one vertex that have the same new UV stay one vertex; the others become separate vertices with the same
+    attributes.
 
     Returns:
         The bytes of a `.glb` file, and n of the `TEXCOORD_n` under which the model is read.
 
     Raises:
-        WlmError: As `restore`.
+        WlmError: The document is damaged, as in `restore`.
     """
     if not len(model.uv):
         return model.stored.glb, model.stored.uv_set
@@ -89,7 +89,7 @@ def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
 
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
-    """Encodes a scene of one sheet with one more UV set, after the last that a primitive of it has.
+    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one.
 
     Args:
         scene: The scene.
@@ -110,7 +110,7 @@ def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int
     for part in sheet.parts:
         vertex = part.primitive.triangle.reshape(-1)
         uv = corner_uv[part.triangle : part.triangle + len(part.primitive.triangle)].reshape(-1, 2) + np.float32(0.0)
-        # Compared by their bits; adding 0 above made -0 into 0.
+        # UVs are compared by their bits; adding 0 above turned -0 into 0.
         key = np.stack([vertex.astype(np.uint32), *uv.view(np.uint32).T], axis=1)
         distinct, corner = np.unique(key, axis=0, return_inverse=True)
         new_uv = np.ascontiguousarray(distinct[:, 1:]).view(np.float32)

@@ -1,7 +1,7 @@
 """The surface point at each pixel of a view of a scene, and at each texel of a sheet.
 
-The cameras are those of `wlm.ops.views`, and viewers who stand in the scene, `wlm.ops.indoors`. Triangles that read no
-sheet, and those that aren't `active`, hide what is behind them, and their pixels count as uncovered.
+Cameras come from `wlm.ops.views` (around the scene) and `wlm.ops.indoors` (at eye height inside the scene). Triangles
+that read no sheet, and those that aren't `active`, hide what is behind them, and their pixels count as uncovered.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ class Points:
     Attributes:
         uv: float32 [N, 2], the UVs in the sheet.
         sheet: int32 [N], the sheet.
-        triangle: int64 [N], the triangle, by its number among all of the scene's.
+        triangle: int64 [N], the triangle's number in the whole scene.
         weight: float32 [N, 3], the weights of its corners.
     """
 
@@ -51,7 +51,7 @@ def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) ->
 def visible_uv(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Draws a scene from each camera.
+    """Renders a scene from each camera.
 
     Args:
         scene: The scene.
@@ -83,7 +83,7 @@ def visible_uv(
 def points_at(
     scene: LightmappedScene, visible: torch.Tensor, barycentric: torch.Tensor, uv: torch.Tensor
 ) -> tuple[torch.Tensor, Points]:
-    """The covered pixels of what `visible_uv` yields, bool [h, w], and their points, row by row."""
+    """Selects the covered pixels of a result of `visible_uv`, bool [h, w], and their points, row by row."""
     hit = visible >= 0
     triangle = visible[hit].long()
     sheet = torch.from_numpy(scene.triangles.sheet).to(visible.device)[triangle]
@@ -91,7 +91,7 @@ def points_at(
 
 
 def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
-    """The weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
+    """Computes the weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
     return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
@@ -118,7 +118,7 @@ def visibility(
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1, got {height} and {width}")
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
-    # Pixels without a triangle count as nothing, each in a cell of its own: choosing the others would wait for the GPU.
+    # Pixels without a triangle add 0, each to a separate cell: selecting the other pixels would wait for the GPU.
     own = torch.arange(resolution**2, device=count.device) % count.numel()
     for visible, _, uv in visible_uv(scene, views, resolution, device):
         u, v = uv.reshape(-1, 2).double().T
@@ -130,7 +130,7 @@ def visibility(
 
 
 def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Finds the active triangle that holds the centre of each cell of a grid over UV space.
+    """Finds the active triangle that contains the centre of each cell of a grid over UV space.
 
     Args:
         sheet: The sheet.

@@ -1,4 +1,4 @@
-"""Weights of a lightmap's error: how much each part of it counts, by visibility and by nearness to a seam."""
+"""Weights of a lightmap's error in each part of it, by visibility and distance to a seam."""
 
 from functools import cached_property
 
@@ -12,13 +12,13 @@ from wlm.atlas.model import Profile
 from wlm.atlas.views import scene_views, sheet_charts, texel_triangles, visibility
 
 RESOLUTION = 768
-"""Pixels along a side of a view that visibility is counted in."""
+"""Pixels along a side of the views in which visibility is counted."""
 
 _BORDER = 2  # cells of the fine grid: one texel
 # The relative error is the error over the light plus this share of the 99th percentile of the texels: darker light is
 # black on a screen that shows the brighter.
 _DARK, _BRIGHT = 0.05, 99.0
-_SAMPLES = 1 << 22  # texels of which the percentile is taken
+_SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
@@ -36,12 +36,12 @@ class FineGrid:
 
     @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The triangle that holds each cell's centre, and the weights of its corners, as `texel_triangles`."""
+        """The triangle at each cell's centre, and the weights of its corners, as in `texel_triangles`."""
         return texel_triangles(self.sheet, self.height, self.width, self.device)
 
     @cached_property
     def covered(self) -> torch.Tensor:
-        """bool [2 H, 2 W], whether a triangle holds the centre, exactly."""
+        """bool [2 H, 2 W], whether a triangle contains the cell's centre, computed exactly."""
         sheet = self.sheet
         return covered_on(sheet.uv, sheet.triangle[sheet.active], self.height, self.width, self.device) > 0
 
@@ -56,7 +56,7 @@ class FineGrid:
 
     @cached_property
     def texels(self) -> torch.Tensor:
-        """bool [2 H, 2 W], the quarters of the texels of the mask whose own centres a triangle holds."""
+        """bool [2 H, 2 W], the quarters of mask texels that have their centre in a triangle."""
         sheet = self.sheet
         inside = covered_on(sheet.uv, sheet.triangle[sheet.active], *sheet.mask.shape, self.device) > 0
         return _quarters(inside & torch.from_numpy(sheet.mask).to(self.device))
@@ -73,12 +73,12 @@ class FineGrid:
 
 
 def _quarters(texels: torch.Tensor) -> torch.Tensor:
-    """Each texel as four cells."""
+    """Repeats each texel as four cells."""
     return texels.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
 
 def _largest(values: torch.Tensor) -> torch.Tensor:
-    """The largest value within a texel of each cell."""
+    """Computes the largest value within a texel of each cell."""
     window = 2 * _BORDER + 1
     across = max_pool2d(values[None, None], (1, window), 1, (0, _BORDER))
     return max_pool2d(across, (window, 1), 1, (_BORDER, 0))[0, 0]
@@ -108,18 +108,18 @@ def spread(
     relative: float = 0.0,
     mean: float | None = None,
 ) -> torch.Tensor:
-    """Makes weights of counts of pixels: the counts, a little where there are none, and more at borders of charts.
+    """Turns pixel counts into weights: unseen cells get a small weight, and borders of charts a larger one.
 
     Args:
         grid: The grid.
         visible: float64 [2 H, 2 W] on its device, pixels that show each cell.
         unseen, border, relative: As in `Profile`.
-        mean: Mean count of a cell, of which unseen cells have a fraction; None: this sheet's.
+        mean: Mean count of a cell, which scales the weight of unseen cells; None: that of this sheet.
 
     Returns:
-        As `weights`.
+        The same array as from `weights`.
     """
-    # A texel is read at its centre too, and a small triangle may hold that centre but no quarter's.
+    # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it
         used = _quarters(torch.from_numpy(grid.sheet.mask).to(grid.device))

@@ -1,11 +1,12 @@
 """BC6H blocks, unsigned, of all fourteen modes: their layout, and an exact decoder.
 
-A block of 128 bits holds 4 x 4 texels of RGB half floats: one line in colour, or two and the number of the partition
-that says which texels are on which. From the lowest bit: the mode's number; the endpoints w and x of the first line, y
-and z of the second, their bits in an order of each mode's own; the partition's number; the indices. Most modes store x,
-y and z as differences to w. A line's anchor texel, the first of them texel 0, has an index of one bit less.
+A block of 128 bits stores 4 x 4 texels of RGB half floats: one line in colour space, or two lines and the number of the
+partition that assigns texels to them. From the lowest bit, a block contains the mode's number; the endpoints w and x of
+the first line, y and z of the second, in a bit order that depends on the mode; the partition's number; the indices.
+Most modes store x, y and z as differences to w. The index of a line's anchor texel (texel 0 for the first line) has one
+bit less.
 
-The format is that of Khronos' Data Format Specification 1.3, chapter 20.2 ("BC6H").
+Khronos' Data Format Specification 1.3, chapter 20.2 ("BC6H"), specifies the format.
 """
 
 import numpy as np
@@ -16,8 +17,9 @@ BLOCK_BYTES = 16
 SIDE = 4
 """Texels along a block."""
 
-# Of each mode, from the format's mode 1 to its mode 14: its number; bits of w; of the others' red, green and blue; and
-# the fields behind the number, from the lowest bit. "rw0-9" is bits 0 to 9 of w's red, "rw15-10" is bits 15 down to 10.
+# For each mode, from the format's mode 1 to mode 14: its number; bits of w; bits of the others' red, green and blue;
+# and the fields after the number, from the lowest bit. "rw0-9" is bits 0 to 9 of w's red, "rw15-10" is bits 15 down to
+# 10.
 _WX = "rw0-9 gw0-9 bw0-9"
 _MODES = (
     (0x00, 10, (5, 5, 5), f"gy4 by4 bz4 {_WX} rx0-4 gz4 gy0-3 gx0-4 bz0 gz0-3 bx0-4 bz1 by0-3 ry0-4 bz2 rz0-4 bz3"),
@@ -66,12 +68,12 @@ TWO_LINES = 10
 """Modes before this row of `MODES` have two lines."""
 
 PARTITION = 12
-"""The number of the field that holds the partition, in `LAYOUT`."""
+"""The number of the partition's field in `LAYOUT`."""
 _PARTITION_BITS = 5
 
 
 def _fields(text: str) -> list[int]:
-    """The code of `LAYOUT` of every bit that a mode's line names."""
+    """Computes the code in `LAYOUT` of every bit that a mode's line names."""
     codes = []
     for token in text.split():
         field = 4 * "rgb".index(token[0]) + "wxyz".index(token[1])
@@ -94,29 +96,29 @@ def _layout() -> np.ndarray:
 
 
 LAYOUT = _layout()
-"""int32 [14, 82]: by the row of `MODES`, what each bit of a block is: 16 times the number of the field, plus the bit of
-it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c (red, green, blue) of endpoint e (w, x,
-y, z)."""
+"""int32 [14, 82]: for each row of `MODES`, the meaning of each bit of a block: 16 times the number of the field, plus
+the bit in it; -1 for bits of the mode's number and of indices. Field 4 c + e is channel c (red, green, blue) of
+endpoint e (w, x, y, z)."""
 
 MODES = np.array(
     [[number, 2 if number < 2 else 5, number not in (0x03, 0x1E), bits, *others] for number, bits, others, _ in _MODES],
     np.int32,
 )
-"""int32 [14, 7]: the mode's number, bits of it, whether x, y and z are differences, bits of w, and bits of the others'
-red, green and blue."""
+"""int32 [14, 7]: the mode's number, its number of bits, whether x, y and z are differences, bits of w, and bits of the
+others' red, green and blue."""
 
 MASKS = np.array([sum((int(word) >> 2 * i & 1) << i for i in range(16)) for word in PARTITIONS[1, :32]], np.int32)
-"""int32 [32]: the texels on the second line of each partition, a bit each."""
+"""int32 [32]: the texels on the second line of each partition, one bit per texel."""
 
 SECOND_ANCHORS = np.ascontiguousarray(ANCHORS[1, :32, 0])
 """int32 [32]: the anchor texel of the second line."""
 
-_PIECE = 1 << 15  # blocks at once
+_PIECE = 1 << 15  # blocks decoded at once
 _RESERVED = -1
 
 
 def _rows() -> np.ndarray:
-    """By the lowest five bits of a block, the row of `MODES`; `_RESERVED` of four numbers."""
+    """Makes a table from the lowest five bits of a block to the row of `MODES`, or `_RESERVED` for four values."""
     rows = np.full(32, _RESERVED, np.int64)
     for row, (number, bits) in enumerate(MODES[:, :2]):
         rows[np.arange(number, 32, 1 << bits)] = row
@@ -127,7 +129,7 @@ _ROWS = _rows()
 
 
 def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
-    """Decodes unsigned BC6H, to the bit.
+    """Decodes unsigned BC6H, bit-exactly.
 
     Args:
         blocks: uint8 [B, 16].

@@ -1,9 +1,9 @@
-"""Rate-distortion optimisation of blocks of 4 x 4 texels: blocks repeated where that loses little.
+"""Rate-distortion optimisation of blocks of 4 x 4 texels: blocks are repeated where that adds little error.
 
-A block codec's bytes hardly compress, for no two blocks are alike. Here a block takes the bytes of one before it that
-fits its texels nearly as well: zstd or LZMA then stores a match in place of 16 bytes. The least of all errors within a
-window is taken, of equal ones the nearest, if it is not more than a given amount above the block's own. Memory and
-decoding stay as they are.
+A block codec's bytes hardly compress, since no two blocks are equal. Here a block is replaced by an earlier one that
+fits its texels nearly as well: zstd or LZMA then stores a match in place of 16 bytes. The block with the least error
+within a window is used (the nearest of equals) if its error exceeds that of the original by no more than a given
+amount. Memory and decoding are unchanged.
 """
 
 import numpy as np
@@ -20,13 +20,13 @@ def reuse_blocks(
 
     Args:
         data: Blocks of 16 bytes, row by row.
-        decoded: float32 [H, W, C], what they decode to; H and W multiples of 4.
-        target: float32 [H, W, C], what they should decode to.
-        weight: float32 [H, W, C], of each squared error.
-        allowed: float32 [H, W, C]; its sum over a block is what the block's weighted squared error may grow by.
+        decoded: float32 [H, W, C], the decoded blocks; H and W are multiples of 4.
+        target: float32 [H, W, C], the original texels.
+        weight: float32 [H, W, C], weight of each squared error.
+        allowed: float32 [H, W, C]; its sum over a block limits the increase of the block's weighted squared error.
 
     Returns:
-        As many blocks.
+        The same number of blocks.
     """
     blocks = np.frombuffer(data, np.uint8).reshape(-1, _BYTES)
     return reuse_in_order(blocks, *(by_block(image) for image in (decoded, target, weight, allowed))).tobytes()
@@ -40,12 +40,12 @@ def reuse_in_order(
     allowed: np.ndarray,
     window: int = _WINDOW,
 ) -> np.ndarray:
-    """Repeats blocks in the order in which a file holds them.
+    """Repeats blocks in the order in which a file stores them.
 
     Args:
         blocks: uint8 [n, 16].
-        decoded, target, weight, allowed: float32 [n, V], of a block's V values, as for `reuse_blocks`.
-        window: Blocks before each that are tried.
+        decoded, target, weight, allowed: float32 [n, V], for the V values of a block, as for `reuse_blocks`.
+        window: Number of preceding blocks that are tried.
 
     Returns:
         uint8 [n, 16].
@@ -62,7 +62,7 @@ def reuse_in_order(
 
 
 def by_block(image: np.ndarray) -> np.ndarray:
-    """float32 [blocks, values of a block] of an image [H, W, C]."""
+    """Cuts an image [H, W, C] into blocks, float32 [blocks, values of a block]."""
     height, width, channels = image.shape
     squares = image.reshape(height // _SIDE, _SIDE, width // _SIDE, _SIDE, channels).transpose(0, 2, 1, 3, 4)
     return squares.reshape(-1, _SIDE * _SIDE * channels).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Triangles that light is drawn on."""
+"""Triangles on which light is displayed."""
 
 import os
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.formats.meshes import SUFFIXES, read_mesh
 
-_ROOM = 0.25  # fraction of the bounding box that a room encloses at least
+_ROOM = 0.25  # smallest fraction of the bounding box that an interior encloses
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Geometry:
 
     @property
     def is_room(self) -> bool:
-        """Whether most triangles face the middle, as the walls of a room do.
+        """Whether the geometry is an interior: most triangles face the middle, like inward-facing walls.
 
         The enclosed volume (a sum of signed tetrahedra) is negative for triangles that face inwards.
         """
@@ -44,7 +44,7 @@ class Geometry:
         low, high = (corner.astype(np.float64) for corner in self.box)
         if not (high > low).all():
             return False
-        # In shares of the box, so that no size over- or underflows.
+        # Positions are normalised by the box, so that no size over- or underflows.
         a, b, c = ((self.position[self.triangle] - low) / (high - low) - 0.5).transpose(1, 0, 2)
         return float(np.einsum("fk,fk->", a, np.cross(b, c))) / 6.0 < -_ROOM
 

@@ -1,7 +1,7 @@
 """Meshes in formats other than glTF, read with trimesh: OBJ, PLY, STL and OFF.
 
-trimesh is given the bytes of the file alone, so that a material can't name another file. It accepts some damaged files
-without a word, so its result is checked: numbers are finite and triangles name vertices that exist. Polygons are cut
+trimesh gets only the bytes of the file, so that a material can't name another file. It accepts some damaged files
+silently, so its result is checked: numbers are finite and triangles name vertices that exist. Polygons are cut
 into triangles. Normals, colours and materials are left out. The v of these formats points up; here it points down, as
 in glTF.
 """
@@ -19,7 +19,7 @@ from wlm.formats.limits import MODEL_BYTES
 from wlm.formats.reading import read_file
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
-"""Endings of the names of files that are read here."""
+"""File name extensions that are read here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
             scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
             meshes = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh)]
         parts = [_checked(each) for each in meshes]
-    except Exception as error:  # trimesh's readers raise whatever NumPy does on damaged text
+    except Exception as error:  # trimesh's readers raise any NumPy error on damaged text
         raise WlmError(
             f"{path}: malformed {suffix[1:].upper()}: {one_line(error, 90) or type(error).__name__}"
         ) from error
@@ -77,7 +77,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
 
 
 def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Positions, UVs or None, and triangles of a mesh.
+    """Extracts and checks the positions, UVs or None, and triangles of a mesh.
 
     Raises:
         ValueError: A number is not finite, or a triangle names a vertex that is not there.

@@ -2,13 +2,13 @@
 (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
 C(u) = T_p(F(T_c(u))) (eq. 7): T_c gives a coordinate, the triangle wave F folds it into [0, 1], T_p gives the colour.
-Both textures are read bilinearly and clamped at their borders, see `wlm_kernels.raster.texture`. An empty T_c stands
-for none: C(u) = T_p(u).
+Both textures are read bilinearly and clamped at their borders, see `wlm_kernels.raster.texture`. An empty T_c means
+that there is none: C(u) = T_p(u).
 
-Two points of the paper had to be settled. Eq. 8 has a floor where an absolute value must be, and would be -2 or 0
-everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, two waves per
-point; acting on T_c's texels it would be eight, with the same result where they are in [0, 1], the range of unsigned
-16-bit numbers. F(x) = x there, so a decoder of a stored T_c computes no wave.
+Two points of the paper are corrected or made precise. Eq. 8 has a floor in place of an absolute value, and would be -2
+or 0 everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, two waves
+per point; acting on T_c's texels it would be eight, with the same result where they are in [0, 1], the range of
+unsigned 16-bit numbers. F(x) = x there, so a decoder of a stored T_c computes no wave.
 
 A point is a coordinate u. A NaN coordinate is an empty point: it reads NaN, its loss is 0, it has no gradient.
 Gradients of textures are added by atomics: on CUDA in any order, so that the last bits change from run to run.
@@ -23,14 +23,14 @@ from wlm_kernels.raster.texture import Axis, add, axis_at, codes, read, read_slo
 wp.set_module_options({"enable_backward": False})
 
 _LINEAR, _CLAMP = (wp.constant(code) for code in codes("linear", "clamp"))
-# A mirrored texture is one that is clamped after the wave.
+# A mirrored texture read is the triangle wave followed by a clamped read.
 _WAVE = wp.constant(codes("linear", "mirror")[1])
 _CHANNELS = wp.constant(3)
 
 
 @wp.struct
 class _Place:
-    """Texels of T_c, if there is one, and of T_p that a coordinate reads."""
+    """The texels of T_c (if any) and T_p that a coordinate reads."""
 
     lut_x: Axis
     lut_y: Axis
@@ -137,7 +137,7 @@ def _surface_points(
     count = triangle.shape[0] // 2
     state = wp.rand_init(seed + step[0], i)
     last = area.shape[0] - 1
-    # In (0, 1], so that a triangle without area is never drawn.
+    # The number lies in (0, 1], so that a triangle without area is never drawn.
     share = (wp.float64(i + 1) - wp.float64(wp.randf(state))) / wp.float64(count)
     t = wp.min(wp.lower_bound(area, share * area[last]), last)
     b = wp.vec2(wp.randf(state), wp.randf(state))
@@ -169,7 +169,7 @@ def _or_zero(x: float) -> float:
 
 @wp.func
 def _sign(x: float) -> float:
-    """The sign, 0 at 0 where L1 has no slope; `wp.sign` is 1 there."""
+    """Returns the sign, 0 at 0 where L1 has no slope; `wp.sign` is 1 there."""
     return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
 
 
@@ -275,8 +275,8 @@ def surface_points(area, corner, distance: float, seed: int, step, triangle, bar
     Args:
         area: float64 [F], cumulative areas of the triangles; the last is above 0.
         corner: vec2 [F, 3], coordinates of the corners, of any area.
-        distance: Between the two points, in units of the coordinates. Where the triangle has no room for that in the
-            direction drawn, the points are equal.
+        distance: Distance between the two points, in units of the coordinates. Where the triangle ends before that in
+            the direction drawn, the points are equal.
         seed: Seed of the draw, together with the step.
         step: int [1], on the device.
         triangle: int [2 N], written: the first points, then the second.
@@ -294,7 +294,8 @@ def image_loss(difference, weight: float, grad) -> None:
     neighbours p and q, horizontal and vertical.
 
     Args:
-        difference: float [H, W, 3], d, the image less the reference; NaN where neither shows the mesh, which is 0.
+        difference: float [H, W, 3], d, the image minus the reference; NaN, which counts as 0, where neither shows the
+            mesh.
         weight: Weight of the second sum.
         grad: float [H, W, 3], written; 0 where d is NaN.
     """

@@ -1,12 +1,12 @@
 """Reads lightmaps from tiles: one entry of a lookup texture, then bilinear reads of a small texture.
 
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
-entry names the rectangle of the texture that holds it, or of a second texture, made of blocks. The rectangle's
+entry names its rectangle in the texture or in a second texture, which consists of blocks. The rectangle's
 outermost samples lie on the tile's borders. `decode` reads the tiles of one lightmap; `decode_shared` reads tiles that
 many sheets and states share, where light is a sum of components, rectangles beside each other, times the state's
 factors.
 
-Read `wlm/atlas/exact.py` first: the same in float64 NumPy.
+Read `wlm/atlas/exact.py` first: it is the same in float64 NumPy.
 """
 
 import warp as wp
@@ -33,7 +33,7 @@ class Axis:
 
 @wp.func
 def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """The number of the tile that holds a coordinate, and the place in it from 0 to 1; for NaN, tile 0 and NaN."""
+    """Returns the tile that contains a coordinate, and the place in it from 0 to 1; tile 0 and NaN for NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
@@ -43,7 +43,7 @@ def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 @wp.func
 def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """The two texels between which a place in a tile lies."""
+    """Returns the two texels between which a place in a tile lies."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
     if last >= first_block_code:
@@ -114,7 +114,7 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
 
 @wp.func
 def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
-    """Bilinear read of the rectangle that begins some columns to the right."""
+    """Reads bilinearly from the rectangle that begins some columns to the right."""
     left = right + x.low
     next = right + x.high
     top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
@@ -124,7 +124,7 @@ def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y:
 
 @wp.func
 def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """`axis_at` for a component of one block."""
+    """Computes `axis_at` for a component of one block."""
     return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
 
 
@@ -166,7 +166,7 @@ def _decode_shared(
         last = int(lut[row, column, 3])
     page = last >> (_COUNT_BITS + _COARSE_BITS)
     coarse = (last >> _COUNT_BITS) & _COARSE_MASK
-    # NaN where there is no place.
+    # The result is NaN where the coordinate is NaN.
     total = wp.vec3(0.0, 0.0, 0.0) * (across[1] + down[1])
     count = last & _COUNT_MASK
     if count > 0:
@@ -207,7 +207,7 @@ def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, fir
         factor: vec3 [C], a constant of each mixture and then one factor of each component.
         lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
             - 1; number of its mixture's constant; page << 12 | number of coarse components << 8 | number of components.
-            Or the first two numbers alone, [ty, tx, 2]: one component and one page.
+            With one component and one page only the first two numbers exist, [ty, tx, 2].
         texels: vec3h [pages, Hp, Wp]; the components of a tile follow each other along a row.
         blocks: vec3h [pages, Hb, Wb], the second texture, in blocks of 4 x 4 texels.
         first_block_code: As for `decode`; 16: no entry names the second texture.

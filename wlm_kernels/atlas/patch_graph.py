@@ -1,10 +1,11 @@
 """The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2).
 
-Few pairs need all their samples compared. Bounds of the distance from below and from above (`Bounds`) settle most;
+Few pairs need all their samples compared. Lower and upper bounds of the distance (`Bounds`) decide most;
 they are in float32, with a margin larger than its rounding, and so never change a result. Patches are sorted by their
-mean level, which differs by less than lambda where two are alike: those beyond aren't looked at.
+mean level, which differs by less than lambda where two are alike: patches farther apart are not compared.
 
-Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): the same with the whole matrix.
+Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): they compute the same with the whole
+matrix.
 """
 
 import math
@@ -25,7 +26,7 @@ from wlm_kernels.atlas.patches import (
     turned,
 )
 
-# More than the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
+# The margin exceeds the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)
 
 
@@ -134,14 +135,14 @@ def _row_differences(a: wp.mat33, b: wp.mat33) -> wp.mat33:
 
 @wp.func
 def _along(m: wp.mat33, order: int) -> float:
-    """The sum of m[p[k], k]."""
+    """Computes the sum of m[p[k], k]."""
     p = turned(wp.vec3i(0, 1, 2), order)
     return m[p[0], 0] + m[p[1], 1] + m[p[2], 2]
 
 
 @wp.func
 def _near(rule: Rule, a: int, b: int) -> bool:
-    """Whether two dominant colours are within lambda_h of each other."""
+    """Tests whether two dominant colours are within lambda_h of each other."""
     r = channel(a, 0) - channel(b, 0)
     g = channel(a, 1) - channel(b, 1)
     b_ = channel(a, 2) - channel(b, 2)
@@ -152,7 +153,7 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 def _alike(
     samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
 ) -> int:
-    """Whether Dist is below lambda in any order (eq. 3 and 4): odd if it is, above 1 if samples had to be compared."""
+    """Tests if Dist is below lambda in any order (eq. 3, 4): odd if it is, above 1 if samples had to be compared."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
@@ -197,7 +198,7 @@ def _alike(
     if a.level == b.level:
         limit = rule.same[level]
     for i in range(6):
-        # The likeliest first: if it is alike the others need no comparison.
+        # The likeliest order comes first: if the patches are alike in it, the others need no comparison.
         order = (first + i) % 6
         if ((undecided >> order) & 1) == 1:
             if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
@@ -308,14 +309,14 @@ def _join(
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """Makes the thresholds, exact as the decimal fractions that they print as.
+    """Makes the thresholds, with settings interpreted as the exact decimal fractions that they print as.
 
     Args:
         threshold: lambda (eq. 4); Dist must be less.
         colour_threshold: lambda_h (section 3.2.1), the largest distance of two dominant colours.
         device: Where the arrays go.
     """
-    total = Fraction(str(threshold)) * 765  # of three channels of 255 levels
+    total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
     out.level = float(total)
@@ -331,7 +332,7 @@ def bounds(samples, patches, levels: int):
     """Computes `Bounds` [F, levels] of patches.
 
     Args:
-        samples, patches: As of `sample`.
+        samples, patches: Results of `sample`.
         levels: One more than the highest level of a patch.
     """
     out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
@@ -348,8 +349,8 @@ class Graph:
         patches: Patch [M], by rising `low`.
         bounds: Bounds [M, levels].
         rule: Rule.
-        low, high: float [M], least and largest mean level on any lattice; of two that are alike on any lattice the
-            means differ by less than lambda.
+        low, high: float [M], least and largest mean level on any lattice; the means of two patches that are alike on
+            any lattice differ by less than lambda.
         means: float32 [M], `low` on the host.
         reach: The largest difference of the two in any patch.
     """
@@ -384,7 +385,7 @@ def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
-    """The graph of some of its nodes, int [N], ascending."""
+    """Makes the subgraph of some nodes, int [N], ascending."""
     spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
     taken = _taken(whole.patches, whole.bounds, nodes)
     return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
@@ -418,10 +419,10 @@ def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joine
     Args:
         graph: The graph.
         nodes: int [N].
-        begin, end: The range of them.
+        begin, end: The range of nodes to process.
         heads: int [H], nodes, ascending.
         head_low: float [H], their `low`.
-        rank: int [H], the order in which they are asked.
+        rank: int [H], the order in which heads are compared.
         joined: int [N], written in the range: the rank of the head, H for none.
     """
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]

@@ -1,6 +1,6 @@
-"""Feature patches of triangles and whether two are alike (lightmap-uv-clustering-cascade, section 3.1, eq. 1 to 4).
+"""Feature patches of triangles and their similarity (lightmap-uv-clustering-cascade, section 3.1, eq. 1 to 4).
 
-A patch of size n holds a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at
+A patch of size n stores a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at
 the barycentrics (i, j, k) / (n - 1), and is stored at `j n - j (j - 1) / 2 + i`. On this lattice another order of the
 vertices is another order of (i, j, k), so one stored patch serves all six. Order o is the permutation p =
 `ORDERS[o]`: vertex k of a triangle goes to vertex p[k] of the other.
@@ -13,13 +13,13 @@ depends on the device:
 
 - The lightmap has 16 bits per channel, vertices are in 1/65536 of a texel, and a sample's place is rounded to 1/256 of
   a texel, as texture filters of GPUs do.
-- Dist (eq. 2) is summed exactly. Of two patches of different sizes the smaller is interpolated linearly in the
+- Dist (eq. 2) is summed exactly. If two patches differ in size the smaller is interpolated linearly in the
   triangles of its own lattice, in multiples of 1 / (n - 1) of a level. That favours no vertex; with square cells the
   result would change with the order.
 
 The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].
 
-Read `tests/reference/patches.py` first: the same per triangle in float64 NumPy.
+Read `tests/reference/patches.py` first: it is the same per triangle in float64 NumPy.
 """
 
 import itertools
@@ -40,7 +40,7 @@ _LEVELS = wp.constant(255)
 _BIN_SHIFT = wp.constant(3)  # 256 levels in 32 bins
 _BEYOND = wp.constant(BINS**3)
 
-# Divisor from 16 bits, under weights that add up to 256 * 256, to 8 bits.
+# This divisor converts 16 bits, weighted with a sum of 256 * 256, to 8 bits.
 _TO_BYTE = wp.constant(wp.int64(65536 * 257))
 _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 
@@ -65,7 +65,7 @@ class Patch:
 
 
 def samples_of(size):
-    """Number of samples of a patch of size n, n (n + 1) / 2."""
+    """Returns the number of samples of a patch of size n, n (n + 1) / 2."""
     return size * (size + 1) // 2
 
 
@@ -86,7 +86,7 @@ def channel(colour: int, c: int) -> int:
 
 @wp.func
 def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
-    """A sample's place along an axis of `side` texels, in 1/256 of a texel, clamped to the outermost centres."""
+    """Computes a sample's place along an axis of `side` texels, in 1/256 texel, clamped to the outermost centres."""
     steps = wp.int64(i + j + k)
     last = wp.int64(side - 1) * wp.int64(65536) * steps
     at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
@@ -151,7 +151,7 @@ def _sample(
 
 @wp.func
 def _bin(colour: int) -> int:
-    """Number of a colour's bin, red in the highest bits."""
+    """Returns the number of a colour's bin, with red in the highest bits."""
     r = channel(colour, 0) >> _BIN_SHIFT
     g = channel(colour, 1) >> _BIN_SHIFT
     b = channel(colour, 2) >> _BIN_SHIFT
@@ -172,7 +172,7 @@ def _dominant(
     stop = p.start + size * (size + 1) // 2
     best = int(0)
     most = int(0)
-    key = int(-1)  # before the first
+    key = int(-1)  # below the first bin
     while key < _BEYOND:
         after = int(_BEYOND)
         count = int(0)
@@ -201,7 +201,7 @@ def _difference(a: int, b: int) -> int:
 
 @wp.func
 def turned(w: wp.vec3i, order: int) -> wp.vec3i:
-    """(w[p[0]], w[p[1]], w[p[2]]) for the permutation p of an order."""
+    """Returns (w[p[0]], w[p[1]], w[p[2]]) for the permutation p of an order."""
     if order == 0:
         return w
     if order == 1:
@@ -217,7 +217,7 @@ def turned(w: wp.vec3i, order: int) -> wp.vec3i:
 
 @wp.func
 def _inverse(order: int) -> int:
-    """The inverse permutation; only the two rotations, orders 3 and 4, aren't their own."""
+    """Returns the inverse permutation; all orders except the two rotations, 3 and 4, are self-inverse."""
     if order == 3:
         return 4
     if order == 4:
@@ -227,7 +227,7 @@ def _inverse(order: int) -> int:
 
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
-    """`2 ** level` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
+    """Computes `2 ** level` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
     # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
@@ -249,7 +249,7 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
     wb = ry
     wc = rx
     if rest > mask + 1:
-        # In an inverted one they have all but z, all but x or all but y one step higher.
+        # In an inverted one all coordinates except z, except x or except y are one step higher.
         a = samples[small.start + _index(size, x + 1, y + 1)]
         wa = mask + 1 - rz
         wb = mask + 1 - rx
@@ -263,7 +263,7 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
 
 @wp.func
 def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
-    """Sum of differences, vertex k of the small patch on vertex p[k] of the large one; stops past the limit."""
+    """Sums differences with vertex k of the small patch on vertex p[k] of the large one; stops above the limit."""
     steps = 1 << large.level
     size = steps + 1
     at = large.start
@@ -337,7 +337,7 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
         colours; and uint8 [F], 1 where a patch reads a texel that is too bright.
 
     Raises:
-        ValueError: More samples than 32 bits count.
+        ValueError: There are more samples than 32 bits can count.
     """
     start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:
@@ -356,10 +356,11 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 
 
 def dominant(samples, patches) -> None:
-    """Finds the dominant colours, the commonest of 32 x 32 x 32 bins and the lowest of equals (section 3.2.1).
+    """Finds the dominant colours, the most frequent of 32 x 32 x 32 bins, and the lowest of equally frequent ones
+    (section 3.2.1).
 
     Args:
-        samples, patches: As of `sample`; the latter's `colour` is written.
+        samples, patches: Results of `sample`; the latter's `colour` is written.
     """
     wp.launch(_dominant, patches.shape, inputs=[samples], outputs=[patches], device=samples.device)
 
@@ -368,11 +369,11 @@ def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.nd
     """Finds the order with the least distance of each pair, the first of equals, and that distance (eq. 2 and 3).
 
     Args:
-        samples, patches: As of `sample`.
+        samples, patches: Results of `sample`.
         member, representative: int [N], numbers of patches.
 
     Returns:
-        int8 [N], o such that vertex k of the member goes to vertex `ORDERS[o][k]` of the representative; and
+        int8 [N], o such that vertex k of the member maps to vertex `ORDERS[o][k]` of the representative; and
         float64 [N], Dist, in [0, 1].
     """
     device, count = samples.device, member.shape[0]

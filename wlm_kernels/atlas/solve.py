@@ -1,9 +1,9 @@
-"""Samples of tiles by weighted least squares: a thread for each tile, or for each channel of one.
+"""Samples of tiles by weighted least squares: one thread per tile, or per channel of a tile.
 
-A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample with its eight
-neighbours alone, so that they are gathered from the points once, and a round of conjugate gradients is over samples.
+A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample only with its
+eight neighbours, so they are gathered from the points once, and conjugate gradients then iterate over samples.
 
-Arrays may have any strides: on CUDA those along the tiles should be 1.
+Arrays may have any strides; on CUDA the stride along the tiles should be 1.
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 MOST = 16  # samples along an axis
-_BLOCK = 64  # threads: few tiles should reach all of a GPU
+_BLOCK = 64  # threads: small blocks let few tiles occupy a whole GPU
 
 _Row = wp.types.vector(length=MOST, dtype=float)
 _TINY = wp.constant(1e-30)
@@ -22,10 +22,10 @@ class Grid:
     """Samples and points of a tile.
 
     Attributes:
-        points: m.
-        nx, ny: Samples, `MOST` at most.
-        first_x, first_y: [m], the sample before each point; 0 where there is one alone.
-        share_x, share_y: [m], the share of the next sample; 0 where there is one alone.
+        points: m, points along an axis.
+        nx, ny: Samples along x and y, at most `MOST`.
+        first_x, first_y: [m], the sample before each point; 0 if there is only one sample.
+        share_x, share_y: [m], the weight of the next sample; 0 if there is only one sample.
     """
 
     points: int
@@ -42,10 +42,10 @@ class System:
     """The normal equations of T tiles; S = nx * ny, row by row.
 
     Attributes:
-        own: [T, S], of a sample with itself.
-        right, down: [T, S], with the next one along x and y; 0 beyond the last.
-        cross: [T, S], with the one right of that below, and of the next one with that below.
-        diagonal: [T, S], how much the points weigh in which a sample has a share, times that: the sum of a row.
+        own: [T, S], coefficient of a sample with itself.
+        right, down: [T, S], coefficients with the next sample along x and y; 0 beyond the last.
+        cross: [T, S], coefficient with the sample to the lower right, equal to that of the right with the lower one.
+        diagonal: [T, S], sum of a row: the points' weights times the sample's interpolation weights.
     """
 
     own: wp.array2d[float]
@@ -142,8 +142,8 @@ def _solve(
 ):
     t, channel = wp.tid()
     count = grid.nx * grid.ny
-    # What the start leaves, taken back to the samples; the points' own values are subtracted, since sums of large ones
-    # would lose it.
+    # The residual of the start is transposed to the samples; differences are formed at the points, since
+    # differences of large sums would lose precision.
     for s in range(count):
         residual[t, channel, s] = 0.0
         out[t, channel, s] = start[t, channel, s]
@@ -167,7 +167,7 @@ def _solve(
         for j in range(grid.nx):
             residual[t, channel, i + j] += (1.0 - share) * sums[j]
             residual[t, channel, below + j] += share * sums[j]
-    # In terms of the difference to the start, towards which the ridge pulls.
+    # The unknown is the difference to the start, towards which the ridge term regularises.
     energy = float(0.0)
     for s in range(count):
         value = residual[t, channel, s]
@@ -246,16 +246,16 @@ def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System)
     """Gathers the normal equations.
 
     Args:
-        weight: float [T, m * m], of the points' squared errors.
-        scale: float [T], that a tile's weights are multiplied by.
+        weight: float [T, m * m], weights of the points' squared errors.
+        scale: float [T], factor of each tile's weights.
         grid: The samples.
-        system: Written.
+        system: The equations, written.
     """
     wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
 
 
 def gather(light: wp.array, grid: Grid, out: wp.array) -> None:
-    """Takes light at the points [T, 3, m * m] back to the samples [T, 3, S], by the transpose of interpolation."""
+    """Applies the transpose of interpolation: light at points [T, 3, m * m] to samples [T, 3, S]."""
     wp.launch(_gather, light.shape[:2], inputs=[light, grid, out], device=light.device, block_dim=_BLOCK)
 
 
@@ -271,21 +271,21 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the equations from a start, to which a ridge pulls.
+    """Solves the equations from a start, with ridge regularisation towards it.
 
     Args:
-        light, weight, scale, grid, system: As above.
-        ridge: Added to a sample's own weight.
-        rounds: Of conjugate gradients.
+        light, weight, scale, grid, system: Arguments and result of `gather` and `gather_system`.
+        ridge: Number added to the diagonal of the equations.
+        rounds: Rounds of conjugate gradients.
         start: float [T, 3, S].
-        work: Three arrays as `start`.
-        out: As `start`, written.
+        work: Three work arrays of the shape of `start`.
+        out: float [T, 3, S], written.
     """
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
 
 
 def errors(light: wp.array, weight: wp.array, grid: Grid, samples: wp.array, out: wp.array) -> None:
-    """Weighted squared errors of samples [T, 3, S], float64 [T, 3]."""
+    """Computes the weighted squared errors of samples [T, 3, S], float64 [T, 3], written."""
     inputs = [light, weight, grid, samples, out]
     wp.launch(_errors, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)

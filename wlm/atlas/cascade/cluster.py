@@ -5,18 +5,19 @@ lambda in one of the six orders of the vertices. The node with most edges (the l
 group: itself and its neighbours. The group is removed and the edges of the rest are counted again, until no edge is
 left (eq. 6).
 
-That is quadratic. Of more than `SAMPLE` triangles groups are formed among that many at random, all others join the
-first representative that they are like, and so on with those that are left: the time grows with the triangles and the
-groups, each triangle is like its representative, and no two representatives are alike, as before. On 41,472 triangles
-of a synthetic lightmap there are 1.6% more groups, in a sixth of the time; 991,232 triangles take 8 s on one core.
+That is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of that size, all others
+join the first representative that they are like, and the same is repeated with the rest. The time is proportional to
+triangles times groups, each triangle is still like its representative, and no two representatives are alike. On 41,472
+triangles of a synthetic lightmap there are 1.6% more groups, in a sixth of the time; 991,232 triangles take 8 s on one
+core.
 
 Edges are stored within a sample alone, so that memory grows with the triangles and the texels that they cover: at most
 `samples_of(largest)` words per triangle.
 
-Where the paper is silent or we differ:
+The following points are not specified by the paper or differ from it:
 
-- The sizes of patches are 2 ** k + 1, the next that is at least R_s (eq. 1), and at most `largest`.
-- R_s takes lengths in texels, which is right where the lightmap isn't square too.
+- The sizes of patches are 2 ** k + 1, the smallest one not below R_s (eq. 1), and at most `largest`.
+- R_s uses lengths in texels, which is also right where the lightmap isn't square.
 - A triangle is excluded if its patch reads a texel above `max_radiance` in any channel; one at exactly that isn't.
   The samples of a triangle larger than `largest` lie more than a texel apart, and texels between them are not read.
 - Colours are fractions of `max_radiance`, and so are lambda and lambda_h: a dark map needs a lower maximum.
@@ -54,7 +55,7 @@ _FARTHEST = 65536.0
 SAMPLE = 8192
 """Triangles among which groups are formed at once."""
 
-_PAIRS_AT_ONCE = 1 << 24  # between two looks at the clock
+_PAIRS_AT_ONCE = 1 << 24  # pairs between two progress reports
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,9 @@ class Stats:
     """Figures of the graph.
 
     Attributes:
-        compared: Pairs whose samples had to be compared, bounds having settled the others; rounding may make it differ
-            from device to device.
-        edges: Pairs that are alike; of more than `SAMPLE` triangles both are of pairs within samples.
+        compared: Pairs whose samples had to be compared, since bounds did not decide; rounding may make the number
+            differ between devices.
+        edges: Pairs that are alike; with more than `SAMPLE` triangles both numbers count only pairs within samples.
     """
 
     compared: int
@@ -80,9 +81,9 @@ class Clusters:
             were formed, then single triangles, by number.
         representative: int32 [G], a triangle of each group.
         order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]` of
-            `wlm_kernels.atlas.patches`. Of orders that fit equally well the first; 0 for representatives.
+            `wlm_kernels.atlas.patches`. The first of equally good orders; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
-        excluded: bool [F], too bright or not active: each is a group of its own.
+        excluded: bool [F], too bright or not active: each is a separate group.
         stats: Figures of the graph.
     """
 
@@ -121,7 +122,7 @@ def cluster(
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
-            "cluster" while groups are formed; of more than `SAMPLE` triangles in turns.
+            "cluster" while groups are formed; with more than `SAMPLE` triangles these alternate.
 
     Returns:
         The groups.
@@ -187,7 +188,7 @@ def _check(uv, triangle, lightmap, threshold, colour_threshold, max_radiance, la
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """The lightmap as the kernels take it: 16 bits per channel, and 1 in the fourth where it is too bright."""
+    """Converts the lightmap for the kernels: 16 bits per channel, and 1 in the fourth where it is too bright."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
     fraction = lightmap.astype(np.float64) / max_radiance
     texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
@@ -196,13 +197,13 @@ def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
 
 
 def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The vertices in 1/65536 of a texel from the first texel's centre, int64 [F, 3, 2]."""
+    """Converts vertices to 1/65536 of a texel from the first texel's centre, int64 [F, 3, 2]."""
     place = (uv * [shape[1], shape[0]] - 0.5) * 65536.0
     return np.rint(place).astype(np.int64)[triangle.astype(np.int64)]
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Each patch's size as a level, int32 [F]: R_s (eq. 1), or the next larger of `SIZES`, at most `largest`."""
+    """Computes each patch's level, int32 [F]: size R_s (eq. 1) or the next larger of `SIZES`, at most `largest`."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
@@ -215,12 +216,12 @@ def _groups(
 
     Args:
         graph: The graph, of M nodes.
-        number: int [M], the triangle of each node, which settles ties.
+        number: int [M], the triangle of each node, which breaks ties.
         progress: As for `cluster`.
 
     Returns:
-        The node that represents each group and the nodes of the group, those of one left out, in the order in which
-        they were formed; and figures of the graph.
+        The representative node and the nodes of each group with several nodes, in the order in which the groups were
+        formed; and figures of the graph.
     """
     count, compared, edges = len(number), 0, 0
     left = np.arange(count)
@@ -237,7 +238,7 @@ def _groups(
             groups += formed
             clustering.report(count)
             return groups, Stats(compared, edges)
-        # Those that are like no other of the sample may be like one outside of it.
+        # Nodes that are like no other in the sample may be like one outside it.
         alone = np.setdiff1d(sample, np.concatenate([np.empty(0, np.int64), *(members for _, members in formed)]))
         heads = np.concatenate([np.array([node for node, _ in formed], np.int64), alone])
         rest = np.setdiff1d(left, sample, assume_unique=True)
@@ -253,7 +254,7 @@ def _groups(
 
 
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
-    """The first of the heads that each node is like, int [N]; their number where there is none."""
+    """Finds the first head that each node is like, int [N]; the number of heads where there is none."""
     device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
@@ -272,7 +273,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> tuple[np.ndarray, Stats]:
-    """The edges, uint8 [M, M]; `done` triangles are in groups already."""
+    """Computes the edges, uint8 [M, M]; `done` triangles are already grouped."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     compared = wp.zeros(count, dtype=wp.int64, device=device)
@@ -292,14 +293,14 @@ def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndar
 
     Args:
         edge: uint8 [M, M], 1 where two nodes are alike.
-        number: int [M], the triangle of each node, which settles ties.
+        number: int [M], the triangle of each node, which breaks ties.
 
     Yields:
         The node that represents a group, and the nodes of the group; groups of one are left out.
     """
     degree = edge.sum(1, dtype=np.int64)
     remains = np.ones(len(number), bool)
-    # Of equals the lowest number is first.
+    # Among equals the lowest number comes first.
     order = np.argsort(number, kind="stable")
     while len(order) and degree[node := order[degree[order].argmax()]] > 0:
         members = np.flatnonzero(remains & (edge[node] != 0))

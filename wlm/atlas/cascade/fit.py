@@ -6,18 +6,18 @@ T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coo
 
     space "views"   A step draws the mesh from one random camera of `views`, once with the old UVs and the lightmap,
                     its gaps filled, and once with the new UVs and the cascade. The loss is the L1 of the colours plus
-                    `gradient` times the L1 of the images' gradients. The paper's.
+                    `gradient` times the L1 of the images' gradients. This is the paper's choice.
     space "uv"      A step draws random points on the mesh, uniform over its area, as many as a quarter of a view's
                     pixels, in pairs one texel of the lightmap apart on one triangle. The loss is the same, with the
                     difference within a pair in place of an image's gradient. Places that no camera sees count too;
-                    seams don't, since a pair doesn't cross one. Ours.
+                    seams don't, since a pair doesn't cross one. This is our alternative.
 
-Where the paper is silent: the loss is a sum and not a mean, which changes Adam's steps by its epsilon alone; radiance,
-and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned more coarsely than
-a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range of its 16 bits,
-where F is the identity. The paper's rates are constant; `Profile.final_rate` lets rates decay, so that less noise of
-the last steps is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to 1.3 dB better than the
-best constant rates, with 300 steps as with 2,000.
+The paper leaves some points open. Here the loss is a sum and not a mean, which changes Adam's steps by its epsilon
+alone; radiance, and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned
+more coarsely than a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range
+of its 16 bits, where F is the identity. The paper's rates are constant; `Profile.final_rate` lets rates decay, so that
+less noise of the last steps is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to 1.3 dB better
+than the best constant rates, with 300 steps as with 2,000.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
@@ -50,7 +50,7 @@ from wlm_kernels.atlas.patches import ORDERS
 from wlm_kernels.raster import texture as texture_kernels
 from wlm_kernels.raster.rasterize import Rasterizer
 
-_CHUNK = {"cpu": 5, "cuda": 100}  # steps between two looks at the clock
+_CHUNK = {"cpu": 5, "cuda": 100}  # steps between two progress reports
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # state of Adam
 _PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show the mesh
 
@@ -77,11 +77,11 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
         stages: Reports and times the stage.
 
     Returns:
-        The groups; None if the threshold is 0: no triangle shares.
+        The groups; None if the threshold is 0, where no triangle shares texels.
     """
     if profile.threshold == 0:
         return None
-    # Any number will do for a black lightmap, whose triangles are all alike.
+    # A black lightmap may use any number, since its triangles are all alike.
     brightest = float(sheet.lightmap[sheet.mask].max()) or 1.0
     with stages("cluster"):
         if (
@@ -130,11 +130,11 @@ def fit_cascade(
         A model of method "cascade", or "plain" where `lut_scale` is 0: T_p alone, under the same UVs.
 
     Raises:
-        WlmError: As `pack` and `tune`; or a package for the blocks of T_p is missing.
+        WlmError: An error of `pack` or `tune`, or a package for the blocks of T_p is missing.
     """
     (sheet,), facts = scene.sheets, {}
     count = len(sheet.triangle)
-    # UVs are tuned at the places that the file holds.
+    # The cascade is tuned with UVs rounded as in the file.
     if repack:
         with stages("pack"):
             packed = pack(sheet, clusters, profile.scale)
@@ -203,7 +203,7 @@ def tune(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
-    """Tunes a cascade to show the mesh as its lightmap does.
+    """Tunes a cascade so that the mesh looks as with its lightmap.
 
     Args:
         sheet: The triangles and their lightmap.
@@ -357,7 +357,7 @@ class _Step:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Goes back to a `state`.
+        """Restores a `state`.
 
         Raises:
             ValueError: The state belongs to another fit; nothing has changed.
@@ -378,7 +378,7 @@ class _Step:
                 moments = self._adam.state[parameter]
                 moments["step"] = values[f"{name}.step"].to(parameter.device)
                 for key in _MOMENTS[1:]:
-                    # In the parameter's memory layout, which the fused step expects of both.
+                    # Both use the parameter's memory layout, which the fused step expects.
                     moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
 
     @property
@@ -410,7 +410,7 @@ class _Views:
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
-        # Written out, as in `wlm.ops.views`: vertices at one place must stay at one place.
+        # The product is written out, as in `wlm.ops.views`, so that coinciding vertices stay coinciding.
         x, y, back = (sum(self._position[:, k] * axes[i, k] for k in range(3)) for i in range(3))
         w = DISTANCE - back
         # z / w only has to increase with the distance.

@@ -5,9 +5,9 @@ share an edge under the old UVs stay together in one chart. A chart moves rigidl
 stretched and never mirrored, and all charts are scaled by one epsilon, in texels. `uvunwrap` packs them in float32;
 each chart's rigid motion is fitted to its result by least squares and then applied exactly.
 
-Where the paper is silent: charts have two texels between them (one around each), so that a bilinear read in one
-never meets a texel of another; a triangle that is too thin for the packer gets a place of its own, half a texel high.
-The atlas is as large as its charts need, W_r x H_r of eq. 9, be that less or more than epsilon W x epsilon H.
+The paper leaves two points open. Here charts have two texels between them (one around each), so that a bilinear read in
+one never reads another's texel, and a triangle that is too thin for the packer gets a separate place, half a texel
+high. The atlas is as large as its charts need, W_r x H_r of eq. 9, be that less or more than epsilon W x epsilon H.
 
 The stated behaviours:
 
@@ -40,8 +40,8 @@ _PADDING = 1  # texels around each chart
 _MOST = 16384  # texels that can be drawn along a side
 _STRETCH = 1e-2  # texels by which the packer, in float32, may deviate from a rigid motion
 _THIN = 0.5  # texels: height of the place of a triangle that is too thin for the packer
-_FEW = 4096  # charts; more are packed by their boxes: a tenth of the time, and charts so small waste no more room
-# Less than a texel: in float32 two charts two texels apart would else both touch the centre between them.
+_FEW = 4096  # charts; more than these are packed as boxes, in a tenth of the time and without more waste
+# This is less than a texel: otherwise float32 rounding lets two charts two texels apart touch the centre between.
 _REACH = 1.0 - 1e-3
 
 
@@ -51,7 +51,7 @@ class Packed:
 
     Attributes:
         height, width: H_r and W_r, texels of the atlas.
-        corner: float64 [F, 3, 2], the corners' new places x and y in texels; the first texel's outer corner is 0.
+        corner: float64 [F, 3, 2], the corners' new x and y in texels; the origin is the first texel's outer corner.
         uv: float32 [F, 3, 2], the same over (W_r, H_r).
         source: int32 [F], the triangle whose texels each one reads: itself or its representative; -1 where it isn't
             active.
@@ -82,7 +82,7 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
 
     Raises:
         WlmError: `uvunwrap` isn't installed or fails, or the atlas gets too large.
-        ValueError: `scale` isn't above 0, or the groups are of another mesh.
+        ValueError: `scale` isn't above 0, or the groups belong to another mesh.
     """
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected above 0, got {scale}")
@@ -98,7 +98,7 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
     height, width = sheet.mask.shape
     numbers = welded(sheet.position, sheet.uv, sheet.triangle)
     old = (sheet.uv * [width, height])[sheet.triangle]
-    heads = np.flatnonzero(source == np.arange(count))  # those that keep their texels
+    heads = np.flatnonzero(source == np.arange(count))  # triangles that keep their texels
     head_chart, rotation, shift, size = _pack_charts(sheet.name, old[heads], numbers[heads], scale)
 
     chart = np.full(count, -1, np.int32)
@@ -124,7 +124,7 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
 
 
 def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
-    """Renders the atlas: each texel that a bilinear read of a chart can meet takes the lightmap's colour at its place.
+    """Renders the atlas: each texel that a bilinear read of a chart can reach takes the lightmap's colour there.
 
     Inside a triangle that is the place with the same barycentrics, the paper's three steps. Since a chart moved
     rigidly, one affine map gives it for all its triangles, and beyond its border, where the lightmap's gaps are filled.
@@ -170,14 +170,14 @@ def _pack_charts(
         int [N], the chart of each triangle; complex [C] twice, its motion, as `_motions`; float64 [2], W_r and H_r.
     """
     label = charts(numbers)
-    # Counter-clockwise, since the packer would mirror clockwise ones.
+    # Triangles are made counter-clockwise, since the packer would mirror clockwise ones.
     winding = np.where((_signed_area(old) < 0)[:, None], [0, 2, 1], [0, 1, 2])
     numbers = np.take_along_axis(numbers, winding, 1)
     points = np.take_along_axis(old, winding[..., None], 1)
     place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale)
     thin = chart < 0
     if thin.any():
-        # Each becomes a chart of its own: a larger triangle that holds it.
+        # Each becomes a separate chart: a larger triangle that contains it.
         points[thin] = _thickened(points[thin], _THIN / scale)
         extra = np.arange(int(thin.sum()))
         numbers[thin] = numbers.max() + 1 + np.arange(3 * len(extra)).reshape(-1, 3)
@@ -225,7 +225,7 @@ def _uvunwrap(
     placed = (chart >= 0) & (place != place[:, :1]).any((1, 2))
     used = np.unique(chart[placed])
     chart = np.where(np.isin(chart, used), np.searchsorted(used, chart), -1)
-    # The page may be larger than its charts need.
+    # The packer's atlas may be larger than its charts need.
     size = np.ceil(place[placed].reshape(-1, 2).max(0, initial=0.0) + _PADDING - 1e-3)
     if size.max() > _MOST:
         shape = f"{size[0]:.0f}x{size[1]:.0f}"
@@ -295,7 +295,7 @@ def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray)
 
 
 def _thickened(points: np.ndarray, height: float) -> np.ndarray:
-    """Right triangles [N, 3, 2] around thin ones [N, 3, 2], at least this high and at least this long."""
+    """Makes right triangles [N, 3, 2] around thin ones [N, 3, 2], at least `height` high and at least as long."""
     out = np.empty_like(points)
     for i, corner in enumerate(points):
         ends = [(corner[k], corner[(k + 1) % 3]) for k in range(3)]
@@ -310,9 +310,9 @@ def _thickened(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def _dilated(corner: np.ndarray) -> np.ndarray:
-    """The outlines of triangles [N, 3, 2], each dilated by one texel along both axes: [N, 7, 2].
+    """Computes outlines of triangles [N, 3, 2], each dilated by one texel along both axes: [N, 7, 2].
 
-    A bilinear read at a point meets the texels whose centres are less than one texel away along both axes, so these
+    A bilinear read at a point uses the texels whose centres are less than one texel away along both axes, so these
     are the centres within the Minkowski sum of the triangle and a square. Its edges are those of both, by direction.
     """
     flip = _signed_area(corner) < 0
@@ -328,7 +328,7 @@ def _dilated(corner: np.ndarray) -> np.ndarray:
 
 
 def _signed_area(corner: np.ndarray) -> np.ndarray:
-    """Twice the areas of triangles [N, 3, 2], positive where they turn from x to y."""
+    """Computes twice the areas of triangles [N, 3, 2], positive where they turn from x to y."""
     ab, ac = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     return ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
 

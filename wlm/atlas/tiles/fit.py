@@ -2,11 +2,11 @@
 
 The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
 B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 it is the lightmap itself.
-Tiles share no sample, so each is a small weighted least squares problem, solved for every size. The error of a tile is
-that of its samples after they are stored. The sizes are then allocated within a budget, `wlm.atlas.tiles.layout`.
+Tiles share no sample, so each is a small weighted least-squares problem, which is solved for every size. The error of a
+tile is measured with its samples as stored. The sizes are then allocated within a budget, `wlm.atlas.tiles.layout`.
 
-This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get samples and evenly lit walls next
-to none, within a triangle too, which that paper names as its limit (section 5.1).
+This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get many samples and evenly lit walls
+few, even within one triangle, which that paper names as its limit (section 5.1).
 """
 
 import functools
@@ -44,11 +44,11 @@ SUPERSAMPLING = 2
 
 _AT_ONCE, _AT_ONCE_CUDA = 8192, 65536  # tiles
 _SHARES = tuple((k + 0.5) / SUPERSAMPLING for k in range(SUPERSAMPLING))  # weight of the second texel at a point
-# Rounds of conjugate gradients from the unweighted solution: for curves, for curves of blocks, and for stored samples.
+# Conjugate gradient rounds from the unweighted solution: for curves, for curves of blocks, and for stored samples.
 _ROUGH, _MEDIUM, _FINE = 3, 10, 24
 # Ridge regularisation: a sample that reaches no point with a weight stays near the unweighted solution.
 _RIDGE = 1e-4
-# The fraction of the squared range of one texel that a bit must save: half float's rounding there.
+# A bit must save this fraction of one texel's squared range, which is the rounding of a half float there.
 _LEAST_GAIN = 2.0**-24 / 48
 
 
@@ -59,7 +59,7 @@ class Tiles:
     Attributes:
         index: int64 [T], number of the tile in the grid, row by row.
         light: float [T, 3, m * m], at m x m points of the tile, row by row, (k + 0.5) / m along an axis.
-        weight: float [T, m * m], weight of a point's squared error, 0 or more; over all tiles they add up to 1.
+        weight: float [T, m * m], weight of each point's squared error, 0 or more; the sum over all tiles is 1.
         size: Texels along a tile.
     """
 
@@ -120,7 +120,7 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model of tiles whose samples are solved for.
+    """Makes the model from the solved samples of its tiles.
 
     Args:
         scene: The scene whose lightmap was cut.
@@ -155,7 +155,7 @@ def composed_model(
 
 
 def least_gain(sheet: Sheet) -> float:
-    """The error that a bit must save to be allocated."""
+    """Computes the error that a bit must save to be allocated."""
     return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
 
 
@@ -225,7 +225,7 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
 
 
 def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
-    """Weights of linear interpolation from samples to points along an axis of a tile, float [points, samples]."""
+    """Computes weights of linear interpolation from samples to points along a tile's axis, float [points, samples]."""
     place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0)).long()
     result = torch.zeros((points, samples), device=device)
@@ -239,7 +239,7 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Solves for the samples of least weighted squared error, at one size for all tiles.
 
-    Conjugate gradients on the normal equations, from the solution with equal weights, for each channel of a tile.
+    Conjugate gradients solve the normal equations of each channel of a tile from the solution with equal weights.
 
     Args:
         tiles: T of them.
@@ -260,13 +260,13 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
         kernels.gather_system(weight, scale, grid, system)
         start = space(3, nx * ny)
         kernels.gather(light, grid, interop.to_warp(start))
-        # With equal weights the equations separate into those of the axes.
+        # With equal weights the equations separate by axis.
         across, down = (_axis(samples, grid.points, str(start.device))[2] for samples in (nx, ny))
         start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
         *work, out = (space(3, nx * ny) for _ in range(4))
         ridge = _RIDGE * grid.points**2 / (nx * ny)
         arrays = [interop.to_warp(each) for each in (start, *work, out)]
-        # In exact arithmetic as many rounds as samples are enough.
+        # In exact arithmetic the solution needs at most one round per sample.
         rounds = min(rounds, 2 * nx * ny)
         kernels.solve(light, weight, scale, grid, system, ridge, rounds, arrays[0], arrays[1:4], arrays[4])
     return out.unflatten(2, (ny, nx)).permute(0, 2, 3, 1)
@@ -284,7 +284,7 @@ def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
 
 
 def _laid_out(values: torch.Tensor) -> torch.Tensor:
-    """Lays out values [T, ...]; on a GPU tiles come last, since its threads read one place of many tiles at once."""
+    """Lays out values [T, ...]; on a GPU the tiles' axis is contiguous, since threads read many tiles at once."""
     if values.device.type == "cpu":
         return values.contiguous()
     return values.movedim(0, -1).contiguous().movedim(-1, 0)
@@ -300,8 +300,8 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Interpolation along an axis: the sample before each point, the weight of the next one, and the inverse of the
-    interpolation matrix's Gram matrix, which would dominate the time if a GPU computed it each time."""
+    """Computes interpolation along an axis: the sample before each point, the weight of the next one, and the inverse
+    Gram matrix of the interpolation matrix, which is cached since computing it on a GPU would dominate the time."""
     matrix = linear(samples, points)
     place = (torch.arange(points) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0))
@@ -311,7 +311,7 @@ def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.T
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
-    """Weighted squared error of each tile, mean of the channels, float64 [T]; the sum is the mean squared error.
+    """Computes the weighted squared error of each tile, averaged over the channels, float64 [T]; the sum is the MSE.
 
     Args:
         tiles: T of them.
@@ -327,7 +327,7 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
 
 
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
-    """The weight of each sample's squared error, float [T, ny, nx]."""
+    """Computes the weight of each sample's squared error, float [T, ny, nx]."""
     points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
     down, across = (linear(count, points, device).square() for count in (ny, nx))
     return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
@@ -343,7 +343,7 @@ def curves(
 
     Args:
         tiles: T of them.
-        sizes: The sizes; an error is that of the samples after the size's format has stored them.
+        sizes: The sizes; errors are measured after the samples are stored in the size's format.
         progress: Called with the sizes done.
         checkpoint: Keeps the errors of the sizes done, as batch 0.
     """

@@ -1,4 +1,4 @@
-"""Sizes of tiles: the sizes that a tile may have, the one that it gets within a budget of bits, and its place.
+"""Sizes of tiles: the candidates, the allocation within a budget of bits, and the places in the texture.
 
 Each tile has a curve of error against bits. At the optimum one more bit gains as much in every tile. That gain, a
 Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each with its own
@@ -28,8 +28,8 @@ from wlm.formats.exr import HALF_MAX
 
 _BISECTIONS, _CLOSE = 60, 1e-6
 _TILES_AT_ONCE = 1 << 16
-_WIDTHS = np.linspace(0.7, 1.5, 17)  # widths of T_p that are tried, over the square root of its number of samples
-# Sides in texels for "mixed": above 6 every other one is enough.
+_WIDTHS = np.linspace(0.7, 1.5, 17)  # candidate widths of T_p over the square root of its number of samples
+# Sides in texels for "mixed": above 6 every second one is enough.
 _MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 
 
@@ -55,7 +55,7 @@ class Size:
 
     @property
     def step(self) -> int:
-        """The number of which its sides are multiples."""
+        """The sides are multiples of this number of texels."""
         return BLOCK_SIDE if self.format in ("bc6h", "astc") else 1
 
 
@@ -75,7 +75,7 @@ class Layout:
 
 
 def sizes_of(profile: Profile) -> list[Size]:
-    """Lists the sizes that a tile may have; blocks are whole, so that no block has two tiles."""
+    """Lists the sizes that a tile may have; tiles consist of whole blocks, so that no block is shared."""
     most = profile.tile + 1
 
     def of_blocks(format: str, second: bool) -> list[Size]:
@@ -137,7 +137,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves with the smallest texture; and gives the texture's rows and columns."""
+    """Finds the width of shelves with the smallest texture, and returns it with the texture's rows and columns."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -169,7 +169,7 @@ def composed(
         layout: Sizes and places of the tiles.
         index: int64 [T], the tiles' numbers in the grid.
         counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
-        device: "cpu" or "cuda:N": a large texture takes seconds to pass through the host.
+        device: "cpu" or "cuda:N": copying a large texture through the host takes seconds.
 
     Returns:
         For each texture, on the device, the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
@@ -195,7 +195,7 @@ def composed(
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [n, ny, 1] and columns [n, 1, nx] of the texels of rectangles with first texels (x, y) [n, 2]."""
+    """Computes rows [n, ny, 1] and columns [n, 1, nx] of rectangles of texels from their first texels (x, y) [n, 2]."""
     row = first[:, 1, None, None] + np.arange(ny)[:, None]
     return row, first[:, 0, None, None] + np.arange(nx)
 
@@ -236,7 +236,7 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 
 @dataclass(frozen=True)
 class _Run:
-    """The places of the rectangles of one size: some beside those of another size, the rest on shelves of their own.
+    """The places of the rectangles of one size: some share a shelf with another size, the rest have separate shelves.
 
     Attributes:
         beside: Number of rectangles beside others, from (x, y) on.
@@ -268,7 +268,7 @@ class _Kinds:
         return cls(size[order], count[order])
 
     def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Places each size on shelves of a width; gives the places and the height of all shelves."""
+        """Places each size on shelves of a width; returns the places and the height of all shelves."""
         runs, x, y, height = [], 0, 0, 0
         for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
             each = width // w
