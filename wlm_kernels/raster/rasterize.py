@@ -8,7 +8,7 @@ by w, so a triangle that reaches behind the viewer needs no clipping; there is n
 Coverage is decided without rounding. Where float64 can't decide the sign of an edge function it is computed exactly,
 and where it is exactly zero the pixel counts as moved by an infinitesimal step to the right, and by an infinitely
 smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that triangles share is
-covered by exactly one of those that surround it, also where each has vertices of its own at equal positions.
+covered by exactly one of those that surround it, also where they use different vertices at equal positions.
 
 The visible triangle is a minimum over 64-bit keys, depth first and then number: the same on every run.
 
