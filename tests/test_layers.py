@@ -1,16 +1,16 @@
-"""The arrows of the house: every import points down a floor, and no two modules import each other."""
+"""Checks that every import points to a lower layer and that modules form no import cycle."""
 
 import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-GROUND = (
+BASE = (
     "wlm_kernels wlm wlm._facade wlm.bundle wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels "
     "wlm.system wlm.workers"
 )
-FLOORS = (
-    GROUND.split(),
+LAYERS = (
+    BASE.split(),
     ["wlm.ops", "wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
     ["wlm.inspection"],
@@ -19,17 +19,17 @@ FLOORS = (
     ["wlm.__main__"],
     ["benchmarks"],
 )
-FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+LAYER_OF = {package: layer for layer, packages in enumerate(LAYERS) for package in packages}
 
 
-def room_of(module: str) -> str:
-    """`wlm.probe` of `wlm.probe.fit`; the kernels and the benchmarks are one room each."""
+def package_of(module: str) -> str:
+    """Returns `wlm.probe` for `wlm.probe.fit`; `wlm_kernels` and `benchmarks` are one package each."""
     root = module.split(".", maxsplit=1)[0]
     return root if root != "wlm" else ".".join(module.split(".")[:2])
 
 
 def imports() -> dict[str, set[str]]:
-    """For each module the modules of ours that it imports anywhere, also in functions and for types alone."""
+    """Returns the project modules that each module imports anywhere, including in functions and for type checking."""
     files = [path for folder in ("wlm", "wlm_kernels", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
     graph = {}
@@ -49,15 +49,15 @@ def imports() -> dict[str, set[str]]:
 def test_imports_point_down():
     wrong = []
     for module, targets in imports().items():
-        here = room_of(module)
+        here = package_of(module)
         for target in targets:
-            there = room_of(target)
-            # Rooms of one floor never meet, but for those of the ground.
-            highest = FLOOR_OF[here] - 1 if FLOOR_OF[here] else 0
-            if here != there and (FLOOR_OF[there] > highest or here == "wlm_kernels"):
+            there = package_of(target)
+            # Packages of one layer don't import each other, except those of the lowest layer.
+            highest = LAYER_OF[here] - 1 if LAYER_OF[here] else 0
+            if here != there and (LAYER_OF[there] > highest or here == "wlm_kernels"):
                 wrong.append(f"{module} imports {target}")
     assert not wrong
 
 
-def test_no_circles():
+def test_no_cycles():
     tuple(TopologicalSorter(imports()).static_order())

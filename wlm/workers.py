@@ -288,10 +288,10 @@ class Actors(Workers):
 
 
 def _connect(ray: Any, address: str) -> None:
-    """Connects to a cluster and restores the signal handlers that Ray replaces."""
+    """Connects to a cluster and restores the SIGTERM handler that Ray replaces."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
-        # Ray would retry for minutes.
+        # Ray would retry for minutes, so a plain connection is tried first.
         try:
             socket.create_connection((host, int(port)), _ANSWER).close()
         except (OSError, OverflowError) as error:

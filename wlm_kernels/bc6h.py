@@ -24,7 +24,7 @@ _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
 _REFINED = wp.constant(2)  # number of fits of a line to its texels' levels
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
-_TRIED = wp.constant(2)  # partitions that are encoded
+_TRIED = wp.constant(2)  # number of partitions tried that are encoded
 _LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
 _HUGE = wp.constant(3.4e38)
 

@@ -51,7 +51,7 @@ class Block:
 
 @wp.func
 def write_block(number: int, block: Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
-    """Packs a block."""
+    """Packs a block into 128 bits."""
     mode = block.mode
     word = wp.vec4ui()
     word[0] = wp.uint32(tables.modes[mode, 0])

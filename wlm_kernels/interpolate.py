@@ -1,8 +1,8 @@
-"""Planes and volumes of features, sampled linearly, with a last axis that is clamped or periodic.
+"""Linear sampling of feature planes and volumes whose first axis is clamped or periodic.
 
 A plane is `[T, W, C]`: row = time (or v), column = u. A volume is `[T, H, W, C]`. Space is clamped to the border;
 the first axis is clamped, or wraps round when `periodic` (its last slice is the first's neighbour). Coordinates are
-in [0, 1], cell centres at (i + 1/2) / size. Any number of channels C. Twins in torch: `wlm.ops.plain`.
+in [0, 1], cell centres at (i + 1/2) / size. C is arbitrary. Torch references: `wlm.ops.plain`.
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ _CLAMP, _WRAP = (wp.constant(BOUNDARIES.index(name)) for name in ("clamp", "wrap
 
 @wp.func
 def cell(coordinate: float, size: int) -> int:
-    """The lower neighbour of a coordinate in [0, 1] on an axis of `size` cells; may be -1."""
+    """Returns the lower neighbour of a coordinate in [0, 1] on an axis of `size` cells; may be -1."""
     return int(wp.floor(coordinate * float(size) - 0.5))
 
 
@@ -29,7 +29,7 @@ def fraction(coordinate: float, size: int) -> float:
 
 @wp.func
 def axis_index(i: int, size: int, periodic: int) -> int:
-    """Clamps to the border, or wraps (i is at most one period out)."""
+    """Clamps an index to the border, or wraps it (i is at most one period outside)."""
     if periodic != 0:
         return (i + size) % size
     return wp.clamp(i, 0, size - 1)
@@ -37,7 +37,7 @@ def axis_index(i: int, size: int, periodic: int) -> int:
 
 @wp.struct
 class _Cell:
-    """Where a point lies in its volume: along the width, the height and the first axis, of which `base` is row 0.
+    """Position of a point in its volume along the width, the height and the first axis; `base` is the volume's row 0.
 
     A plane is a volume of height 1, in which only the first four of eight corners differ.
     """
@@ -146,12 +146,12 @@ def _sample_backward(
 
 
 def sample(values, times: int, layers, points, out, periodic: bool = False) -> None:
-    """Samples planes bilinearly, or volumes trilinearly; outside [0, 1] the border goes on, or the next period.
+    """Samples planes bilinearly, or volumes trilinearly; coordinates outside [0, 1] are clamped or wrapped.
 
     Args:
-        values: float [L * T, H, W, C], L planes (H = 1) or volumes, one behind the other: Warp arrays end at four
+        values: float [L * T, H, W, C], L planes (H = 1) or volumes, concatenated because Warp arrays have at most four
             dimensions.
-        times: T, slices of each.
+        times: T, number of slices of each.
         layers: int [N], the plane or volume of each point, 0 to L - 1; of shape [0]: L is 1.
         points: float [N, 2] (u, t) or [N, 3] (u, v, t).
         out: float [N, C], written.

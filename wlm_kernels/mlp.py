@@ -1,6 +1,6 @@
-"""A small MLP with two hidden layers of one width, GELU between and no activation at the output.
+"""A small MLP with two hidden layers of equal width, GELU activations and a linear output.
 
-The weights of N networks lie in two arrays, column by column, so that a layer is `h += column[c] * x[c]`:
+The weights of N networks are stored in two arrays, column by column, so that a layer is `h += column[c] * x[c]`:
 
     hidden  [N, I + 1 + H + 1] of vecH: I columns of the first layer, its bias, H columns of the second, its bias
     output  [N, H + 1] of vecO:         H columns of the third layer, its bias
@@ -22,7 +22,7 @@ import warp as wp
 GELUS = ("exact", "tanh", "fast")
 
 
-# GELU is x gate(x). Its derivative is made of the same gate, so that training evaluates each erf or tanh once.
+# GELU is x gate(x). Its derivative uses the same gate, so that training evaluates each erf or tanh once.
 
 
 @wp.func_native("""

@@ -12,7 +12,7 @@ LARGEST = wp.constant(65408.0)
 
 @wp.func
 def unpack_rgb9e5(word: wp.uint32) -> wp.vec3:
-    """The light of a packed texel."""
+    """Unpacks a texel to linear light."""
     scale = wp.pow(2.0, float(int(wp.rshift(word, wp.uint32(27)))) - 24.0)
     return scale * wp.vec3(
         float(int(word & wp.uint32(511))),
@@ -23,7 +23,7 @@ def unpack_rgb9e5(word: wp.uint32) -> wp.vec3:
 
 @wp.func
 def pack_rgb9e5(light: wp.vec3) -> wp.uint32:
-    """Packs light; below 0 counts as 0, beyond the format's largest as that."""
+    """Packs linear light, clamped to the format's range."""
     r = wp.clamp(light[0], 0.0, LARGEST)
     g = wp.clamp(light[1], 0.0, LARGEST)
     b = wp.clamp(light[2], 0.0, LARGEST)

@@ -23,9 +23,9 @@ from benchmarks.rivals.rival import Rival, measure
 from wlm.errors import WlmError
 from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
 
-# Bits of a weight that `at_bytes` tries; None for half floats. Below 4 the rounding is the larger error.
+# Bits of a weight that `at_bytes` tries; None for half floats. Below 4 bits the rounding error dominates.
 WEIGHT_BITS = (4, 5, 6, 8, 10, None)
-# `at_bytes` stops here: more parts are slow to find, and twice as many gain little.
+# Limit of `at_bytes`: more parts take long to compute, and doubling their number gains little.
 MAX_PARTS = 512
 MAX_GRID = 64
 # Component counts that may follow the best so far without an improvement.
@@ -56,10 +56,10 @@ def clustered_pca(
     Args:
         position, values, components, bits: See the module.
         clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
-        seed: Of the first centres.
-        signal: False clusters the positions with k-means, as gaussian-probe-compression, section 5.1, has it: the
-            centres are stored, and a probe needs no index. True puts each probe where it is reconstructed best, as
-            Sloan et al. 2003 do: an index of ceil(log2 clusters) bits a probe is stored and counted.
+        seed: Seed of the initial centres.
+        signal: False clusters the positions with k-means (gaussian-probe-compression, section 5.1): the centres are
+            stored, and a probe needs no index. True assigns each probe to the cluster that reconstructs it best (Sloan
+            et al. 2003): an index of ceil(log2 clusters) bits a probe is stored and counted.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("clusters", clusters, 1)
@@ -98,7 +98,7 @@ def moving_basis(
 
 
 def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Rival:
-    """Packs SH as the bricks of Unreal's volumetric lightmap do, without sky occlusion: 28 bytes per probe at L2.
+    """Packs SH like the bricks of Unreal's volumetric lightmap, without sky occlusion: 28 bytes per probe at L2.
 
     The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
     have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,

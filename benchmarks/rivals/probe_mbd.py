@@ -5,7 +5,7 @@
 with the mean m and the K basis vectors b_j interpolated trilinearly from the corners of a coarse grid, and K weights
 w_n a probe. With one mean and basis everywhere this is global PCA, with one for each cube blockwise PCA, whose seams
 the interpolation removes. Weights belong to probes and not to a second grid, so free positions, which
-gaussian-probe-compression, section 2.2, holds against the method, ask for nothing more.
+gaussian-probe-compression, section 2.2, calls a weakness of the method, need no extension.
 
 What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D, K, cells along the
 box's longest side, scale), float16 [V, K + 1, D] means and bases in units of the scale, and the weights as in
@@ -34,8 +34,8 @@ from benchmarks.rivals.probe_pca import (
 from wlm.errors import WlmError
 
 _HEADER = struct.Struct("<BHHIf")
-# Weight of staying where the last round was, against the mean of the normal equations' diagonal. It makes every
-# system definite, also at corners that hardly any probe feels, and cannot raise the error.
+# Weight of the damping term, relative to the mean of the normal equations' diagonal. It makes every system definite,
+# also at corners that affect almost no probe, and cannot raise the error.
 _STAY = 1e-3
 
 
@@ -124,7 +124,7 @@ def encode(
         components: K, 1 to D.
         grid: Cells along the longest side of the probes' box, 1 to `MAX_CELLS`.
         iterations: Rounds of the solver, at least 0; with none this is global PCA.
-        bits: Of a weight, 1 to 16, over the range of each cell and component; None for half floats.
+        bits: Bits of a weight, 1 to 16, over the range of each cell and component; None for half floats.
 
     Returns:
         The layout of this module.
@@ -132,7 +132,7 @@ def encode(
     scale = scale_of(values)
     solver = Solver(position, values / scale, components, grid)
     solver.step(iterations)
-    # The corners make up for the rounding of the weights as far as they can.
+    # Solving for the corners again compensates part of the rounding of the weights.
     _, _, cell = _interpolation(position, grid)
     weights = write_weights(solver.weight, cell, cell.max() + 1, bits)
     solver.weight = read_weights(weights, cell, cell.max() + 1, components, bits).astype(np.float64)

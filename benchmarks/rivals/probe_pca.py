@@ -78,7 +78,7 @@ def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
         position: float64 [N, 3].
         clusters: The most parts; fewer where there are fewer distinct positions, or where two centres or an
             empty one fall away.
-        seed: Of the first centres.
+        seed: Seed of the initial centres.
     """
     low, extent = position.min(0), extent_of(position)
     points = (position - low) / extent
@@ -107,7 +107,7 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
         values: float64 [N, D].
         clusters: The most parts; fewer where there are fewer distinct probes.
         components: K, basis vectors of a subspace.
-        seed: Of the first centres.
+        seed: Seed of the initial centres.
     """
     values = values / scale_of(values)
     centre = _seeds(values, clusters, np.random.default_rng(seed))
@@ -154,9 +154,9 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
 
     Args:
         values: float64 [N, D].
-        partition: Of the N probes.
+        partition: Partition of the N probes.
         components: K, 1 to D.
-        bits: Of a weight, 1 to 16, over the range of each part and component; None for half floats.
+        bits: Bits of a weight, 1 to 16, over the range of each part and component; None for half floats.
 
     Returns:
         The layout of this module.
@@ -165,7 +165,7 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
     values = values / scale
     mean, basis = fit_subspaces(values, partition.members, components)
     mean, basis = mean.astype("<f2"), basis.astype("<f2")
-    # Weights for the subspace as it is read back: the rounding of means and bases is no error of its own then.
+    # Weights are fitted to the subspace as decoded, which compensates the rounding of means and bases.
     inverse = np.linalg.pinv(basis.astype(np.float64))
     weight = np.empty((len(values), components))
     for part, probes in enumerate(partition.members):

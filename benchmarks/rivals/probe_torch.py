@@ -1,8 +1,8 @@
-"""The probe fit in plain torch: the reference that the kernels' fit is held to, for speed and for quality.
+"""The probe fit in plain torch: the reference for the speed and the quality of the kernels' fit.
 
 The same model as `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
 (eq. 5 without eq. 6), with autograd, on dense matrices of probes times Gaussians. Its start is the paper's: centres by
-k-means, scales from the nearest centre. It stops short of the file: the network stays in float32.
+k-means, scales from the nearest centre. It writes no file, and the network stays in float32.
 """
 
 import itertools
@@ -24,10 +24,10 @@ class DenseFit:
     """The fit of a probe set.
 
     Attributes:
-        parameters: The tensors that the optimiser moves: centres [K, 3], logs of the scales [K, 3], quaternions
+        parameters: The optimised tensors: centres [K, 3], logs of the scales [K, 3], quaternions
             w x y z [K, 4], latents [K, L], then the network's weights and biases, layer by layer.
         steps_done: Steps so far.
-        seconds: What `run` has taken so far, with the device awaited.
+        seconds: Time spent in `run` so far, including waiting for the device.
     """
 
     def __init__(
@@ -45,19 +45,19 @@ class DenseFit:
         seed: int,
         device: str,
     ):
-        """Draws the first parameters.
+        """Initialises the parameters.
 
         Args:
             x: [N, 3], positions in the unit cube.
-            values: [N, D], what to fit.
-            count: Gaussians that are wanted; no more than there are distinct positions are made.
+            values: [N, D], values to fit.
+            count: Requested number of Gaussians; limited to the number of distinct positions.
             latent: L, numbers in a Gaussian's latent.
             hidden: Width of both hidden layers.
-            steps: Of the whole fit, on which the schedule depends.
-            rates: First learning rates: centre, log of the scale, rotation, latent, network.
+            steps: Steps of the whole fit, which define the schedule.
+            rates: Initial learning rates: centre, log of the scale, rotation, latent, network.
             final: All rates end here, on half a cosine, as a share of the first.
-            bits: Of each number but the centre's, which has 16, in the last sixth (eq. 13 and 14).
-            seed: Of everything random.
+            bits: Bits of each number except the centre's, which has 16, in the last sixth (eq. 13 and 14).
+            seed: Seed of all random numbers.
             device: "cpu" or "cuda:0".
 
         Raises:
@@ -82,7 +82,7 @@ class DenseFit:
         )
         net = []
         for inputs, outputs in itertools.pairwise([latent + 3, hidden, hidden, values.shape[1]]):
-            # As torch's linear layers begin.
+            # Initialised like torch's linear layers.
             net += [random.uniform(-1, 1, shape) / math.sqrt(inputs) for shape in ((inputs, outputs), outputs)]
         self.parameters = [self._put(array).requires_grad_() for array in (*start, *net)]
         self._levels = [2.0**_CENTRE_BITS - 1.0] + [2.0**bits - 1.0] * 3
@@ -91,7 +91,7 @@ class DenseFit:
         spread = exact.std(0)
         self._mean, self._spread = self._put(exact.mean(0)), self._put(spread)
         self._x = self._put(x)
-        # A number that never changes has no weight, and decodes to its mean.
+        # A constant number has weight 0 and decodes to its mean.
         self._target = self._put((exact - exact.mean(0)) / np.where(spread > 0, spread, 1.0))
         # The squared error of the numbers themselves, in units of the most varied channel's variance (eq. 8).
         self._weight = self._put((spread / (spread.max() or 1.0)) ** 2)

@@ -201,7 +201,7 @@ class LightmappedScene:
 
     @cached_property
     def triangles(self) -> Triangles:
-        """All triangles of the scene."""
+        """Joins all triangles of the scene."""
         first = np.cumsum([0, *(len(sheet.position) for sheet in self.sheets)])
         owner = [np.where(sheet.active, number, -1) for number, sheet in enumerate(self.sheets)]
         corners = self.blocker.reshape(-1, 3)
@@ -216,7 +216,7 @@ class LightmappedScene:
 
     @cached_property
     def indoors(self) -> Indoors:
-        """The places where viewers can stand, see `wlm.ops.indoors`."""
+        """Finds the places where cameras inside the scene can be, see `wlm.ops.indoors`."""
         return indoors(self.triangles.position, self.triangles.triangle, metres=self.metres)
 
 

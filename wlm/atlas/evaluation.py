@@ -152,7 +152,7 @@ class Report(Score):
         method: The model's method.
         profile: Name of its settings.
         bytes: Size of its file.
-        geometry_bytes: Part of it that holds the triangles and masks.
+        geometry_bytes: Size of the triangles and masks in the file.
         gpu_bytes: Size of its textures and tables on a GPU.
         cr: Compression ratio of the textures (eq. 9).
         cr_disk: Compression ratio of the file without triangles and masks.
@@ -230,7 +230,7 @@ def compare(
             or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For some of the decoders, numbers of their own charts or tiles: their seams are where these change.
+        labels: For some decoders, numbers of their charts or tiles: their seams are where these change.
             Seams of the others are the borders of the lightmaps' charts. Either way a border lies between neighbouring
             pixels that show one triangle or two that share a corner in space, so that an outline in front of
             another surface is no border.
@@ -306,7 +306,7 @@ def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Lab
 
 
 def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
-    """The chart of each of the scene's triangles, int64 [F], different in each sheet."""
+    """Numbers the charts of the scene's triangles, int64 [F], differently in each sheet."""
     result, count = np.full(len(scene.triangles.triangle), -1, np.int64), 0
     first = 0
     for sheet in scene.sheets:
@@ -337,7 +337,7 @@ class _Reference:
         return light
 
     def exposure(self, state: int) -> float:
-        """Exposure factor from linear light to display values."""
+        """Returns the exposure factor from linear light to display values."""
         return exposure(np.concatenate([chart[state] for chart in self._charts]))
 
     def _image(self, number: int, state: int) -> torch.Tensor:
@@ -351,7 +351,7 @@ def _peaks(
     resolution: int,
     device: str,
 ) -> tuple[list[float], float]:
-    """The range of the reference in all views, see the module, for each state, and its maximum.
+    """Computes the range of the reference in all views (see the module) for each state, and its maximum.
 
     Rendering each view twice is cheaper than storing all views.
     """
@@ -378,7 +378,7 @@ def _peaks(
 
 
 def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
-    """The decoded colours, float64 [N, 3], checked."""
+    """Calls the decoder and checks the colours, float64 [N, 3]."""
     colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
         raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
@@ -389,7 +389,7 @@ def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedSce
 
 
 def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
-    """The labels, int64 [N], checked."""
+    """Computes and checks the labels, int64 [N]."""
     label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
         raise ValueError(f"{name}: expected labels, integers [{count}], got {label.dtype} {tuple(label.shape)}")
@@ -468,7 +468,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """The mean of the numbers that aren't NaN; NaN for none."""
+    """Averages the numbers that aren't NaN; NaN if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return fmean(known) if known else math.nan
 
@@ -557,7 +557,7 @@ class _Similarity:
         self._variance = square - self._mean.square()
 
     def mean(self, colour: torch.Tensor) -> float:
-        """Mean over the covered pixels whose window is in the picture; NaN without any, or without a range.
+        """Averages SSIM over covered pixels whose window is in the picture; NaN if there are none, or no range.
 
         Args:
             colour: float64 [N, 3], decoded.

@@ -116,7 +116,7 @@ class Listing:
 
 
 def is_listing(path: str | os.PathLike[str] | None) -> bool:
-    """Whether a path is a list of lightmaps rather than one lightmap. None stands for the materials' own."""
+    """Tests whether a path is a list of lightmaps rather than one lightmap; None means those of the materials."""
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 

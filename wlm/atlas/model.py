@@ -70,8 +70,8 @@ MOST_SIZE = 1 << (16 - SIDE_BITS)
 """Largest number of texels of T_p, or of blocks, that an entry can address along an axis."""
 
 COUNT_BITS, COARSE_BITS = 8, 4
-"""Bits of an entry's fourth number: the lowest hold the number of components, the next the number of coarse ones; the
-page is above them."""
+"""Bit counts in an entry's fourth number: the lowest bits are the number of components, the next the number of coarse
+ones, and the remaining bits the page."""
 
 MOST_PAGES, MOST_COARSE = 1 << (16 - COUNT_BITS - COARSE_BITS), (1 << COARSE_BITS) - 1
 
@@ -317,7 +317,7 @@ class AtlasModel(Model):
 
     @cached_property
     def scene(self) -> Any:
-        """The `LightmappedScene` without lightmaps, read from the stored triangles and masks.
+        """Reads the `LightmappedScene`, without lightmaps, from the stored triangles and masks.
 
         Raises:
             WlmError: The stored triangles are damaged.
@@ -327,7 +327,7 @@ class AtlasModel(Model):
         return import_module("wlm.atlas.stored").restore(self)
 
     def table(self) -> np.ndarray:
-        """The table of sheets as kernels and shaders read it, int32 [rows, 7].
+        """Makes the table of sheets for kernels and shaders, int32 [rows, 7].
 
         Sheets come first, then levels; with separate tiles both are listed for each state in turn. A row contains the
         rows and columns of texels, the first row and column in T_c, the rows and columns of tiles, and the row number
@@ -337,7 +337,7 @@ class AtlasModel(Model):
         return np.array(rows, np.int32)
 
     def without_mips(self) -> "AtlasModel":
-        """The same model without its smaller levels; the texels of shared levels stay in the textures."""
+        """Returns the model without its smaller levels; the texels of shared levels stay in the textures."""
         kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
         sheets, later = (tuple(replace(row, smaller=0) for row in rows) for rows in (self.sheets, kept))
         return replace(self, sheets=sheets, levels=(), later=later, tail=self.tail[:0])
@@ -365,7 +365,7 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
 
 
 def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of the mips of a lightmap: a quarter in whole blocks, then halves (rounded down) to one texel.
+    """Lists rows and columns of a lightmap's mips: a quarter in whole blocks, then halves, rounded down, to one texel.
 
     Direct3D and browsers require whole blocks, so the first level is padded where a quarter of the lightmap does not
     consist of whole blocks; `tail_share` is the fraction that the lightmap covers.
@@ -388,12 +388,12 @@ def tail_codec(colour: str) -> str:
 
 
 def tail_blocks(height: int, width: int) -> int:
-    """Number of blocks of a level."""
+    """Returns the number of blocks of a level."""
     return -(-height // BLOCK_SIDE) * -(-width // BLOCK_SIDE)
 
 
 def tail_bits(height: int, width: int) -> int:
-    """Bits of the mips of a lightmap on a GPU."""
+    """Returns the bits of the mips of a lightmap on a GPU."""
     return sum(tail_blocks(*shape) for shape in tail_shapes(height, width)) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
 
 
@@ -406,7 +406,7 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
 
 
 def first_block_code(colour: str, shape: tuple[int, ...]) -> int:
-    """The size code from which on an entry of T_c names blocks instead of texels; `NO_BLOCKS` if none does.
+    """Returns the smallest size code with which an entry of T_c names blocks instead of texels, or `NO_BLOCKS`.
 
     Args:
         colour: Format of T_p, as in `Profile`.
@@ -512,7 +512,7 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
-    """The place of a coarse component of a tile; coarse components are stacked in columns beside the others.
+    """Computes the place of a coarse component of a tile; these are stacked in columns beside the other components.
 
     Args:
         size: int [..., 2], texels of the other components along x and y.

@@ -1,6 +1,6 @@
-"""Makes the inputs of the systems: lightmaps and probes over the day by Mitsuba 3, six-way lightmaps by our tracer.
+"""Bakes inputs of the systems: lightmaps and probes over the day with Mitsuba 3, six-way lightmaps with our tracer.
 
-The extra `bake` brings Mitsuba, which on the CPU needs LLVM 16 or later. The page is docs/bake.md.
+The extra `bake` installs Mitsuba, which needs LLVM 16 or later on the CPU. The documentation is docs/bake.md.
 """
 
 from wlm._facade import facade

@@ -1,4 +1,4 @@
-"""Mitsuba and the compiler that it needs: found, or what to install in one line."""
+"""Loads Mitsuba and the compiler that it needs, or reports in one line what to install."""
 
 import contextlib
 import ctypes
@@ -24,7 +24,7 @@ def start(device: str = "cpu") -> ModuleType:
     """Imports Mitsuba and chooses its variant.
 
     Args:
-        device: "cpu" or "cuda"; Mitsuba takes the first GPU.
+        device: "cpu" or "cuda"; Mitsuba uses the first GPU.
 
     Returns:
         The module `mitsuba`.
@@ -41,7 +41,7 @@ def start(device: str = "cpu") -> ModuleType:
         if not has_llvm:
             raise WlmError(f"{_EXTRA}: LLVM is missing, with which Mitsuba compiles for the CPU: {_INSTALL}")
         if (path := _old_llvm()) is not None:
-            # It would end the process where it meets an instruction that it doesn't know.
+            # An older LLVM would end the process at the first unknown instruction.
             raise WlmError(f"{_EXTRA}: {path} is older than what Mitsuba's kernels need: {_INSTALL}")
     elif not drjit.has_backend(drjit.JitBackend.CUDA):
         raise WlmError(f"{_EXTRA}: Mitsuba finds no NVIDIA GPU, or no OptiX in its driver: take --device cpu")
@@ -51,7 +51,7 @@ def start(device: str = "cpu") -> ModuleType:
 
 @contextlib.contextmanager
 def _without_chatter() -> Iterator[None]:
-    """Drops what Dr.Jit's C library prints where it finds no LLVM; other lines are passed on."""
+    """Suppresses the output of Dr.Jit's C library when it finds no LLVM; other lines are passed on."""
     with tempfile.TemporaryFile() as sink:
         sys.stderr.flush()
         saved = os.dup(_STDERR)
@@ -68,10 +68,10 @@ def _without_chatter() -> Iterator[None]:
 
 
 def _old_llvm() -> str | None:
-    """The library of LLVM that is loaded, where it is older than 16: from then on it tells its version."""
+    """Returns the path of the loaded LLVM library if it is older than 16, the first version that reports itself."""
     try:
         lines = _MAPS.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:  # elsewhere than on Linux nothing tells which one it is
+    except OSError:  # only Linux lists the loaded libraries
         return None
     paths = dict.fromkeys(line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line)
     return next((path for path in paths if not hasattr(ctypes.CDLL(path), "LLVMGetVersion")), None)

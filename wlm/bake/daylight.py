@@ -1,4 +1,4 @@
-"""Where the sun is at an hour."""
+"""Direction of the sun by the hour."""
 
 import math
 
@@ -10,14 +10,14 @@ _YEAR = 365.25
 
 
 def sun_direction(hour: float, latitude: float, day: int, north: float = 0.0, period: float = 24.0) -> np.ndarray:
-    """The direction to the sun, float64 [3], of unit length, y up; y < 0 at night.
+    """Returns the direction to the sun, float64 [3], of unit length, y up; y < 0 at night.
 
-    The orbit is a circle and noon is when the sun is highest: right to 2 degrees.
+    The model is a circular orbit with the sun highest at noon; its error is at most 2 degrees.
 
     Args:
-        hour: Of the sun: it is highest at half the period.
-        latitude: Degrees.
-        day: Of the year.
+        hour: Solar time; the sun is highest at half the period.
+        latitude: Degrees, north positive.
+        day: Day of the year.
         north: Degrees by which north is turned from -z towards -x.
         period: Hours of a day.
     """
@@ -27,7 +27,7 @@ def sun_direction(hour: float, latitude: float, day: int, north: float = 0.0, pe
     east = -math.cos(declination) * math.sin(angle)
     up = math.sin(phi) * math.sin(declination) + math.cos(phi) * math.cos(declination) * math.cos(angle)
     northward = math.cos(phi) * math.sin(declination) - math.sin(phi) * math.cos(declination) * math.cos(angle)
-    # Unturned, east is +x and north is -z.
+    # Before the rotation by `north`, east is +x and north is -z.
     x = east * math.cos(turn) - northward * math.sin(turn)
     z = -east * math.sin(turn) - northward * math.cos(turn)
     return np.array([x, up, z])

@@ -1,4 +1,4 @@
-"""A scene's surfaces: triangles in the world with normals, lightmap UVs and materials; new UVs where that is wanted."""
+"""Surfaces of a scene: triangles in world space with normals, lightmap UVs (or newly unwrapped UVs) and materials."""
 
 import copy
 import io
@@ -23,20 +23,20 @@ _UNWRAPPED = 1  # n of the new `TEXCOORD_n`
 _MOST_IMAGE = 1 << 26  # pixels
 _STRONGEST = 1e9  # radiance
 _LARGEST = 1e9
-_NEAREST = 0.01  # of the scene's size to its distance: Mitsuba starts rays 1e-4 of 1 + |place| off surfaces, in float32
-_BRIGHTEST = 0.99  # albedo: of more, light would stay in a closed room for ever
+_NEAREST = 0.01  # least size over distance: Mitsuba offsets ray origins by 1e-4 (1 + |position|), in float32
+_BRIGHTEST = 0.99  # largest albedo: with 1, light in a closed scene would never be absorbed
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What a surface does with light: all that it reflects is diffuse.
+    """A diffuse material.
 
     Attributes:
-        name: For lamps; "" where it has none.
-        colour: Linear RGB albedo, a factor of the texture's where there is one.
+        name: Name by which lamps refer to it; "" if it has none.
+        colour: Linear RGB albedo, multiplied by the texture's if there is one.
         texture: Linear RGB albedo, float32 [H, W, 3], or None.
         uv_set: n of the texture's `TEXCOORD_n`.
-        placed: Of `KHR_texture_transform`, [2, 3]: the texture lies at this matrix times (u, v, 1); None: at (u, v).
+        placed: Matrix of `KHR_texture_transform`, [2, 3], applied to (u, v, 1); None for the identity.
         emission: Radiance on the front, RGB.
         double: Whether the back reflects as well; otherwise it absorbs all light.
     """
@@ -57,9 +57,9 @@ class Surface:
     Attributes:
         position: float64 [V, 3], in the world.
         triangle: int32 [F, 3]; counter-clockwise as seen from the front.
-        normal: float64 [V, 3], of unit length, for shading; 0 where the file has none.
-        uv: float64 [V, 2], the lightmap's, or None: it has none and isn't baked.
-        texture_uv: float32 [V, 2] of the material's texture, or None.
+        normal: float64 [V, 3], unit shading normals; 0 where the file has none.
+        uv: float64 [V, 2], lightmap UVs; None if it has none and isn't baked.
+        texture_uv: float32 [V, 2], UVs of the material's texture, or None.
         material: The material.
     """
 
@@ -76,11 +76,11 @@ class Geometry:
     """The surfaces of a glTF file.
 
     Attributes:
-        document: The file, in which new UVs would go.
-        surfaces: In the order of the file.
-        replacements: Of an unwrapped file: what `write_glb` needs; otherwise empty.
-        uv_set: n of `TEXCOORD_n`, the lightmap's; None: it wasn't asked for.
-        usual: Whether that is the set that readers take by themselves: 1 where there is one, else 0.
+        document: The file, to which new UVs are written.
+        surfaces: The surfaces in the order of the file.
+        replacements: Input of `write_glb` for an unwrapped file; otherwise empty.
+        uv_set: n of the lightmap's `TEXCOORD_n`; None if it wasn't requested.
+        usual: Whether readers choose this set by default: 1 if it exists, else 0.
     """
 
     document: GltfDocument
@@ -91,7 +91,7 @@ class Geometry:
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lowest and the highest corner, float64 [3] each."""
+        """Returns the lowest and the highest corner of the bounding box, float64 [3] each."""
         used = np.concatenate([each.position[each.triangle.reshape(-1)] for each in self.surfaces])
         return used.min(0), used.max(0)
 
@@ -101,8 +101,8 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
 
     Args:
         path: The file.
-        settings: Which lightmap UVs, or how to make them; None: none are needed.
-        trust: Whether it may name files outside its folder.
+        settings: Selects the lightmap UVs or how to unwrap them; None if no UVs are needed.
+        trust: Whether it may refer to files outside its folder.
 
     Raises:
         WlmError: It can't be read, has no triangle with area, is too small, too large or too far from the origin for
@@ -162,7 +162,7 @@ def _surface(
     uv: np.ndarray | None,
     material: Material,
 ) -> Surface:
-    """Triangles with area, whose front is where their normals point."""
+    """Returns the non-degenerate triangles of a primitive, with fronts on the side of their normals."""
     position = primitive.position[gather]
     triangle = np.asarray(triangle, np.int32)
     a, b, c = position[triangle].transpose(1, 0, 2)
@@ -170,7 +170,7 @@ def _surface(
     kept = np.linalg.norm(face, axis=1) > 0
     triangle, face = triangle[kept], face[kept]
     normal = np.zeros_like(position) if normal is None else normal[gather]
-    # A node that mirrors turns the winding round, and not the normals.
+    # A mirroring node transform reverses the winding but not the normals.
     if len(face) and float(np.einsum("fk,fk->", face, normal[triangle].sum(1))) < 0:
         triangle = triangle[:, [0, 2, 1]]
     if uv is not None:
@@ -189,11 +189,11 @@ def _surface(
 def unwrap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
 ) -> list[Replacement]:
-    """Makes UVs of one square for all primitives together, in proportion to their size in the world.
+    """Creates UVs in one unit square for all primitives together, in proportion to their world-space size.
 
     Args:
-        document: For messages.
-        primitives: Without the UV set that is made.
+        document: The file, for messages.
+        primitives: The primitives without the new UV set.
         settings: Resolution and padding.
 
     Returns:
@@ -209,7 +209,7 @@ def unwrap(
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0
         if area.any():
             kept.append((each, np.flatnonzero(area)))
-            # About their own middle: float32 has few digits far from the origin.
+            # Positions are centred, because float32 is imprecise far from the origin.
             local = (each.position - each.position.mean(0)).astype(np.float32)
             meshes.append(uvunwrap.Mesh(local, each.triangle[area].astype(np.uint32)))
     if not meshes:
@@ -227,7 +227,7 @@ def unwrap(
     for (primitive, numbers), mesh in zip(kept, atlas.meshes, strict=True):
         corner = np.asarray(mesh.corner_uvs, np.float64).reshape(-1, 2) * scale
         vertex = primitive.triangle[numbers].reshape(-1)
-        # A vertex for each place of each old one.
+        # Each old vertex becomes one vertex per distinct UV position.
         rows = np.column_stack([vertex.astype(np.float64), corner])
         unique, index = np.unique(rows, axis=0, return_inverse=True)
         replacements.append(
@@ -244,7 +244,7 @@ def unwrap(
 def _without_lightmap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive]
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """A copy without the UV sets from 1 on: they are an old lightmap's, and in the new one's place.
+    """Returns a copy without the UV sets from 1 on, which belong to an old lightmap and are replaced.
 
     Raises:
         WlmError: A texture reads `TEXCOORD_1` or later.
@@ -265,7 +265,7 @@ def _without_lightmap(
 
 
 def _texture_sets(value: Any) -> list[int]:
-    """The UV sets that a material's textures read."""
+    """Returns the UV sets that a material's textures use."""
     if isinstance(value, list):
         return [one for each in value for one in _texture_sets(each)]
     if not isinstance(value, dict):
@@ -275,7 +275,7 @@ def _texture_sets(value: Any) -> list[int]:
 
 
 def _material(document: GltfDocument, number: int | None) -> Material:
-    """A material as a diffuse one: of metal, whose base colour is that of its reflections, too."""
+    """Converts a material to a diffuse one; the base colour of a metal becomes its albedo too."""
     if number is None:
         return Material()
     content = document.item("materials", number)
@@ -312,7 +312,7 @@ def _material(document: GltfDocument, number: int | None) -> Material:
 
 
 def _placed(where: str, transform: dict[str, Any]) -> np.ndarray:
-    """The matrix of `KHR_texture_transform`: scale, then rotation against the clock as v runs down, then offset."""
+    """Returns the matrix of `KHR_texture_transform`: scale, then counter-clockwise rotation (v down), then offset."""
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
     scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())
     numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
@@ -323,7 +323,7 @@ def _placed(where: str, transform: dict[str, Any]) -> np.ndarray:
 
 
 def _texture(document: GltfDocument, number: int) -> np.ndarray:
-    """An image as linear light, float32 [H, W, 3]."""
+    """Reads an image as linear light, float32 [H, W, 3]."""
     where = f"{document.path}: textures[{number}]"
     image = document.item("images", document.item("textures", number).get("source"))
     if "bufferView" in image:

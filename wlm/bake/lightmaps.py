@@ -1,4 +1,4 @@
-"""Lightmaps over the hours of a scene: irradiance at texels, its noise, what is covered, and the set's list."""
+"""Bakes a scene's lightmaps by the hour: irradiance and noise per texel, coverage, and the set's `set.json`."""
 
 import json
 import os
@@ -27,10 +27,10 @@ FORMAT = "wlm-bake"
 _VERSION = 1
 SET_FILE = "set.json"
 _MESH, _MASK, _COVERAGE = "scene.glb", "mask.png", "coverage.exr"
-_ATLAS, _LIGHT, _DIRECTION = "0", "light", "dir"  # of a set with layers
-_LUMINANCE = (0.212671, 0.715160, 0.072169)  # as Mitsuba has it
-_NOISE = "noise"  # begins the names of pictures of the noise
-_HIDDEN = 0.5  # share of rays that hit backs: of more, the place is within an object
+_ATLAS, _LIGHT, _DIRECTION = "0", "light", "dir"  # names in a set with layers
+_LUMINANCE = (0.212671, 0.715160, 0.072169)  # the weights that Mitsuba uses
+_NOISE = "noise"  # prefix of the names of noise images
+_HIDDEN = 0.5  # share of rays that hit back faces above which a texel counts as inside an object
 _ABOUT = (
     "set.json lists the lightmaps, and of a directional bake dir_*.exr, where light comes from: 0.5 + 0.5 times the "
     "mean direction, in glTF's axes, and 0.5 + 0.5 times its cosine to the normal. noise_*.exr: the standard error of "
@@ -45,17 +45,17 @@ class BakedLightmaps:
     """Lightmaps over time.
 
     Attributes:
-        hours: Rising.
-        light: float16 [T, H, W, 3], irradiance; texels outside the mask have the nearest valid one's.
-        noise: float16 [T, H, W, 3], its standard error, 0 outside the charts.
-        mask: bool [H, W].
+        hours: Hours in ascending order.
+        light: float16 [T, H, W, 3], irradiance; texels outside the mask have the value of the nearest valid texel.
+        noise: float16 [T, H, W, 3], standard error of the irradiance, 0 outside the charts.
+        mask: bool [H, W], true for valid texels.
         coverage: float32 [H, W], the share of each texel that is on a surface.
-        back: float32 [H, W], the share of rays that hit backs.
+        back: float32 [H, W], the share of rays that hit back faces.
         geometry: The surfaces, with their lightmap UVs.
-        direction: float16 [T, H, W, 4] or None, where the light comes from, as Unity's `comp_dir` has it, in glTF's
-            axes: 0.5 + 0.5 d, with d the mean of the directions that light the texel, each by the luminance that it
-            gives, of length 1 where there is but one; then 0.5 + 0.5 n.d, with n the texel's normal. Under a normal
-            m the light is about (0.5 + 0.5 m.d) / (0.5 + 0.5 n.d) of the lightmap's.
+        direction: float16 [T, H, W, 4] or None, dominant light direction encoded like Unity's `comp_dir`, in glTF's
+            axes: 0.5 + 0.5 d, where d is the luminance-weighted mean of the directions of incident light (of length 1
+            for a single direction); then 0.5 + 0.5 n.d, with n the texel's normal. For a shading normal m, the light
+            is about (0.5 + 0.5 m.d) / (0.5 + 0.5 n.d) times the lightmap's.
     """
 
     hours: tuple[float, ...]
@@ -69,7 +69,7 @@ class BakedLightmaps:
 
     @property
     def error(self) -> list[float]:
-        """For each hour the root of the mean square of the noise over that of the light; 0 where all is dark."""
+        """Returns the RMS of the noise divided by the RMS of the light for each hour; 0 if all light is 0."""
         shares = []
         for light, noise in zip(self.light, self.noise, strict=True):
             power = float(np.square(light[self.mask].astype(np.float64)).mean())
@@ -88,23 +88,23 @@ def bake_lightmaps(
 ) -> BakedLightmaps:
     """Bakes the lightmap of a scene at each of its hours.
 
-    All hours have the same random numbers: what noise is left doesn't flicker between them.
+    All hours use the same random numbers, so that remaining noise doesn't flicker between them.
 
     Args:
-        task: From `wlm.bake.work.open_task`.
+        task: Result of `wlm.bake.work.open_task`.
         device: "cpu" or "cuda".
-        checkpoint: From `wlm.bake.work.open_checkpoint`, or None.
+        checkpoint: Result of `wlm.bake.work.open_checkpoint`, or None.
         progress: Called from time to time.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
-            a lamp names a material that isn't there.
+            a lamp names a material that doesn't exist.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     scene = task.scene
     start(device)
     denoise = need("pyoidn", "bake").denoise if scene.denoise else None
-    # Both need Mitsuba's variant to be chosen.
+    # Both modules can only be imported after Mitsuba's variant is set.
     from wlm.bake.paths import irradiance
     from wlm.bake.world import check_lamps, make_hour
 
@@ -155,22 +155,22 @@ def bake_lightmaps(
 
 
 def _directions(sums: np.ndarray) -> np.ndarray:
-    """Mean directions [T, 3] of light [T, 6], see `wlm.bake.paths.irradiance`; 0 where it is dark."""
+    """Computes mean directions [T, 3] from sums [T, 6], see `wlm.bake.paths.irradiance`; 0 without light."""
     total = sums[:, :3] @ np.array(_LUMINANCE, np.float32)
     mean = np.divide(sums[:, 3:], total[:, None], out=np.zeros_like(sums[:, 3:]), where=total[:, None] > 0)
-    # Rounding may leave a single direction a little too long.
+    # Rounding may make a single direction slightly longer than 1.
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
 
 
 def _encoded(texels: Texels, mean: np.ndarray, normal: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """Mean directions [T, 3] as `BakedLightmaps.direction` has them, half floats [H, W, 4]."""
+    """Encodes mean directions [T, 3] for `BakedLightmaps.direction`, half floats [H, W, 4]."""
     levels = np.clip(_finished(texels, 0.5 + 0.5 * mean, mask, denoise), 0.0, 1.0)
     share = 0.5 + 0.5 * ((2.0 * levels - 1.0) * normal).sum(-1, keepdims=True)
     return np.concatenate([levels, np.clip(share, 0.0, 1.0)], -1).astype(np.float16)
 
 
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """A picture, float32, whose gaps have the nearest texel's values, filtered where that is wanted."""
+    """Returns a float32 image with gaps filled from the nearest texel, optionally denoised."""
     picture = fill_gaps(texels.image(values), mask)
     if denoise is not None:
         try:
@@ -182,27 +182,27 @@ def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> 
 
 
 def check_folder(folder: str | os.PathLike[str]) -> None:
-    """Checks, before long work, that lightmaps can be written to a folder.
+    """Checks, before a long bake, that lightmaps can be written to a folder.
 
     Raises:
-        WlmError: They can't, or it holds other files.
+        WlmError: The folder isn't writable, or it contains other files.
     """
     claim(Path(folder), INDEX, FORMAT)
 
 
 def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:
-    """Writes a set that `wlm compress` takes, in place of an earlier one.
+    """Writes a lightmap set for `wlm compress`, replacing an earlier one.
 
     Args:
-        folder: Made if it isn't there.
+        folder: The output folder, created if it doesn't exist.
         task: The scene.
-        baked: Of it.
+        baked: The scene's lightmaps.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        WlmError: It holds other files, or can't be written.
+        WlmError: The folder contains other files, or can't be written.
     """
     folder = Path(folder)
     height, width = baked.mask.shape
@@ -211,7 +211,7 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     if task.scene.period is not None:
         listed["period_hours"] = task.scene.period
     about: dict[str, object] = {"mask": _MASK}
-    if baked.geometry.usual:  # whoever reads the set knows no other
+    if baked.geometry.usual:  # readers of the set can only select the default UV set
         about["mesh"] = _MESH
     names = {layer: [f"{layer}_{stamp}.exr" for stamp in stamps] for layer in (_LIGHT, _DIRECTION)}
     files: list[dict[str, object]] = [{"file": file} for file in names[_LIGHT]]

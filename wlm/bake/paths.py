@@ -1,10 +1,10 @@
-"""Paths of light by Mitsuba: what arrives at places of surfaces, and at points in space.
+"""Path tracing with Mitsuba: incident light at surface points and at points in space.
 
-A place is the first vertex of a path. Lights are sampled from it and from every surface that the path meets, and what a
-path hits by chance counts too; both are weighed by the power heuristic (Veach 1995, with exponent 2). The sun is
-sampled apart from the other lights, so that its direct light can be left out.
+Each path starts at such a point. Lights are sampled from it and from every surface that the path hits, and lights hit
+by the path count too; multiple importance sampling uses the power heuristic (Veach 1995, with exponent 2). The sun is
+sampled separately from the other lights, so that its direct light can be excluded.
 
-Mitsuba's names depend on its variant, which `wlm.bake.backend.start` chooses first.
+Mitsuba's types depend on its variant, which `wlm.bake.backend.start` sets first.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, repor
 SUN_ANGLE = math.radians(0.5358 / 2.0)
 """Radius of the sun's disc in the sky."""
 
-# Steps of the samples' second and third number, of 2^32: the golden ratio and the square root of 2. The first goes
-# through the samples in order: with the second a Fibonacci lattice.
+# Increments of the samples' second and third coordinate, in units of 2^-32: the golden ratio and the square root of 2.
+# The first coordinate is the sample's index; with the second it forms a Fibonacci lattice.
 _GOLDEN, _ROOT = int(2**32 * (math.sqrt(5.0) - 1.0) / 2.0), int(2**32 * (math.sqrt(2.0) - 1.0))
-_PARTS = 8  # that samples are divided into, whose spread tells the noise
-_LANES = 1 << 20  # paths at once
-_RANDOM_BOUNCE = 3  # from which on a path ends at random
+_PARTS = 8  # number of batches of samples, whose spread estimates the noise
+_LANES = 1 << 20  # number of parallel paths
+_RANDOM_BOUNCE = 3  # first bounce with Russian roulette
 _COEFFICIENTS = 9
 
 
@@ -37,8 +37,8 @@ class Sun:
     """The sun.
 
     Attributes:
-        direction: To it, [3], of unit length.
-        irradiance: R, G, B on a surface that faces it.
+        direction: Direction to the sun, [3], of unit length.
+        irradiance: R, G, B on a surface that faces the sun.
     """
 
     direction: tuple[float, float, float]
@@ -47,11 +47,11 @@ class Sun:
 
 @dataclass(frozen=True)
 class Outside:
-    """Light from outside that isn't in Mitsuba's scene: it needs no choice between lights.
+    """Lights that are handled outside Mitsuba's scene, so that they need no random light selection.
 
     Attributes:
-        sun: None: none, or below the horizon.
-        ambient: Radiance from all directions where nothing is hit, R, G, B.
+        sun: The sun; None if there is none or if it is below the horizon.
+        ambient: Radiance of rays that hit no surface, R, G, B.
     """
 
     sun: Sun | None = None
@@ -60,14 +60,14 @@ class Outside:
 
 @dataclass(frozen=True)
 class Tracing:
-    """How paths are traced.
+    """Settings of the path tracer.
 
     Attributes:
         outside: The sun and the ambient light.
-        sun_direct: Whether the sun's direct light counts.
-        samples: Paths a texel or probe, rounded up to a multiple of 8.
-        bounces: Surfaces that reflect light on its way.
-        seed: Of the random numbers.
+        sun_direct: Whether the sun's direct light is included.
+        samples: Paths per texel or probe, rounded up to a multiple of 8.
+        bounces: Maximum number of reflections.
+        seed: Seed of the random numbers.
     """
 
     outside: Outside
@@ -79,13 +79,13 @@ class Tracing:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """What arrives at N places.
+    """Estimated incident light at N points.
 
     Attributes:
-        mean: float32 [N, C].
-        noise: float32 [N, C], the standard error of each.
-        back: float32 [N], the share of first rays that hit the back of a surface that has none: the place is within
-            an object.
+        mean: float32 [N, C], estimates.
+        noise: float32 [N, C], the standard error of each estimate.
+        back: float32 [N], the share of first rays that hit the back of a single-sided surface, which indicates a point
+            inside an object.
     """
 
     mean: np.ndarray
@@ -94,7 +94,7 @@ class Gathered:
 
 
 class _Outside:
-    """The sun and the ambient light in Mitsuba's numbers; kernels don't depend on them, so that hours share these."""
+    """The sun and the ambient light as Mitsuba variables, not constants, so that all hours share the same kernels."""
 
     def __init__(self, outside: Outside) -> None:
         self.ambient = mi.Color3f(*outside.ambient)
@@ -105,24 +105,24 @@ class _Outside:
         dr.make_opaque(self.frame, self.irradiance, self.ambient)
 
     def sample(self, rng: mi.PCG32) -> mi.Vector3f:
-        """A direction to a point of the disc."""
+        """Samples a direction to a point of the sun's disc."""
         square = mi.Point2f(rng.next_float32(), rng.next_float32())
         return self.frame.to_world(mi.warp.square_to_uniform_cone(square, math.cos(SUN_ANGLE)))
 
 
 def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool = False, report: Any = None) -> Gathered:
-    """Irradiance at the texels of a lightmap, the mean over their places.
+    """Computes irradiance at the texels of a lightmap, as the mean over their sample positions.
 
     Args:
-        scene: Of Mitsuba.
+        scene: The Mitsuba scene.
         texels: `wlm.bake.texels.Texels`, T of them.
-        tracing: How.
-        directional: Whether to tell where it comes from, too.
-        report: Called with the share that is done.
+        tracing: Settings of the path tracer.
+        directional: Whether to compute light directions, too.
+        report: Called with the finished share of the work.
 
     Returns:
-        Of three numbers, RGB. With `directional` three more: the sum of the directions that light comes from, each by
-        the luminance (ITU-R BT.709) that it gives to the surface.
+        Estimates with three channels, RGB. With `directional` three more: the sum of the directions of incident light,
+        each weighted by the luminance (ITU-R BT.709) of its irradiance.
     """
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
@@ -136,7 +136,7 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
         it = _interaction(p, face)
         d = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(at[0], at[1])))
         cosine = dr.dot(d, normal)
-        # What is behind the triangle itself is dark whatever the shading normal says.
+        # Directions behind the geometric triangle contribute nothing, regardless of the shading normal.
         seen = (dr.dot(d, face) > 0) & (cosine > 0)
         light, back = _radiance(scene, it, d, cosine * dr.inv_pi, sky, rng, tracing.bounces, seen)
         parts = [(light * dr.pi, d)]
@@ -166,15 +166,15 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
 
 
 def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Radiance at points as L2 spherical harmonics, orthonormal, in the order of `wlm.probe.sphere.basis`.
+    """Projects radiance at points onto orthonormal L2 spherical harmonics, in the order of `wlm.probe.sphere.basis`.
 
     Args:
-        scene: Of Mitsuba.
+        scene: The Mitsuba scene.
         position: float [N, 3].
         tracing, report: As for `irradiance`.
 
     Returns:
-        Of 27 numbers, the coefficients with red, green and blue of each.
+        Estimates with 27 channels: red, green and blue of each coefficient.
     """
     place = mi.Point3f(np.asarray(position, np.float32).T)
     sky = _Outside(tracing.outside)
@@ -204,7 +204,7 @@ def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any
 
 
 def _gather(one: Any, count: int, channels: int, tracing: Tracing, report: Any) -> Gathered:
-    """Means over samples in parts, and what the parts' spread says of the noise."""
+    """Averages samples in batches and estimates the noise from the batches' spread."""
     each = -(-tracing.samples // _PARTS)
     at_once = max(1, _LANES // each)
     total, square = np.zeros((2, count, channels))
@@ -213,22 +213,22 @@ def _gather(one: Any, count: int, channels: int, tracing: Tracing, report: Any) 
     for part in range(_PARTS):
         key = int(keys.spawn(1)[0].generate_state(1, np.uint64)[0])
         for begin in range(0, count, at_once):
-            # A multiple of what fits, so that all but the last share a kernel's size.
+            # All launches except the last have the same size, so that they share a kernel.
             length = min(at_once, count - begin)
             lane = dr.arange(mi.UInt32, length * each)
             number, sample = lane // each, lane % each
             number += dr.opaque(mi.UInt32, begin)
-            # It adds each lane's number to the first one's.
+            # Mitsuba adds each lane's index to this seed.
             rng = mi.PCG32(length * each, dr.opaque(mi.UInt64, key), dr.opaque(mi.UInt64, begin * each))
             shift = mi.sample_tea_32(number, dr.opaque(mi.UInt32, key & 0xFFFFFFFF), 8)
             third = mi.sample_tea_32(number, dr.opaque(mi.UInt32, key >> 32), 8)[0]
-            # Next to 1 it would be the square's edge, from which directions can't be told.
+            # Values rounded to 1 lie on the edge of the unit square, where the mapping to directions is degenerate.
             at = tuple(
                 dr.minimum(mi.Float((start + sample * step) >> 8) * 2.0**-24, 1.0 - 2.0**-24)
                 for start, step in zip((*shift, third), (2**32 // each % 2**32, _GOLDEN, _ROOT), strict=True)
             )
             values, hidden = one(number, at, rng)
-            # A path that meets an edge of no width may come to no number.
+            # A path that hits a degenerate edge may yield NaN.
             sums = [dr.block_sum(dr.select(dr.isfinite(value), value, 0.0), each) for value in (*values, hidden)]
             dr.eval(*sums)
             block = np.stack([value.numpy() for value in sums], -1).astype(np.float64) / each
@@ -252,8 +252,8 @@ def _radiance(
     bounces: int,
     active: mi.Bool,
 ) -> tuple[mi.Color3f, mi.Bool]:
-    """Light that arrives from a direction, and whether the ray hits a back; lights that it hits are weighed against
-    sampling them from the start, the direction having been chosen with a density `pdf`."""
+    """Traces a path in a direction sampled with density `pdf`; returns its radiance and whether the first ray hits a
+    back face. Lights that it hits are weighted against light sampling by multiple importance sampling."""
     context = mi.BSDFContext()
 
     def body(ray, light, share, before, pdf, rng, back, depth, active):
@@ -309,20 +309,20 @@ def _radiance(
 
 
 def _interaction(p: mi.Point3f, normal: mi.Vector3f) -> mi.Interaction3f:
-    """A place that rays begin at, off the surface by rounding's width; a normal of 0 is no surface."""
+    """Creates the origin of rays, offset from the surface against self-intersection; a normal of 0 means no surface."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p, it.n = p, mi.Normal3f(normal)
     return it
 
 
 def _heuristic(pdf: mi.Float, other: mi.Float) -> mi.Float:
-    """The weight of a sample of density `pdf` that could have been made with the other density."""
+    """Returns the power heuristic's weight of a sample of density `pdf` against the other strategy's density."""
     a, b = dr.square(pdf), dr.square(other)
     return dr.select(a > 0, a / (a + b), 0.0)
 
 
 def _basis(d: mi.Vector3f) -> list[mi.Float]:
-    """Orthonormal real SH: L00, y, z, x, xy, yz, 3z2-1, xz, x2-y2."""
+    """Evaluates orthonormal real SH: L00, y, z, x, xy, yz, 3z2-1, xz, x2-y2."""
     first, second = math.sqrt(3.0 / (4.0 * math.pi)), math.sqrt(15.0 / (4.0 * math.pi))
     return [
         mi.Float(math.sqrt(0.25 / math.pi)),

@@ -1,4 +1,4 @@
-"""Light probes of a scene by the hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
+"""Bakes a scene's light probes by the hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
 
 import math
 import os
@@ -20,7 +20,7 @@ from wlm.system import OnProgress
 
 _MOST = 1 << 20
 _NUMBERS = 27
-_HIDDEN = 0.25  # share of rays that hit backs: of more, the probe is within an object, and dark
+_HIDDEN = 0.25  # share of rays that hit back faces above which a probe counts as inside an object and is 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,10 @@ class BakedProbes:
     """Probes over time.
 
     Attributes:
-        hours: Rising.
-        position: float32 [N, 3].
-        values: float32 [T, N, 9, 3], orthonormal SH of radiance, RGB; 0 of a probe within an object.
-        noise: float32 [T, N, 9, 3], the standard errors.
+        hours: Hours in ascending order.
+        position: float32 [N, 3], metres.
+        values: float32 [T, N, 9, 3], orthonormal SH of radiance, RGB; 0 for a probe inside an object.
+        noise: float32 [T, N, 9, 3], standard errors of the values.
     """
 
     hours: tuple[float, ...]
@@ -41,19 +41,19 @@ class BakedProbes:
 
 
 def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
-    """The probes' places, float32 [N, 3].
+    """Computes the probes' positions, float32 [N, 3].
 
     Args:
-        settings: How far apart, on surfaces or in a lattice.
+        settings: Spacing, and whether probes lie on surfaces or in a lattice.
         geometry: The surfaces.
-        seed: Of the places on surfaces.
+        seed: Seed of the random positions on surfaces.
 
     Raises:
-        WlmError: There would be more than a million.
+        WlmError: There would be more than a million probes.
     """
     low, high = geometry.box
     if not settings.surfaces:
-        # In the middle of cells, as many as there is room for, and one where there is none.
+        # Probes lie in the middle of cells; each axis has the number of cells that fit, at least one.
         cells = np.maximum(1.0, np.floor((high - low) / settings.spacing + 1e-6))
         _check_count(float(np.prod(cells)))
         axes = [
@@ -69,7 +69,7 @@ def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> 
     _check_count(count)
     count = max(1, round(count))
     generator = np.random.default_rng(seed)
-    # Stratified by area, so that neighbours on the list are as far apart as they can be.
+    # Positions are stratified by surface area, so that they are evenly distributed.
     share = np.cumsum(double) / double.sum()
     chosen = np.searchsorted(share, (np.arange(count) + generator.random(count)) / count).clip(max=len(share) - 1)
     u, v = generator.random((2, count, 1))
@@ -97,11 +97,11 @@ def bake_probes(
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, there are too many probes, or a lamp
-            names a material that isn't there.
+            names a material that doesn't exist.
     """
     scene = task.scene
     start(device)
-    # Both need Mitsuba's variant to be chosen.
+    # Both modules can only be imported after Mitsuba's variant is set.
     from wlm.bake.paths import harmonics
     from wlm.bake.world import check_lamps, make_hour
 
@@ -133,7 +133,7 @@ def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
     """Writes probes as `.npz`: `position`, `sh` of one hour or `sh_HOUR` of several, and the noise likewise.
 
     Raises:
-        WlmError: It can't be written.
+        WlmError: The file can't be written.
     """
     single = len(baked.hours) == 1
     arrays: dict[str, np.ndarray] = {"position": baked.position, "convention": np.array(CANONICAL)}
@@ -145,7 +145,7 @@ def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
 
 
 def noise_share(baked: BakedProbes) -> list[float]:
-    """For each hour the root of the mean square of the noise over that of the values; 0 where all is dark."""
+    """Returns the RMS of the noise divided by the RMS of the values for each hour; 0 if all values are 0."""
     shares = []
     for values, noise in zip(baked.values, baked.noise, strict=True):
         live = values.any(axis=(1, 2))

@@ -1,4 +1,4 @@
-"""The scene of a bake: a YAML file that names a glTF file, its lights by hour, and how finely to compute.
+"""Settings of a bake: a YAML file that names a glTF file, lights by the hour, resolution and sampling.
 
     geometry: room.gltf
     hours: [6, 9, 12, 15, 18, 21]
@@ -10,8 +10,8 @@
     probes: {spacing: 0.5}
     samples: 256
 
-Lengths are the glTF file's, metres; +y is up, as in glTF. Light is linear RGB: daylight comes in W/m2/nm, as Mitsuba's
-model of it does (a clear noon has about 1.5), times `scale`; all else in the same unit or any other.
+Lengths are the glTF file's, metres; +y is up, as in glTF. Light is linear RGB: daylight is in W/m2/nm, the unit of
+Mitsuba's model (about 1.5 at a clear noon), times `scale`; other lights use the same unit or any other.
 """
 
 import os
@@ -40,17 +40,17 @@ class _Settings(BaseModel):
 
 
 class Daylight(_Settings):
-    """Sun and sky by the hour, as Mitsuba's `sunsky` has them (Hosek and Wilkie 2012, 2013); the hour is the sun's own.
+    """Sun and sky by solar time, from Mitsuba's `sunsky` (Hosek and Wilkie 2012, 2013).
 
     Attributes:
         latitude: Degrees, north positive.
-        day: Of the year, 1 to 366.
+        day: Day of the year, 1 to 366.
         north: Degrees by which north is turned from -z towards -x.
-        turbidity: 1 is air alone, 10 is haze.
-        albedo: Of the ground, which the sky reflects.
-        scale: A factor for both.
-        direct: Whether what the sun lights directly is in the result; its bounces are in any case.
-        night: Radiance of the sky added at any hour.
+        turbidity: Turbidity of the air: 1 is clear air, 10 is haze.
+        albedo: Albedo of the ground, which affects the sky.
+        scale: Factor of the sun and the sky.
+        direct: Whether the result includes the sun's direct light; it always includes its indirect light.
+        night: Radiance of the sky added at all hours.
     """
 
     latitude: float = Field(45.0, ge=-90.0, le=90.0)
@@ -64,12 +64,12 @@ class Daylight(_Settings):
 
 
 class Sky(_Settings):
-    """Light from all around that is the same at all hours.
+    """Environment light that is the same at all hours.
 
     Attributes:
-        radiance: Of all directions, or a factor for the picture.
-        file: A picture of all directions in a `.exr`, `.hdr`, `.ktx2` or `.dds`, twice as wide as high: the top row is
-            +y, the middle column -z, columns to the right of it turn towards +x; None: none.
+        radiance: Radiance from all directions, or a factor of the environment map.
+        file: An equirectangular environment map (`.exr`, `.hdr`, `.ktx2` or `.dds`), twice as wide as high: the top row
+            is +y, the middle column -z, columns to the right of it turn towards +x; None for no map.
     """
 
     radiance: Colour = (1.0, 1.0, 1.0)
@@ -77,14 +77,14 @@ class Sky(_Settings):
 
 
 class Lamp(_Settings):
-    """A point light, or a material that glows in place of what the glTF file says of it.
+    """A point light, or a material whose emission replaces the glTF file's.
 
     Attributes:
-        position: Of a point.
-        intensity: Of a point, per solid angle: the irradiance at a distance r is intensity / r^2.
-        material: A material's name.
-        radiance: Of the material's surfaces, on their front.
-        lit: Hours between which it is lit, the first included; past midnight where the second is less. None: always.
+        position: Position of a point light.
+        intensity: Radiant intensity of a point light: the irradiance at a distance r is intensity / r^2.
+        material: Name of the emissive material.
+        radiance: Radiance of the fronts of the material's surfaces.
+        lit: Hours at which it is switched on and off, the first included; may span midnight. None: always on.
     """
 
     position: _Vector | None = None
@@ -103,7 +103,7 @@ class Lamp(_Settings):
         return self
 
     def is_lit(self, hour: float) -> bool:
-        """Whether it is lit at an hour."""
+        """Returns whether the lamp is on at an hour."""
         if self.lit is None:
             return True
         on, off = self.lit
@@ -111,15 +111,15 @@ class Lamp(_Settings):
 
 
 class LightmapSettings(_Settings):
-    """How the lightmap is laid out.
+    """Layout of the lightmap.
 
     Attributes:
         resolution: Texels along a side.
-        uv_set: n of `TEXCOORD_n`; None: 1 where there is one, else 0.
-        unwrap: Whether to make new UVs, `TEXCOORD_1`, and write the mesh with them.
+        uv_set: n of `TEXCOORD_n`; None: 1 if it exists, else 0.
+        unwrap: Whether to create new UVs, `TEXCOORD_1`, and write the mesh with them.
         padding: Texels between new charts.
-        supersample: Places along a texel's side that its light is the mean of.
-        directional: Whether to bake where the light comes from, too.
+        supersample: Sample positions along a texel's side; a texel is their mean.
+        directional: Whether to bake light directions, too.
     """
 
     resolution: int = Field(256, ge=8, le=4096)
@@ -131,13 +131,13 @@ class LightmapSettings(_Settings):
 
 
 class ProbeSettings(_Settings):
-    """Where the probes are.
+    """Positions of the probes.
 
     Attributes:
-        spacing: Between neighbours.
-        surfaces: Whether they lie on surfaces, at random, one for each square of `spacing`; otherwise in a lattice in
-            the geometry's box.
-        lift: Of those on surfaces, how far off.
+        spacing: Distance between neighbours.
+        surfaces: Whether they lie at random positions on surfaces, one per area of `spacing` squared; otherwise in a
+            lattice in the geometry's bounding box.
+        lift: Distance of probes on surfaces from their surface.
     """
 
     spacing: float = Field(1.0, gt=0.0, le=1e9)
@@ -146,18 +146,18 @@ class ProbeSettings(_Settings):
 
 
 class BakeScene(_Settings):
-    """A scene.
+    """Settings of a baked scene.
 
     Attributes:
-        geometry: A `.glb` or `.gltf` beside the YAML file.
-        name: Of the set.
-        hours: To bake at.
-        period: Length of the day, None where the hours aren't of a day.
-        daylight, sky: Light from outside; one of both at most.
-        lamps: Lights with times. Materials that glow in the glTF file glow always, unless a lamp names them.
-        lightmap, probes: What is baked.
-        samples: Paths of a texel, or of a probe.
-        bounces: Surfaces that reflect the light on its way, at most.
+        geometry: A `.glb` or `.gltf` in the YAML file's folder.
+        name: Name of the lightmap set.
+        hours: Hours to bake.
+        period: Length of the day in hours; None if the hours don't repeat.
+        daylight, sky: Light from outside; at most one of them.
+        lamps: Lights with times. Emissive materials of the glTF file are always on, unless a lamp names them.
+        lightmap, probes: Settings of the lightmap and of the probes.
+        samples: Paths per texel or per probe.
+        bounces: Maximum number of reflections of a path.
         denoise: Whether Intel's Open Image Denoise filters the lightmaps.
         seed: One seed gives one result on one device.
     """
@@ -188,7 +188,7 @@ class BakeScene(_Settings):
 
     @property
     def sun_direct(self) -> bool:
-        """Whether the sun's own light is in the result."""
+        """Whether the result includes the sun's direct light."""
         return self.daylight is not None and self.daylight.direct
 
 
@@ -197,10 +197,10 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False) -> tuple[BakeS
 
     Args:
         path: The YAML file.
-        trust: Whether it may name files outside its folder.
+        trust: Whether it may refer to files outside its folder.
 
     Returns:
-        The settings, the glTF file, and the sky's picture or None.
+        The settings, the path of the glTF file, and the path of the environment map or None.
 
     Raises:
         WlmError: The file can't be read, or a setting is wrong.

@@ -1,4 +1,4 @@
-"""Six-way lightmaps of smoke with light of every order of scattering, by the path tracer of `wlm.smoke.transport`.
+"""Bakes six-way lightmaps of smoke with multiple scattering, using the path tracer of `wlm.smoke.transport`.
 
 smoke: jet.nvdb
 camera: {toward: [0, 0, 1], resolution: 256}
@@ -27,19 +27,19 @@ _Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 class SixWayScene(BaseModel):
-    """What to bake.
+    """Settings of a six-way bake.
 
     Attributes:
         smoke: A `.npz`, `.nvdb` or `.vdb` volume, or a folder of frames, beside the YAML file.
-        camera: Orthographic; as of a scene of `wlm smoke`.
-        extinction, emission: Factors of the smoke's density and temperature; None: the scene's, or 1.
-        up: The axis that is up in files of other programs.
-        albedo: The share of light that a scattering leaves.
+        camera: An orthographic camera, with the settings of a `wlm smoke` scene.
+        extinction, emission: Factors of the smoke's density and temperature; None uses the scene's, or 1.
+        up: The up axis in files of other programs.
+        albedo: Single-scattering albedo.
         g: Mean cosine of the Henyey-Greenstein phase function.
-        samples: Paths a pixel.
-        highest: Scatterings after which a path ends; None: none.
-        step: In voxels, of the march that gives the transparency.
-        seed: One seed gives one result on one kind of device.
+        samples: Paths per pixel.
+        highest: Maximum number of scattering events of a path; None for no limit.
+        step: Step in voxels of the march that computes the transparency.
+        seed: Random seed; one seed gives one result on one kind of device.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -65,7 +65,7 @@ def load_sixway(
     Args:
         path: The YAML file.
         device: "cpu" or "cuda:N".
-        trust: Whether it may name files outside its folder, and volumes are as large as they say.
+        trust: Whether it may refer to files outside its folder, and whether volumes may exceed the size limits.
 
     Raises:
         WlmError: A file can't be read, or a setting is wrong.
@@ -78,21 +78,21 @@ def load_sixway(
 
 
 def bake_sixway(volume: DensityVolume, camera: Camera, settings: SixWayScene) -> tuple[SixWay, float]:
-    """Traces the light from six directions; emission and transparency are those of a march.
+    """Traces light from six directions; ray marching computes emission and transparency.
 
     Args:
         volume: The smoke.
-        camera: Orthographic.
-        settings: The scene's.
+        camera: An orthographic camera.
+        settings: The settings of the scene.
 
     Returns:
-        The lightmaps, of `settings.albedo`, and the root of their noise's mean square over that of their light.
+        The lightmaps, with `settings.albedo`, and the RMS of their noise divided by the RMS of their light.
 
     Raises:
-        WlmError: The smoke is so dense that paths would hardly end, or it doesn't fit into the memory.
+        WlmError: The smoke is so dense that paths would become extremely long, or it doesn't fit into memory.
     """
     marched = bake(volume, camera, step=settings.step, g=settings.g, estimate=False)
-    # All six lightmaps share their paths. Of hot smoke they are of the lights alone.
+    # All six lightmaps share their paths. The lightmaps of emissive smoke exclude its emission.
     lights = [Light(tuple(map(float, direction @ camera.axes)), (4.0 * math.pi,) * 3) for direction in VECTORS]
     options = {} if settings.highest is None else {"highest": settings.highest}
     traced = trace(
@@ -106,7 +106,7 @@ def bake_sixway(volume: DensityVolume, camera: Camera, settings: SixWayScene) ->
         seed=settings.seed,
         **options,
     )
-    # The light is white and so is the smoke: any channel is as the others.
+    # Light and smoke are white, so all channels are equal.
     light = traced.planes[: len(lights)].sum(1)[..., 0]
     power = float(light.double().square().mean())
     noise = traced.noise[: len(lights), ..., 0]

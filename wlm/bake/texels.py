@@ -1,4 +1,4 @@
-"""Where a lightmap's texels are on the surfaces: places within each, normals, and how much of it is covered."""
+"""Maps a lightmap's texels to surfaces: sample positions and normals within each texel, and its coverage."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from wlm.bake.geometry import Surface
 from wlm.errors import WlmError
 from wlm.ops import interpolate, rasterize_uv
 
-_OVERLAP = 0.01  # share of the covered places that may lie in two triangles: edges do
-_MOST_SIDE = 16384  # places along a side
+_OVERLAP = 0.01  # share of the covered samples that may lie in two triangles, as on edges
+_MOST_SIDE = 16384  # sample positions along a side of the lightmap
 
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """The texels of a lightmap that surfaces cover, T of them, with N places in all.
+    """The T covered texels of a lightmap, with N sample positions in total.
 
     Attributes:
-        height, width: Of the lightmap.
-        index: int64 [T], row * width + column, rising.
-        first: int64 [T + 1], where each texel's places begin.
-        position: float32 [N, 3].
-        normal: float32 [N, 3], of unit length, for shading.
-        face: float32 [N, 3], of unit length, the triangle's own, on the same side.
+        height, width: Size of the lightmap in texels.
+        index: int64 [T], row * width + column, ascending.
+        first: int64 [T + 1], index of each texel's first sample.
+        position: float32 [N, 3], sample positions.
+        normal: float32 [N, 3], unit shading normals.
+        face: float32 [N, 3], unit geometric normals of the triangles, on the same side.
         coverage: float32 [T], the covered share of the texel.
     """
 
@@ -38,28 +38,28 @@ class Texels:
     coverage: np.ndarray
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """A picture of values [T, ...], float32 [H, W, ...], 0 where nothing is covered."""
+        """Scatters values [T, ...] to an image, float32 [H, W, ...], 0 in uncovered texels."""
         picture = np.zeros((self.height * self.width, *values.shape[1:]), np.float32)
         picture[self.index] = values
         return picture.reshape(self.height, self.width, *values.shape[1:])
 
     def mean_normal(self) -> np.ndarray:
-        """The texels' normals for shading, float32 [T, 3], of unit length."""
+        """Returns the texels' mean shading normals, float32 [T, 3], of unit length."""
         total = np.add.reduceat(self.normal, self.first[:-1])
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
 
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
-    """Finds the places of all texels: a lattice in each, as far as it is covered.
+    """Computes the sample positions of all texels: the covered points of a lattice in each texel.
 
     Args:
-        where: Names the geometry in errors.
-        surfaces: Those without lightmap UVs are left out.
+        where: Name of the geometry in errors.
+        surfaces: The surfaces; those without lightmap UVs are skipped.
         resolution: Texels along a side.
-        supersample: Places along a texel's side.
+        supersample: Sample positions along a texel's side.
 
     Raises:
-        WlmError: There are too many places, no triangle covers one, or charts overlap.
+        WlmError: There are too many samples, no triangle covers one, or charts overlap.
     """
     used = [each for each in surfaces if each.uv is not None]
     side = resolution * supersample
@@ -75,7 +75,7 @@ def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, super
     face = np.cross(b - a, c - a)
     face /= np.linalg.norm(face, axis=1, keepdims=True)
     corner = np.concatenate([each.normal for each in used])[triangle]
-    # A normal that is missing, or on the other side of its triangle, would take light from within the surface.
+    # A normal that is missing, or on the other side of its triangle, would gather light from inside the surface.
     wrong = np.einsum("fck,fk->fc", corner, face) <= 0
     corner[wrong] = np.broadcast_to(face[:, None], corner.shape)[wrong]
     raster = rasterize_uv(torch.tensor(uv, dtype=torch.float32), torch.tensor(triangle), side, side, coverage=True)

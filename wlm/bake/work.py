@@ -1,4 +1,4 @@
-"""What bakes share: hours one after another, kept in a checkpoint; what the result depends on."""
+"""Shared code of bakes: reading the scene, and computing the hours in order with a checkpoint."""
 
 import hashlib
 import os
@@ -17,20 +17,20 @@ from wlm.formats.parts import Part
 from wlm.formats.reading import read_file
 from wlm.system import Meter, OnProgress
 
-_REPORTS = 100  # of an hour
+_REPORTS = 100  # progress reports per hour
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A scene file and what it names.
+    """A scene file and the files that it refers to.
 
     Attributes:
         scene: The settings.
         path: The YAML file.
         geometry: The glTF file.
-        sky: The sky's picture, float32 [H, W, 3], or None.
-        source: 32 hexadecimal digits of BLAKE2b over the geometry and the picture.
-        trust: Whether the files may name others outside their folder.
+        sky: The environment map, float32 [H, W, 3], or None.
+        source: 32 hexadecimal digits of BLAKE2b over the geometry and the environment map.
+        trust: Whether the files may refer to files outside their folder.
     """
 
     scene: BakeScene
@@ -42,15 +42,15 @@ class Task:
 
 
 def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bool = False) -> Task:
-    """Reads a scene file and the sky's picture.
+    """Reads a scene file and its environment map.
 
     Args:
         path: The YAML file.
-        trust: Whether it may name files outside its folder.
-        directional: Whether lightmaps tell where their light comes from, also where the file doesn't say so.
+        trust: Whether it may refer to files outside its folder.
+        directional: Whether to bake light directions even if the file doesn't request them.
 
     Raises:
-        WlmError: A file can't be read, a setting is wrong, or the picture isn't one of light from all around.
+        WlmError: A file can't be read, a setting is wrong, or the image isn't an environment map.
     """
     scene, geometry, picture = load_scene(path, trust)
     if directional:
@@ -71,19 +71,19 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
 def open_checkpoint(
     output: str | os.PathLike[str], task: Task, what: str, device: str, *, resume: bool = False
 ) -> Checkpoint:
-    """Opens the file that keeps a bake's finished hours, beside its output.
+    """Opens the checkpoint file that stores a bake's finished hours, beside its output.
 
     Args:
-        output: Of the bake.
+        output: Output path of the bake.
         task: The scene.
         what: "lightmaps" or "probes".
         device: "cpu" or "cuda".
-        resume: Whether to go on from it, if it is there.
+        resume: Whether to continue from the file if it exists.
 
     Raises:
-        WlmError: With `resume`: it is damaged, or of another bake.
+        WlmError: With `resume`, the file is damaged or belongs to another bake.
     """
-    # Those of the other bake change nothing.
+    # Settings of the other kind of bake don't affect the result.
     settings = task.scene.model_dump(mode="json", exclude={"probes" if what == "lightmaps" else "lightmap"})
     fit = {"input": task.source, "scene": settings, "device": device}
     path = os.path.realpath(output)
@@ -97,20 +97,20 @@ def each_hour(
     make: Callable[[float, Callable[[float], None]], dict[str, np.ndarray]],
     progress: OnProgress | None,
 ) -> list[dict[str, np.ndarray]]:
-    """Makes what belongs to each hour, but for those that the checkpoint has.
+    """Computes the result of each hour, except those in the checkpoint.
 
     Args:
         hours: The hours.
-        checkpoint: Where they are kept; None: nowhere.
-        table: What an hour's result holds.
-        make: Makes an hour's, and calls its second argument with the share that is done.
-        progress: Called from time to time.
+        checkpoint: Stores finished hours; None stores nothing.
+        table: The arrays of an hour's result.
+        make: Computes an hour's result, and calls its second argument with the finished share.
+        progress: Called regularly.
     """
     try:
         return _hours(hours, checkpoint, table, make, Meter(progress, "bake", _REPORTS * len(hours)))
     except KeyboardInterrupt:
         if checkpoint is not None:
-            # Hours that come fast aren't written one by one.
+            # Hours that finish quickly aren't written individually.
             checkpoint.flush()
         raise
 

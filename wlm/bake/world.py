@@ -1,4 +1,4 @@
-"""A scene as Mitsuba has it: surfaces, and the lights of an hour."""
+"""Builds the Mitsuba scene: surfaces and the lights of an hour."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _DAY = 24.0
 
 @dataclass(frozen=True, eq=False)
 class Hour:
-    """What lights a scene at an hour.
+    """A scene and its lights at an hour.
 
     Attributes:
-        scene: Of Mitsuba, with all lights but the sun, and light that is the same from all around.
-        tracing: How paths are traced in it, and those two.
+        scene: The Mitsuba scene, with all lights except the sun and uniform ambient light.
+        tracing: Settings of the path tracer, which include these two lights.
     """
 
     scene: Any
@@ -39,10 +39,10 @@ class Hour:
 
 
 def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
-    """Checks that the materials that lamps name are there; `path` is the scene's, for the message.
+    """Checks that the materials named by lamps exist; `path` is the scene file, for the message.
 
     Raises:
-        WlmError: One isn't.
+        WlmError: A material doesn't exist.
     """
     names = sorted({each.material.name for each in geometry.surfaces})
     for i, lamp in enumerate(scene.lamps):
@@ -51,12 +51,12 @@ def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
 
 
 def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> Hour:
-    """Makes a scene at an hour.
+    """Builds the scene at an hour.
 
     Args:
         scene: The settings.
-        geometry: Its surfaces.
-        picture: Of the sky, float32 [H, W, 3], or None.
+        geometry: The surfaces.
+        picture: The environment map, float32 [H, W, 3], or None.
         hour: The hour.
     """
     content: dict[str, Any] = {"type": "scene"}
@@ -85,13 +85,13 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
 
 
 def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None, np.ndarray]:
-    """The sun, and the sky as a picture, float32 [H, W, 3]: its top row is up, its middle column -z."""
+    """Computes the sun and an environment map of the sky, float32 [H, W, 3]: top row up, middle column -z."""
     toward = sun_direction(hour, settings.latitude, settings.day, settings.north, period)
     rows, columns = _SKY_ROWS, 2 * _SKY_ROWS
     sky = np.zeros((rows, columns, 3), np.float32)
     sun = None
     if toward[1] > 0:
-        # Mitsuba's model has z up; x and y of it are our x and -z.
+        # Mitsuba's sky model has z up; its x and y are our x and -z.
         local = [float(toward[0]), float(-toward[2]), float(toward[1])]
         common = {
             "type": "sunsky",
@@ -106,7 +106,7 @@ def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None
         d = np.stack([level * np.tile(np.sin(around), rows), level * np.tile(np.cos(around), rows), up])
         above = _eval(common | {"sun_scale": 0.0}, d).reshape(rows, columns, 3)
         sky = np.where((np.cos(polar) > 0)[:, None, None], np.maximum(above, 0.0), 0.0) * np.float32(settings.scale)
-        # The disc is darker towards its edge: its mean.
+        # The disc is darker towards its edge, so its mean radiance is used.
         generator = np.random.default_rng(0)
         cosine = 1.0 - generator.random(_DISC_SAMPLES) * (1.0 - math.cos(SUN_ANGLE))
         turn = generator.random(_DISC_SAMPLES) * 2.0 * math.pi
@@ -123,14 +123,14 @@ def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None
 
 
 def _eval(emitter: dict[str, Any], directions: np.ndarray) -> np.ndarray:
-    """Radiance of a light far off in directions [3, N], float32 [N, 3]."""
+    """Evaluates the radiance of a distant light in directions [3, N], float32 [N, 3]."""
     si = dr.zeros(mi.SurfaceInteraction3f, directions.shape[1])
     si.wi = -mi.Vector3f(directions.astype(np.float32))
     return np.asarray(mi.load_dict(emitter).eval(si)).T
 
 
 def _mesh(surface: Surface, emission: tuple[float, float, float], name: str) -> Any:
-    """A mesh of flat triangles; a vertex for each, since texture UVs are one to a vertex."""
+    """Builds a mesh without vertex normals (flat shading), with one texture UV per vertex."""
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": _reflectance(surface)}
     if surface.material.double:
         bsdf = {"type": "twosided", "bsdf": bsdf}

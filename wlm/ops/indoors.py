@@ -111,7 +111,7 @@ def _standing(mesh: wp.Mesh, corner: np.ndarray, normal: np.ndarray, height: flo
     a, b, c = (corner[floor, k] for k in range(3))
     place = (1.0 - root) * a + root * ((1.0 - share) * b + share * c)
     eye = place + [0.0, height, 0.0]
-    # Clearance: the first hit below the eyes is the floor, and the first hit of a ray up from the floor is above them.
+    # Clearance: if the first hit of a ray down from the eye is the floor, no triangle lies between them.
     y = 1.0 - (2.0 * np.arange(_RAYS) + 1.0) / _RAYS
     azimuth, radius = np.arange(_RAYS) * _GOLDEN_ANGLE, np.sqrt(1.0 - y * y)
     ray = np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)

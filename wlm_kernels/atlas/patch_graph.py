@@ -158,7 +158,7 @@ def _alike(
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
         return 0
-    # No interpolation leaves the range of a patch: bounds by two ranges hold for every sample in every order.
+    # Interpolation stays within a patch's range, so bounds from two ranges are valid for all samples and orders.
     most = int(0)
     least = int(0)
     for c in range(3):

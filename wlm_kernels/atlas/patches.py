@@ -14,7 +14,7 @@ depends on the device:
 - The lightmap has 16 bits per channel, vertices are in 1/65536 of a texel, and a sample's place is rounded to 1/256 of
   a texel, as texture filters of GPUs do.
 - Dist (eq. 2) is summed exactly. If two patches differ in size the smaller is interpolated linearly in the
-  triangles of its own lattice, in multiples of 1 / (n - 1) of a level. That favours no vertex; with square cells the
+  triangles of its lattice, in multiples of 1 / (n - 1) of a level. That favours no vertex; with square cells the
   result would change with the order.
 
 The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].

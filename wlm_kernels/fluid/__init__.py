@@ -1,1 +1,1 @@
-"""Kernels of fluids."""
+"""Kernels of the fluid solver: lattice Boltzmann air and advected smoke."""

@@ -1,7 +1,7 @@
 """Advection of smoke, d rho / dt + u . grad rho = 0, on a grid finer than that of the velocities
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
-Read `tests/reference/advection.py` first: the same step in float64 NumPy, cell by cell.
+Read `tests/reference/advection.py` first: it is the same step in float64 NumPy, cell by cell.
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
   rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. A midpoint within `REACH` of
@@ -97,7 +97,7 @@ class Fields:
 
     @functools.cached_property
     def arrays(self) -> Any:
-        """The fields as kernels take them."""
+        """Packs the fields for kernels."""
         struct = fields_struct(self.density.dtype)()
         struct.density, struct.temperature = self.density, self.temperature
         return struct
@@ -138,7 +138,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate(field: wp.array1d[stored], at: FlatStencil) -> float:
-        """A field at a point, trilinear."""
+        """Interpolates a field trilinearly at a point."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -151,7 +151,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        """`interpolate` beside a solid: solid cells are excluded, the other weights are scaled up."""
+        """Interpolates beside a solid: solid cells are excluded, and the other weights are scaled up."""
         at = stencil(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
@@ -161,12 +161,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 w = stencil_weight(at, k)
                 total += w * value_at(field, index_of(box.n, cell))
                 weight += w
-        # 0 if all eight cells are solid.
+        # The result is 0 if all eight cells are solid.
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
     def limited(field: wp.array1d[stored], at: FlatStencil, value: float) -> float:
-        """A value clamped to the range of the values that `interpolate` reads."""
+        """Clamps a value to the range of the values that `interpolate` reads."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -216,7 +216,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
-        """The first cell of run i of the whole domain, or of the k-th listed brick."""
+        """Returns the first cell of run i of the whole domain, or of the k-th listed brick."""
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])

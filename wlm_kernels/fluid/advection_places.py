@@ -128,7 +128,7 @@ class TrilinearVelocity:
 
 @wp.func
 def _neighbour(i: int, n: int, periodic: int) -> int:
-    """A cell within the grid for any i, even one that was converted from NaN."""
+    """Returns a cell within the grid for any i, even one that was converted from NaN."""
     if periodic != 0:
         if i < 0:
             i = i + n
@@ -157,7 +157,7 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
 
 @wp.func
 def stencil_index(at: Stencil, k: int) -> wp.vec3i:
-    """The k-th of the eight cells."""
+    """Returns the k-th of the eight cells."""
     return wp.vec3i(
         wp.where(k // 4 == 0, at.low[0], at.high[0]),
         wp.where(k // 2 % 2 == 0, at.low[1], at.high[1]),
@@ -167,7 +167,7 @@ def stencil_index(at: Stencil, k: int) -> wp.vec3i:
 
 @wp.func
 def stencil_weight(at: Stencil, k: int) -> float:
-    """The trilinear weight of the k-th cell."""
+    """Returns the trilinear weight of the k-th cell."""
     x = wp.where(k // 4 == 0, 1.0 - at.f[0], at.f[0])
     y = wp.where(k // 2 % 2 == 0, 1.0 - at.f[1], at.f[1])
     z = wp.where(k % 2 == 0, 1.0 - at.f[2], at.f[2])
@@ -176,7 +176,7 @@ def stencil_weight(at: Stencil, k: int) -> float:
 
 @wp.func
 def _pair(i: int, n: int, periodic: int):
-    """The lower of the cells i and i + 1 along an axis, and the step from it to the upper."""
+    """Returns the lower of the cells i and i + 1 along an axis, and the step from it to the upper."""
     low = i
     step = int(1)
     # Cells away from the ends of the axis need no wrapping.
@@ -188,7 +188,7 @@ def _pair(i: int, n: int, periodic: int):
 
 @wp.func
 def flat_stencil(box: Box, p: wp.vec3) -> FlatStencil:
-    """The eight fine cells around a point of the domain."""
+    """Finds the eight fine cells around a point of the domain."""
     at = p - wp.vec3(0.5, 0.5, 0.5)
     least = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
     x, along_x = _pair(int(least[0]), box.n[0], box.periodic[0])
@@ -248,7 +248,7 @@ def _wrap_or_clamp(x: float, n: int, periodic: int) -> float:
 
 @wp.func
 def into_domain(box: Box, x: wp.vec3) -> wp.vec3:
-    """A point wrapped along periodic axes and clamped to the faces of the others."""
+    """Wraps a point along periodic axes and clamps it to the faces of the others."""
     return wp.vec3(
         _wrap_or_clamp(x[0], box.n[0], box.periodic[0]),
         _wrap_or_clamp(x[1], box.n[1], box.periodic[1]),
@@ -258,7 +258,7 @@ def into_domain(box: Box, x: wp.vec3) -> wp.vec3:
 
 @wp.func
 def in_domain(box: Box, x: wp.vec3) -> bool:
-    """Whether a point is in the domain; false for NaN."""
+    """Tests whether a point is in the domain; false for NaN."""
     low = x[0] >= 0.0 and x[1] >= 0.0 and x[2] >= 0.0
     return low and x[0] <= float(box.n[0]) and x[1] <= float(box.n[1]) and x[2] <= float(box.n[2])
 
@@ -275,7 +275,7 @@ def beyond_open_face(box: Box, x: wp.vec3) -> bool:
 
 @wp.func
 def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
-    """The mark of the coarse cell that holds a point of the domain."""
+    """Returns the mark of the coarse cell that contains a point of the domain."""
     x = wp.clamp(int(p[0] * box.voxel), 0, box.coarse[0] - 1)
     y = wp.clamp(int(p[1] * box.voxel), 0, box.coarse[1] - 1)
     z = wp.clamp(int(p[2] * box.voxel), 0, box.coarse[2] - 1)
@@ -284,7 +284,7 @@ def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
 
 @wp.func
 def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
-    """Whether a fine cell is solid; never if `walls` is empty."""
+    """Tests whether a fine cell is solid; false if `walls` is empty."""
     if walls.shape[0] == 0:
         return False
     x = cell[0] // box.refinement
@@ -297,7 +297,7 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
 def trace_back(
     box: Box, u: wp.array1d[wp.vec3], around: TrilinearVelocity, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float
 ) -> wp.vec3:
-    """The departure point x - dt u(x - dt v / 2); `v` is the velocity at x, where `around` has the fractions f."""
+    """Computes the departure point x - dt u(x - dt v / 2); `v` is the velocity at x, at fractions f in `around`."""
     fine = dt * float(box.refinement)
     half = f - 0.5 * dt * v
     least = wp.min(half[0], wp.min(half[1], half[2]))
@@ -313,7 +313,7 @@ def trace_back(
 
 @wp.func
 def clip_at_solid(box: Box, walls: wp.array1d[wp.uint8], x: wp.vec3, end: wp.vec3) -> wp.vec3:
-    """Last point in the fluid, to 1/64 of the length, of a trace from x in the fluid to an end in a solid."""
+    """Finds the last point in the fluid, to 1/64 of the length, of a trace from x to an end in a solid."""
     free = wp.vec3(x)
     solid = wp.vec3(end)
     for _k in range(_HALVINGS):
@@ -386,8 +386,8 @@ def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
 
 
 def rings_for(cells: float) -> int:
-    """Number of rings of bricks that smoke may enter if a trace has a given length in fine cells; a read needs one more
-    cell."""
+    """Returns the number of rings of bricks that smoke may enter if a trace has a given length in fine cells; a read
+    needs one more cell."""
     return -(-(int(cells) + 2) // BRICK)
 
 
@@ -397,7 +397,7 @@ def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
     bricks = Bricks()
     # The brick across a periodic face may be cut short, so that smoke reaches the one behind it.
     bricks.rings = rings + int(any(box.periodic[a] and box.n[a] % BRICK for a in range(3)))
-    # A CPU runs one worker after the other.
+    # A CPU runs workers sequentially.
     bricks.workers = min(total, _WORKERS) if wp.get_device(device).is_cuda else 1
     bricks.threshold = threshold
     bricks.busy = wp.ones(total, dtype=int, device=device)

@@ -1,6 +1,7 @@
 """Sources of smoke, solids that appear and disappear, and buoyancy, by which smoke moves the air.
 
-Read `test_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first: the same in NumPy.
+Read `test_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first: they compute the same in
+NumPy.
 
 Fields and domains are those of `advection` and `advection_places`. Special cases:
 

@@ -1,6 +1,6 @@
 """The lattice Boltzmann step: streaming and collision in one pass over two buffers.
 
-Read `tests/reference/lattice.py` first: the same step in float64 NumPy, cell by cell.
+Read `tests/reference/lattice.py` first: it is the same step in float64 NumPy, cell by cell.
 
 A cell pulls the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes the populations that leave, f*.
 At a wall at rest that closes a whole axis it pulls what it sent there itself (half-way bounce-back). The step knows no
@@ -59,7 +59,7 @@ def trouble_of(key: int) -> tuple[int, int, str]:
 
 
 def eddy_factor(smagorinsky: float) -> float:
-    """18 sqrt(2) C^2."""
+    """Computes 18 sqrt(2) C^2."""
     return 18.0 * math.sqrt(2.0) * smagorinsky * smagorinsky
 
 

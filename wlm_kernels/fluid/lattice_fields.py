@@ -1,7 +1,7 @@
 """Velocity and density of the air on a lattice, its initial state, and solid bodies: their cells and motion.
 
 Read `fields` and `equilibrium` of `tests/reference/lattice.py`, and `test_sphere_voxels` and `test_mesh_voxels` of
-`tests/kernels/test_lattice.py` first: the same in NumPy.
+`tests/kernels/test_lattice.py` first: they compute the same in NumPy.
 
 An array of uint8 stores for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres are at half
 integers, in units of a cell. Bodies are rigid: u(x) = velocity + spin x (x - centre).
@@ -26,7 +26,7 @@ from wlm_kernels.fluid.lattice_sets import (
 
 wp.set_module_options({"enable_backward": False})
 
-# The winding number, unlike a sign from rays, is right where a ray would graze a triangle.
+# The winding number is correct even where a sign from rays would fail because a ray grazes a triangle.
 _INSIDE = wp.constant(0.5)
 
 
@@ -47,13 +47,13 @@ class Bodies:
 
 @wp.func
 def velocity_at(bodies: Bodies, k: int, x: wp.vec3) -> wp.vec3:
-    """The velocity of body k at a point."""
+    """Computes the velocity of body k at a point."""
     return bodies.velocity[k] + wp.cross(bodies.spin[k], x - bodies.centre[k])
 
 
 @wp.func
 def body_velocity(bodies: Bodies, k: int, p: wp.vec3i) -> wp.vec3:
-    """The velocity of body k at the centre of cell p."""
+    """Computes the velocity of body k at the centre of cell p."""
     return velocity_at(bodies, k, wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5))
 
 

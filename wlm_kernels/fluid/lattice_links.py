@@ -113,7 +113,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     def outflow(
         t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
     ) -> float:
-        """The population that an outlet sends to cell i in direction q."""
+        """Computes the population that an outlet sends to cell i in direction q."""
         drho = float(0.0)
         j = wp.vec3()
         for k in range(t.w.shape[0]):

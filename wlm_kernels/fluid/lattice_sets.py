@@ -1,6 +1,6 @@
 """Shared parts of the lattice Boltzmann kernels: velocity sets, cells, moments, equilibria, storage.
 
-Read `tests/reference/lattice.py` first: the same velocities and equilibria in float64 NumPy.
+Read `tests/reference/lattice.py` first: it has the same velocities and equilibria in float64 NumPy.
 
 Cells are numbered with the last axis fastest, as in the memory of arrays [X, Y, Z]: cell = (x Y + y) Z + z. Velocities
 are in pairs of opposites: 0 is at rest, 1 and 2 are opposite, 3 and 4 are opposite, and so on.
@@ -106,7 +106,7 @@ def opposite(q: int) -> int:
 
 @wp.func
 def cell_of(n: wp.vec3i, i: int) -> wp.vec3i:
-    """The coordinates of cell i."""
+    """Returns the coordinates of cell i."""
     # Two divisions instead of four: a remainder is a division too. Signed divisions take twice as long.
     row = int(wp.uint32(i) // wp.uint32(n[2]))
     x = int(wp.uint32(row) // wp.uint32(n[1]))
@@ -120,13 +120,13 @@ def index_of(n: wp.vec3i, p: wp.vec3i) -> int:
 
 @wp.func
 def wrapped(n: wp.vec3i, p: wp.vec3i) -> wp.vec3i:
-    """Periodic image within the domain of a cell that is at most one cell outside."""
+    """Returns the periodic image within the domain of a cell that is at most one cell outside."""
     return wp.vec3i((p[0] + n[0]) % n[0], (p[1] + n[1]) % n[1], (p[2] + n[2]) % n[2])
 
 
 @wp.func
 def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
-    """Whether a cell is beyond a face of an axis that is not periodic."""
+    """Tests whether a cell is beyond a face of an axis that is not periodic."""
     x = bounded[0] != 0 and (p[0] < 0 or p[0] >= n[0])
     y = bounded[1] != 0 and (p[1] < 0 or p[1] >= n[1])
     z = bounded[2] != 0 and (p[2] < 0 or p[2] >= n[2])
@@ -135,13 +135,13 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Whether the population that leaves a cell for p is stored in the cell's element; otherwise a link writes it."""
+    """Tests if the population that leaves a cell for p is stored in the cell's element; otherwise a link writes it."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 
 @wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
-    """Second-order equilibrium minus its weight, f_eq - w; `drho` is rho - 1.
+    """Computes the second-order equilibrium minus its weight, f_eq - w; `drho` is rho - 1.
 
     f_eq = w rho (1 + 3 c.u + 9/2 (c.u)^2 - 3/2 u.u)
     """
@@ -199,7 +199,7 @@ def memory_functions(
     vec = wp.types.vector(count, float)
     index_type = wp.int64 if wide else wp.int32
 
-    # Through the pointer: addresses from Warp's 64-bit strides would take half the time of a step.
+    # Elements are read through the pointer: addresses from Warp's 64-bit strides would take half the time of a step.
 
     @wp.func_native("return f.data[k];")
     def peek(f: wp.array2d[stored], k: index_type) -> stored: ...

@@ -1,11 +1,11 @@
-"""Reading temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
+"""Decodes temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
 `exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is the
 runtime path: values that depend on the time alone are computed once per frame (the two slices of F_uvt are mixed; F_ut
 and the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is
 loaded once for four texels.
 
-Read first: `wlm/lightmap/exact.py`, the same decode in NumPy.
+Read `wlm/lightmap/exact.py` first; it contains the same decode in NumPy.
 """
 
 import functools
@@ -35,7 +35,7 @@ class Stored:
 
 @wp.struct
 class TimeState:
-    """One time, and the numbers that turn the output y of a network into colour: (shift + spread y) scale."""
+    """One time, and the coefficients that convert the output y of a network to colour: (shift + spread y) scale."""
 
     tau: float
     encoding: wp.vec4

@@ -1,11 +1,11 @@
-"""The temporal lightmap model in training: its maps, its time axis and its targets, as functions for kernels.
+"""The temporal lightmap model in training: maps, time axis and targets, as functions for kernels.
 
 A tile is F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table 1). Its network's inputs are, in
 order: F_uv 4, F_uvt 4, F_ut 2, F_vt 2, the encoded time 4; tiles without temporal maps use F_uv alone. Features v in
 [0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
 
-`step` trains with these, `gather` turns its sums into gradients, `adjoint` has the hand-written adjoints of
-sampling, `decode` reads tiles from their stored bytes.
+`step` uses these functions in training, `gather` converts its sums to gradients, `adjoint` contains the hand-written
+adjoints of sampling, and `decode` decodes tiles from their stored bytes.
 
 Read first: `tests/reference/temporal.py`, `train_features`.
 """

@@ -1,4 +1,4 @@
-"""Decoding tiles that are stored as frames: BC7 blocks of any mode, their levels between two bounds of the tile's
+"""Decodes tiles that are stored as frames: BC7 blocks of any mode, whose levels lie between two bounds of the tile's
 colour.
 
 Blocks are `[N T, 32, 32, 2]` of uint64, the T frames of a tile one after another: the low and the high half of 16
@@ -37,7 +37,7 @@ class StoredFrames:
 
 @wp.func
 def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
-    """Bits `at` to `at + count - 1` of a block; fewer than 31."""
+    """Extracts bits `at` to `at + count - 1` of a block; fewer than 31."""
     word = low
     if at >= 64:
         word = wp.rshift(high, wp.uint64(at - 64))
@@ -50,7 +50,7 @@ def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
 def share_of(
     low: wp.uint64, high: wp.uint64, tables: Tables, at: int, count: int, texel: int, first: int, second: int
 ) -> int:
-    """Share of endpoint 1 in a texel, in 64ths, from indices of `count` bits that begin at bit `at`."""
+    """Returns the weight of endpoint 1 in a texel, in 64ths, from indices of `count` bits that begin at bit `at`."""
     start = at + count * texel
     width = count
     if texel > 0:
@@ -66,7 +66,7 @@ def share_of(
 
 @wp.func
 def end_of(value: int, count: int, lowest: int) -> int:
-    """The byte of a channel of an endpoint; `lowest` is its P bit, or -1 without one."""
+    """Expands a channel of an endpoint to a byte; `lowest` is its P bit, or -1 without one."""
     v = value
     n = count
     if lowest >= 0:
@@ -83,7 +83,7 @@ def mixed(a: int, b: int, share: int) -> int:
 
 @wp.func
 def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> wp.vec3:
-    """Bytes of red, green and blue of a texel of a block; a reserved mode is black."""
+    """Decodes the red, green and blue bytes of a texel of a block; a reserved mode is black."""
     mode = int(0)
     while mode < 8 and bits_of(low, high, mode, 1) == 0:
         mode += 1
@@ -138,7 +138,7 @@ def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> 
         a = end_of(bits_of(low, high, start, colour), colour, p0)
         b = end_of(bits_of(low, high, start + colour, colour), colour, p1)
         rgb[c] = float(mixed(a, b, share))
-    if rotation > 0:  # a channel and alpha have changed places; only modes of one subset have a rotation
+    if rotation > 0:  # a channel is swapped with alpha; only modes with one subset have a rotation
         a = end_of(bits_of(low, high, alpha_at, alpha), alpha, p0)
         b = end_of(bits_of(low, high, alpha_at + alpha, alpha), alpha, p1)
         rgb[rotation - 1] = float(mixed(a, b, alpha_share))
@@ -147,7 +147,7 @@ def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> 
 
 @wp.func
 def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
-    """The colour in gamma space of a texel of a frame."""
+    """Decodes the colour in gamma space of a texel of a frame."""
     low = stored.blocks[frame, y // 4, x // 4, 0]
     high = stored.blocks[frame, y // 4, x // 4, 1]
     level = block_texel(low, high, stored.tables, 4 * (y % 4) + x % 4) / 255.0
@@ -161,7 +161,7 @@ def power(colour: wp.vec3, exponent: float) -> wp.vec3:
 
 @wp.func
 def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
-    """The linear radiance of a texel between two frames (eq. 2)."""
+    """Interpolates the linear radiance of a texel between two frames (neural-dynamic-gi, eq. 2)."""
     light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
     if share > 0.0:
         other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)

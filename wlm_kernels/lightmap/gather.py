@@ -1,10 +1,10 @@
-"""Turns the sums of `step` into gradients, and advances the schedule; on a GPU it also moves the parameters.
+"""Converts the sums of `step` to gradients and advances the schedule; on a GPU it also updates the parameters.
 
 On a GPU the launches that sum the gradients also run Adam: the fused Adam of torch reads and writes the gradients once
-more, and gives each block of threads 65,536 numbers, so that the networks of 64 tiles would use only one to six
+more and assigns 65,536 numbers to each block of threads, so that the networks of 64 tiles would use only one to six
 multiprocessors.
 
-Read first: `kernels/stepping.py` in the tests, which reads these gradients and compares them with autograd's.
+Read `tests/kernels/stepping.py` first; it compares these gradients with autograd's.
 """
 
 import warp as wp

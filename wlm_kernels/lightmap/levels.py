@@ -1,6 +1,6 @@
-"""Rounding of networks to 8-bit levels in one launch; operations of torch would take about forty launches.
+"""Rounds the weights of networks to 8-bit levels in one launch; torch operations would take about forty launches.
 
-Read first: `tests/reference/levels.py`, the same in torch, bit for bit.
+Read `tests/reference/levels.py` first; it computes bitwise identical results in torch.
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ def _half(value: float) -> float:
 
 @wp.func
 def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
-    """Rounds the weights into one unit, and copies the bias behind them."""
+    """Rounds the weights of one unit, and copies the bias stored after them."""
     most = float(0.0)
     for i in range(rows):
         most = wp.max(most, wp.abs(values[n, first + i, j]))
@@ -56,7 +56,7 @@ def put_on_levels(hidden: wp.array, output: wp.array, hidden_out: wp.array, outp
     Args:
         hidden: float [N, I + H + 2, H], see `wlm_kernels.mlp`.
         output: float [N, H + 1, 3].
-        hidden_out, output_out: Like these, written.
+        hidden_out, output_out: Arrays of the same shapes, written.
     """
     shape = (hidden.shape[0], 2 * hidden.shape[2] + 3)
     wp.launch(

@@ -1,6 +1,6 @@
-"""Decoding wide networks on a GPU's matrix units: the runtime path of dynamic tiles with 32 hidden units or more.
+"""Decodes wide networks on a GPU's matrix units: the runtime path of dynamic tiles with 32 hidden units or more.
 
-Activations and weights are half floats and sums float32; GELU is the tanh form with the GPU's own instruction. A thread
+Activations and weights are half floats and sums float32; GELU is the tanh form with the GPU's instruction. A thread
 decodes eight texels of a column, one after another, so that a block loads its tile's weights once for 1,024 texels.
 
 Read first: `wlm_kernels/lightmap/decode.py`, the exact path.
@@ -26,9 +26,9 @@ from wlm_kernels.lightmap.features import CENTRE, TEMPORAL_INPUTS
 from wlm_kernels.native import native_source, on_cuda
 
 ROWS = 8
-"""Texels that a thread decodes."""
+"""Number of texels per thread."""
 
-_STEP = 16  # of a matrix product: the hidden width is a multiple of it
+_STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 
 
 @wp.kernel(enable_backward=False)
@@ -103,7 +103,7 @@ def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
         shared: Whether they write RGB9E5 instead of 8 bits.
 
     Raises:
-        ValueError: Another width.
+        ValueError: The width is not a multiple of 16.
     """
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a multiple of {_STEP}, got {hidden}")

@@ -11,7 +11,7 @@ import warp as wp
 from wlm_kernels.lightmap.reduce import BLOCK
 from wlm_kernels.native import native_source, on_cuda
 
-_STEP = 16  # of a matrix product: the hidden width is a multiple of it
+_STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _WIDEST = 64  # a block's activations and weights then fill its 48 KiB of shared memory
 
 
@@ -37,7 +37,7 @@ def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     """
     vec_in, vec_hidden = wp.types.vector(inputs, float), wp.types.vector(hidden, float)
     vec_result = wp.types.vector(inputs + 3, float)
-    # Rows of 64 halves are all banks: permuting their groups of 8 keeps a column's apart, padding the others does.
+    # A row of 64 halves spans all banks: its groups of 8 are permuted to avoid bank conflicts; other rows are padded.
     rows = {"STRIDE": hidden, "MASK": 7} if hidden == _WIDEST else {"STRIDE": hidden + 8, "MASK": 0}
     constants = {"I": inputs, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
     code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_step", **constants)

@@ -1,9 +1,9 @@
-"""Mixing of two decodes at stored times to the light between them, in radiance.
+"""Interpolates between the decoded light of two stored times, in radiance.
 
 Tiles of 8 bits are uint32 [n, 128 * 128], RGBA from the lowest byte, each with its own bound: radiance is
 (byte / 255 * bound) ** gamma.
 
-The same on the host: `wlm.lightmap.decode.SheetDecoder.tiles_8bit`.
+`wlm.lightmap.decode.SheetDecoder.tiles_8bit` computes the same on the host.
 """
 
 import warp as wp

@@ -10,7 +10,7 @@ in float32 as on the CPU.
 The sums are integers or have a fixed order, so that one seed gives one result on one device. The samples of a tile only
 depend on the seed, the step and the number of the tile, so that a tile fits to the same result in any batch.
 
-Read first: `tests/reference/temporal.py`, `train_features` and `losses`: the same loss in torch.
+Read `train_features` and `losses` in `tests/reference/temporal.py` first; they compute the same loss in torch.
 """
 
 import functools
@@ -40,7 +40,7 @@ from wlm_kernels.lightmap.matrix_step import fits_matrix_units, matrix_network
 from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
 
 LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
-MATRIX_LAUNCH_BOUNDS = (BLOCK, 4)  # as many as shared memory has room for at width 64
+MATRIX_LAUNCH_BOUNDS = (BLOCK, 4)  # the maximum that fits shared memory at width 64
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 

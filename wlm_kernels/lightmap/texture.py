@@ -1,4 +1,4 @@
-"""A map as one texture of RGB9E5 texels with mips, from decoded tiles.
+"""Builds a lightmap as one RGB9E5 texture with mips from decoded tiles.
 
 See `wlm.lightmap.runtime_texture.MapDecoder`.
 """

@@ -1,6 +1,6 @@
 """Edge functions of triangles in homogeneous coordinates, and their exact signs.
 
-`wlm_kernels.raster.rasterize` defines them. Read `tests/reference/raster.py` first: coverage in Python's integers.
+`wlm_kernels.raster.rasterize` defines them. Read `tests/reference/raster.py` first; it computes coverage with integers.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 SPACES = ("clip", "uv")
 
 MOST_PIXELS = 16384
-"""Along one axis. With more, a term of the exact edge function would no longer fit a float64."""
+"""Maximum number of pixels along one axis; beyond it, terms of the exact edge function would not fit a float64."""
 
 _LOW_BITS = wp.constant(wp.int64(2**29 - 1))
 _ZERO = wp.constant(wp.float64(0.0))
@@ -45,7 +45,7 @@ class Frame:
 
 @wp.struct
 class Corners:
-    """A triangle's corners (x, y, w), and z of each."""
+    """The corners (x, y, w) of a triangle, and their z."""
 
     a: wp.vec3d
     b: wp.vec3d
@@ -82,7 +82,7 @@ class Edges:
 
 @wp.func
 def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -> Corners:
-    """The corners of a triangle; their numbers must be valid."""
+    """Reads the corners of a triangle; its indices must be valid."""
     out = Corners()
     i = triangle[t, 0]
     j = triangle[t, 1]
@@ -101,7 +101,7 @@ def corners_of(position: wp.array2d[float], triangle: wp.array2d[int], t: int) -
 
 @wp.func
 def has_corners(triangle: wp.array2d[int], t: int, count: int) -> bool:
-    """Whether the numbers of a triangle's corners are from 0 to `count` - 1."""
+    """Returns whether all indices of a triangle are from 0 to `count` - 1."""
     i = triangle[t, 0]
     j = triangle[t, 1]
     k = triangle[t, 2]
@@ -149,7 +149,7 @@ def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
 
 @wp.func
 def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
-    """P, integers."""
+    """Returns the pixel centre P, with integer components."""
     return wp.vec3d(
         wp.float64((frame.x + 2 * column) * frame.height),
         wp.float64((frame.y + frame.y_step * row) * frame.width),
@@ -159,7 +159,7 @@ def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
 
 @wp.func
 def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
-    """The edge functions. Products of two float32s are exact: a coefficient has the right sign and one rounding."""
+    """Computes the edge functions. Products of float32s are exact: coefficients have the right sign, one rounding."""
     out = Edges()
     n0 = sign * wp.cross(k.b, k.c)
     n1 = sign * wp.cross(k.c, k.a)
@@ -175,7 +175,7 @@ def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
 
 @wp.func
 def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
-    """The edge functions, positive inside, with their rounding bounds; of sign 0 if the triangle covers nothing."""
+    """Computes edge functions, positive inside, with rounding bounds; sign 0 if the triangle covers nothing."""
     n = wp.cross(k.b, k.c)
     d = wp.dot(k.a, n)
     size = wp.abs(k.a[0] * n[0]) + wp.abs(k.a[1] * n[1]) + wp.abs(k.a[2] * n[2])
@@ -194,7 +194,7 @@ def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
 
 @wp.func
 def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
-    """Whether P, moved by the infinitesimal step of the top-left rule, lies inside; exact."""
+    """Returns whether P, moved by the infinitesimal step of the top-left rule, lies inside; exact."""
     p = centre(frame, row, column)
     v = k.b
     w = k.c
@@ -206,7 +206,7 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
             s = e.y[i] * wp.float64(frame.y_step)
         if not s > _ZERO:
             return False
-        # Opposite the next corner: (b, c), (c, a), (a, b).
+        # Edges opposite the corners in order: (b, c), (c, a), (a, b).
         v = w
         w = wp.where(i == 0, k.a, k.b)
     return True
@@ -214,7 +214,7 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
 
 @wp.func
 def _extent(k: Corners, axis: int):
-    """Least and greatest x / w, or y / w, of the part in front of the viewer; least > greatest if there is none.
+    """Returns the range of x / w, or y / w, of the part in front of the viewer; least > greatest if there is none.
 
     An edge that crosses w = 0 goes to an infinity whose sign is the same along all of it.
     """
@@ -239,19 +239,19 @@ def _extent(k: Corners, axis: int):
 
 @wp.func
 def first_pixel(place: wp.float64, count: int) -> int:
-    """The first pixel at or after a place in pixels, 0 to count."""
+    """Returns the first pixel at or after a position in pixels, 0 to count."""
     return int(wp.clamp(wp.ceil(place - _SLACK), _ZERO, wp.float64(count)))
 
 
 @wp.func
 def last_pixel(place: wp.float64, count: int) -> int:
-    """The last pixel at or before a place in pixels, -1 to count - 1."""
+    """Returns the last pixel at or before a position in pixels, -1 to count - 1."""
     return int(wp.clamp(wp.floor(place + _SLACK), -_ONE, wp.float64(count - 1)))
 
 
 @wp.func
 def box_of(k: Corners, frame: Frame) -> Box:
-    """Bounding box of the part in front of the viewer."""
+    """Returns the bounding box of the part in front of the viewer."""
     out = Box()
     x_low, x_high = _extent(k, 0)
     y_low, y_high = _extent(k, 1)
@@ -272,7 +272,7 @@ def box_of(k: Corners, frame: Frame) -> Box:
 
 @wp.func
 def edges_at(k: Corners, frame: Frame, row: int, column: int):
-    """The edge functions at a covered pixel, made positive, and their slopes by X and by Y."""
+    """Returns the edge functions at a covered pixel, made positive, and their derivatives by X and Y."""
     e = functions(k, frame, _ONE)
     x = wp.float64(frame.x + 2 * column)
     y = wp.float64(frame.y + frame.y_step * row)
@@ -289,7 +289,7 @@ def total_of(v: wp.vec3d) -> wp.float64:
 
 
 def frame(height: int, width: int, space: str) -> Frame:
-    """Makes the frame of an image.
+    """Creates the frame of an image.
 
     Raises:
         ValueError: A size is out of range.

@@ -17,7 +17,7 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.func
 def _readable(triangle: wp.array2d[int], t: int, count: int) -> bool:
-    """Whether there is such a triangle, with corners from 0 to `count` - 1."""
+    """Returns whether triangle t exists and has corner indices from 0 to `count` - 1."""
     if t < 0 or t >= triangle.shape[0]:
         return False
     return has_corners(triangle, t, count)
@@ -128,15 +128,15 @@ def _interpolate_backward(
 def rasterize_backward(position, triangle, visible, grad_barycentric, grad, space: str = "clip") -> None:
     """Backward pass from a raster's barycentrics to the positions; z has no gradient.
 
-    On CUDA pixels are added in any order, so that the last bits change from run to run.
+    On CUDA pixels are summed in any order, so that the last bits change from run to run.
 
     Args:
         position: float [V, 4], or [V, 2] in UV space.
         triangle: int [F, 3].
         visible: int [H, W], the visible triangle of each pixel.
         grad_barycentric: vec2 [H, W].
-        grad: Like position; added to.
-        space: As for `Rasterizer`.
+        grad: Shaped like `position`; the gradient is added to it.
+        space: "clip" or "uv", as for `Rasterizer`.
     """
     check_position(position, space)
     inputs = [position, triangle, frame(*visible.shape, space), visible, grad_barycentric]
@@ -150,7 +150,7 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
     Args:
         attribute: float [V, C].
-        triangle: int [F, 3], rows of `attribute`; they need not be the numbers that were drawn with.
+        triangle: int [F, 3], rows of `attribute`; the indices may differ from those of the positions.
         visible: int [H, W], the visible triangle of each pixel.
         barycentric: vec2 [H, W], weights of its corners 0 and 1.
         out: float [H, W, C], written.

@@ -8,7 +8,7 @@ by w, so a triangle that reaches behind the viewer needs no clipping; there is n
 Coverage is decided without rounding. Where float64 can't decide the sign of an edge function it is computed exactly,
 and where it is exactly zero the pixel counts as moved by an infinitesimal step to the right, and by an infinitely
 smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that triangles share is
-covered by exactly one of those that surround it, also where each has vertices of its own at equal positions.
+covered by exactly one of those that surround it, also where they use different vertices at equal positions.
 
 The visible triangle is a minimum over 64-bit keys, depth first and then number: the same on every run.
 
@@ -85,7 +85,7 @@ def _draw(
     z_x = wp.dot(e.x, k.z) / det
     z_y = wp.dot(e.y, k.z) / det
     z_c = wp.dot(e.c, k.z) / det
-    # For a sliver that may cancel completely; clamped to the depths of its corners.
+    # The sum may cancel completely for a sliver, so it is clamped to the depths of the corners.
     z_low = wp.float64(-wp.inf)
     z_high = wp.float64(wp.inf)
     if k.a[2] > _ZERO and k.b[2] > _ZERO and k.c[2] > _ZERO:
@@ -119,7 +119,7 @@ def _draw(
                     depth = z_low
                 if depth > z_high:
                     depth = z_high
-                # As an integer of the same order; adding 0 turns -0 into 0.
+                # The depth becomes an integer of the same order; adding 0 turns -0 into 0.
                 bits = wp.cast(depth + _ZERO, wp.int64)
                 if bits < wp.int64(0):
                     bits = bits ^ _EMPTY
@@ -289,7 +289,7 @@ class Raster:
 class Rasterizer:
     """Draws the same triangles many times. Buffers are allocated once: `run` may be captured in a CUDA graph.
 
-    Beside the result it holds 8 bytes per pixel and 12 per triangle: tiles of triangles are counted, not stored.
+    Besides the result it stores 8 bytes per pixel and 12 per triangle: tiles of triangles are counted, not stored.
 
     Args:
         triangle: int [F, 3], numbers of corners.
@@ -297,14 +297,14 @@ class Rasterizer:
         space: "clip" or "uv", see the module.
         cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
         derivative, coverage: Whether to compute these of `Raster`.
-        split: Most pixels in the box of a triangle that one thread draws; None: 64 on CUDA, no limit on the CPU.
+        split: Maximum pixels in the box of a triangle drawn by one thread; None: 64 on CUDA, no limit on the CPU.
         empty: Allocates a buffer, `empty(shape, dtype=...)` on the triangles' device; default Warp's.
 
     Attributes:
-        raster: `Raster`, what `run` fills.
+        raster: `Raster`, the output of `run`.
 
     Raises:
-        ValueError: A wrong argument, or so many triangles and pixels that their tiles can't be counted.
+        ValueError: An argument is wrong, or the number of tiles of all triangles can exceed the counter's range.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The first triangle along rays."""
+"""Ray casting: the first triangle hit by each ray."""
 
 import warp as wp
 
@@ -28,13 +28,13 @@ def _first_hit(
 
 
 def first_hit(mesh: wp.Mesh, origin: wp.array, direction: wp.array, distance: wp.array, front: wp.array) -> None:
-    """Sends rays from points in directions.
+    """Casts rays from all points in all directions.
 
     Args:
         mesh: The triangles.
         origin: vec3 [P].
         direction: vec3 [D], of unit length, the same for all points.
-        distance: float [P, D], written: to the first triangle; infinite for none.
+        distance: float [P, D], written: distance to the first triangle; infinite if there is none.
         front: int8 [P, D], written: 1 where its corners run counter-clockwise as seen, -1 clockwise, 0 for none.
     """
     wp.launch(

@@ -1,7 +1,7 @@
 """Bilinear and nearest texture reads, and their backward pass (lightmap-uv-clustering-cascade, section 3.3.2).
 
-u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. What lies outside [0, 1]
-depends on the boundary:
+u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. The boundary mode
+defines coordinates outside [0, 1]:
 
     clamp   the nearest texel of the border;
     wrap    the texture repeated;
@@ -9,12 +9,12 @@ depends on the boundary:
             1/2)|. Eq. 8 of the paper has a floor in place of the absolute value, which makes it -2 or 0 everywhere.
 
 Coordinates are float32, but weights are computed in float64: at 4,096 texels float32 would leave them 12 bits. A
-coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient and gives the texels none.
+coordinate that is NaN, or infinite and not clamped, reads NaN; it neither has nor passes on a gradient.
 
 `axis_at`, `read`, `read_slope` and `add` serve other kernels that read textures; one `Axis` for u and one for
 v serve all channels, forward and backward.
 
-Read `wlm/ops/plain.py` first (`texture`): the same by torch's `grid_sample`.
+Read `wlm/ops/plain.py` first (`texture`), which uses torch's `grid_sample`.
 """
 
 import warp as wp
@@ -108,7 +108,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
 
 @wp.func
 def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
-    """Channel c at a place."""
+    """Samples channel c at a coordinate."""
     top = texture[y.low, x.low, c]
     # A neighbour with weight 0 isn't read: it may be infinite.
     if x.weight != 0.0:
@@ -123,7 +123,7 @@ def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
 
 @wp.func
 def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
-    """Derivatives of channel c by u and by v."""
+    """Returns the derivatives of channel c by u and by v."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return wp.vec2()
     top_left = texture[y.low, x.low, c]
@@ -200,7 +200,7 @@ def _sample_backward(
 
 
 def codes(filter: str, boundary: str) -> tuple[int, int]:
-    """The numbers of a filter and a boundary in kernels.
+    """Returns the kernels' codes of a filter and a boundary.
 
     Args:
         filter: "linear", between the four nearest texels, or "nearest".

@@ -1,1 +1,1 @@
-"""Kernels of six-way images of smoke."""
+"""Kernels that render and process six-way lightmaps of smoke."""

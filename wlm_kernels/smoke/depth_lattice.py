@@ -26,16 +26,16 @@ MOST_NODES = 2**28
 voxels."""
 
 _MOST_MARCHING = 2**24  # largest number of nodes of a point light, each of which marches separately
-_AT_ONCE = wp.constant(8)  # nodes of a line that a thread adds up at a time
+_AT_ONCE = wp.constant(8)  # nodes of a line that a thread sums at a time
 _LEAST_SPACING = 0.25  # voxels between nodes
-_ROUNDING = 1e-6  # share by which a part may be longer than the step, so that rounding adds no part
+_ROUNDING = 1e-6  # relative excess of a part over the step that is tolerated, so that rounding adds no part
 
 _Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
 
 
 @wp.struct
 class Lattice:
-    """Nodes at `origin` plus `low` plus multiples of `gap` along the rows of `axes`, in voxels.
+    """A lattice with nodes at `origin` plus `low` plus multiples of `gap` along the rows of `axes`, in voxels.
 
     A point light also has its `place` and the `radius` within which its irradiance is constant.
     """
@@ -51,13 +51,13 @@ class Lattice:
 
 @wp.func
 def axis(lattice: Lattice, n: int) -> wp.vec3:
-    """Direction of an axis of the lattice."""
+    """Returns the direction of an axis of the lattice."""
     return wp.vec3(lattice.axes[n, 0], lattice.axes[n, 1], lattice.axes[n, 2])
 
 
 @wp.func
 def depths_at(nodes: wp.array3d[wp.vec2], lattice: Lattice, p: wp.vec3) -> wp.vec2:
-    """Optical depths to the light and to the opposite light, trilinear between nodes."""
+    """Interpolates optical depths to the light and to the opposite light trilinearly between nodes."""
     inverse = wp.vec3(1.0 / lattice.gap[0], 1.0 / lattice.gap[1], 1.0 / lattice.gap[2])
     return between_nodes(nodes, wp.cw_mul(lattice.axes * (p - lattice.origin) - lattice.low, inverse))
 
@@ -75,7 +75,7 @@ def _add_up(
     # out:
     nodes: wp.array4d[wp.vec2],
 ):
-    """Depths from each node of a line to both of its ends; the light is at the last node."""
+    """Sums depths from each node of a line to both of its ends; the light is at the last node."""
     pair, line, k = wp.tid()
     first = pair == 0  # whether the line runs along the first axis
     last = wp.where(first, nodes.shape[0], nodes.shape[1]) - 1
@@ -85,7 +85,7 @@ def _add_up(
     behind = float(0.0)
     nodes[wp.where(first, last, line), wp.where(first, line, last), k, pair][0] = 0.0
     nodes[wp.where(first, 0, line), wp.where(first, line, 0), k, pair][1] = 0.0
-    # From both ends, several nodes at a time: loads wait for the stores before them.
+    # Sums run from both ends over several nodes at a time, since loads wait for earlier stores.
     for begin in range(0, last, _AT_ONCE):
         forth = _Several()
         back = _Several()
@@ -123,7 +123,7 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
         # out:
         gaps: wp.array4d[float],
     ):
-        """Optical depth between a node and its neighbour along the axis of each pair of lights."""
+        """Computes the optical depth between a node and its neighbour along the axis of each pair of lights."""
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
         size = size_of(smoke.density)
@@ -134,7 +134,7 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
                 d = lattice.gap[pair] / float(parts[pair])
                 for n in range(parts[pair]):
                     p = begin + (float(n) + 0.5) * d * along
-                    # Nodes of a turned lattice lie far outside the grid.
+                    # Nodes of a rotated lattice may lie far outside the grid.
                     low = wp.min(p) >= -0.5
                     if low and p[0] <= size[0] + 0.5 and p[1] <= size[1] + 0.5 and p[2] <= size[2] + 0.5:
                         tau += d * sample(smoke, p)
@@ -149,7 +149,7 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
         # out:
         nodes: wp.array3d[wp.vec2],
     ):
-        """Optical depth from a node to a point light."""
+        """Computes the optical depth from a node to a point light."""
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
         away = wp.length(lattice.place - p)
@@ -169,7 +169,7 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
 
 
 def parts_of(length: float, step: float) -> int:
-    """Number of equal parts of a length that are no longer than a step, at least 1."""
+    """Returns the number of equal parts, no longer than a step, of a length; at least 1."""
     return max(math.ceil(length / step - _ROUNDING), 1)
 
 
@@ -229,7 +229,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
 
 
 def spacing_of(march: March) -> tuple[float, float]:
-    """Largest distance between nodes, and longest step between them."""
+    """Returns the largest distance between nodes, and the longest step between them."""
     spacing = march.step if march.spacing is None else march.spacing
     return spacing, spacing if march.light_step is None else march.light_step
 
@@ -261,7 +261,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
 
 
 def _axes(toward: Sequence[float]) -> list[tuple[float, float, float]]:
-    """The direction to a light, and two directions across it (Duff et al. 2017)."""
+    """Returns the direction to a light, and two directions orthogonal to it (Duff et al. 2017)."""
     x, y, z = toward
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)

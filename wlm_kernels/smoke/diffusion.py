@@ -1,10 +1,10 @@
-"""Multiple scattering by diffusion on a coarse grid: light that cells stop, its fluence, and what a camera sees of it.
+"""Multiple scattering by diffusion on a coarse grid: light that cells stop, its fluence, and its image in a camera.
 
 In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the light
 that the cell stops directly from a light source, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half
 of the fluence leaves at the box's faces (Marshak's condition). Rounds of red-black successive over-relaxation solve it,
-each for the D of the fluence before it. Grids go from coarse to fine: the coarsest has a few cells, between which light
-spreads within the sweeps of a round; each finer grid starts from the interpolated result of the one before.
+each with D computed from the previous fluence. Grids go from coarse to fine: the coarsest has a few cells, between
+which light spreads within the sweeps of a round; each finer grid starts from the interpolated result of the one before.
 
 Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
@@ -55,7 +55,7 @@ def _reach(
     # out:
     reach: wp.array4d[float],
 ):
-    """D, by central differences; cells beyond the box have the value of the nearest cell."""
+    """Computes D by central differences; cells beyond the box have the value of the nearest cell."""
     n, i, j, k = wp.tid()
     nx = light.shape[1]
     ny = light.shape[2]
@@ -72,13 +72,13 @@ def _reach(
 
 @wp.func
 def _flow(one: float, other: float, size: float) -> float:
-    """Flow between two neighbours of given D, per volume and difference of fluence."""
+    """Computes the flow between two neighbours of given D, per volume and difference of fluence."""
     return 2.0 * one * other / ((one + other) * size * size)
 
 
 @wp.func
 def _exchange(own: float, reach: wp.array4d[float], n: int, i: int, j: int, k: int, size: float) -> float:
-    """Flow to a neighbouring cell, or loss through a face of the box, per volume and unit of fluence."""
+    """Computes the flow to a neighbour, or the loss through a face of the box, per volume and unit of fluence."""
     if i < 0 or i >= reach.shape[1] or j < 0 or j >= reach.shape[2] or k < 0 or k >= reach.shape[3]:
         return 1.0 / (size * (2.0 + 0.5 * size / own))
     return _flow(own, reach[n, i, j, k], size)
@@ -95,7 +95,7 @@ def _couple(
     # out:
     flows: wp.array4d[wp.vec4],
 ):
-    """Flows to the next cells along the axes, 0 at the box's faces, and the reciprocal of all that a cell loses."""
+    """Computes flows to the next cells along the axes, 0 at the box's faces, and 1 over the total loss of a cell."""
     n, i, j, k = wp.tid()
     own = reach[n, i, j, k]
     x = _exchange(own, reach, n, i + 1, j, k, cell[0])
@@ -146,7 +146,7 @@ def _relax(
 
 @wp.func
 def _overlap(cell: int, cells: int, fine: int, fines: int) -> float:
-    """Share of a cell that one of the finer cells covers, along an axis."""
+    """Computes the share of a cell that one of the finer cells covers, along an axis."""
     each = float(fines) / float(cells)
     low = wp.max(float(cell) * each, float(fine))
     high = wp.min(float(cell + 1) * each, float(fine + 1))
@@ -160,7 +160,7 @@ def _coarsen(
     # out:
     out: wp.array4d[float],
 ):
-    """Means over larger cells."""
+    """Averages values over larger cells."""
     n, i, j, k = wp.tid()
     nx = fine.shape[1]
     ny = fine.shape[2]
@@ -177,7 +177,7 @@ def _coarsen(
 
 @wp.func
 def _place(cell: int, cells: int, coarse: int) -> float:
-    """Position of a cell's centre in units of coarser cells, whose first centre is at 0."""
+    """Converts a cell's centre to units of coarser cells, whose first centre is at 0."""
     return (float(cell) + 0.5) * float(coarse) / float(cells) - 0.5
 
 
@@ -188,7 +188,7 @@ def _refine(
     # out:
     out: wp.array4d[float],
 ):
-    """Trilinear between the centres of larger cells."""
+    """Interpolates trilinearly between the centres of larger cells."""
     n, i, j, k = wp.tid()
     x = _place(i, out.shape[1], coarse.shape[1])
     y = _place(j, out.shape[2], coarse.shape[2])
@@ -296,7 +296,7 @@ def light_kernels(smoke_type: Any) -> _Kernels:
         # out:
         out: wp.array3d[float],
     ):
-        """One ray from a point light: the light that is stopped on it is added to the cells around."""
+        """Traces one ray from a point light and adds the light that smoke stops to the cells around."""
         n = wp.tid()
         height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
@@ -343,7 +343,7 @@ def light_kernels(smoke_type: Any) -> _Kernels:
         # out:
         out: wp.array3d[float],
     ):
-        """Light from a light at infinity that a cell stops, per volume."""
+        """Computes the light from a light at infinity that a cell stops, per volume."""
         i, j, k = wp.tid()
         total = float(0.0)
         for x in range(parts[0]):
@@ -370,7 +370,7 @@ def light_kernels(smoke_type: Any) -> _Kernels:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        """Light that smoke of albedo 1 in a fluence sends to a pixel, and the part of it from thin cells."""
+        """Computes the light that smoke of albedo 1 in a fluence sends to a pixel, and its part from thin cells."""
         n, row, column = wp.tid()
         r = begin(view, row, column, smoke, march.step, 0.5)
         total = float(0.0)

@@ -107,7 +107,7 @@ class Medium:
 
     @functools.cached_property
     def smoke(self) -> Any:
-        """The smoke as kernels take it; cold smoke has its density in place of a temperature, and emission 0."""
+        """Packs the smoke for kernels; cold smoke has its density in place of a temperature, and emission 0."""
         smoke = self.smoke_type()
         smoke.density, smoke.extinction = self.density, float(self.extinction)
         smoke.temperature, smoke.emission = self.density, 0.0
@@ -141,7 +141,7 @@ class View:
 
 @wp.struct
 class MarchParameters:
-    """`March` as kernels take it. `spacing` and `light_step` are used on the host, to build lattices."""
+    """`March` in the form for kernels. `spacing` and `light_step` are used on the host, to build lattices."""
 
     step: float
     jitter: float
@@ -155,9 +155,9 @@ class MarchParameters:
 class Ray:
     """A ray, its `count` equal steps of `length`, the first of which begins at distance `first`, and the current step.
 
-    Of the current step, number `done`: `offset` is the position of its sample as a share of the step, `distance` and
-    `place` are those of the sample, `sigma` its extinction, `x` the step's optical depth. `tau` and `t` are the optical
-    depth and the transparency of the ray before the step.
+    For the current step, number `done`, `offset` is the position of its sample as a share of the step, `distance` and
+    `place` locate the sample, `sigma` is its extinction, and `x` is the step's optical depth. `tau` and `t` are the
+    optical depth and the transparency of the ray before the step.
     """
 
     origin: wp.vec3
@@ -177,7 +177,7 @@ class Ray:
 
 @wp.func
 def ray(view: View, row: int, column: int) -> Ray:
-    """The ray of a pixel, without steps."""
+    """Makes the ray of a pixel, without steps."""
     u = (float(column) + 0.5 - 0.5 * float(view.width)) * view.pitch
     v = (0.5 * float(view.height) - float(row) - 0.5) * view.pitch
     r = Ray()
@@ -192,7 +192,7 @@ def ray(view: View, row: int, column: int) -> Ray:
 
 @wp.func
 def clip(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
-    """First and last distance along a ray at which there may be smoke; first > last if the ray misses the smoke."""
+    """Finds the first and last distance along a ray at which there may be smoke; first > last if the ray misses it."""
     first = float(-_NEVER)
     last = float(_NEVER)
     for axis in range(3):
@@ -214,7 +214,7 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
 
 @wp.func
 def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float) -> Ray:
-    """A ray with equal steps no longer than `step` through all smoke in front of the origin; no steps if it misses."""
+    """Divides a ray's way through all smoke in front of the origin into equal steps up to `step`; none if it misses."""
     r = Ray()
     r.origin = origin
     r.direction = direction
@@ -228,13 +228,13 @@ def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float)
 
 @wp.func
 def point_on(r: Ray, n: int, offset: float) -> wp.vec3:
-    """Position of the sample of step n; an offset of 1/2 is the step's middle."""
+    """Computes the position of the sample of step n; an offset of 1/2 is the step's middle."""
     return r.origin + (r.first + (float(n) + offset) * r.length) * r.direction
 
 
 @wp.func
 def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
-    """Trilinear density, 0 outside the grid."""
+    """Interpolates density trilinearly, with 0 outside the grid."""
     x = p[0] - 0.5
     y = p[1] - 0.5
     z = p[2] - 0.5
@@ -284,13 +284,13 @@ def _in_brick(density: wp.array3d[Any], bricks: int, p: wp.vec3) -> float:
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
-    """`density_at`, which returns early in an empty brick. `p` lies at most half a voxel outside the grid."""
+    """Computes `density_at`, with an early return in an empty brick. `p` lies at most half a voxel outside the grid."""
     return _in_brick(smoke.density, smoke.bricks, p)
 
 
 @wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
-    """Trilinear between elements of an array, element (i, j, k) being at q = (i, j, k); constant beyond its ends."""
+    """Interpolates an array trilinearly, with element (i, j, k) at q = (i, j, k) and constant beyond its ends."""
     x = wp.clamp(q[0], 0.0, float(nodes.shape[0] - 1))
     y = wp.clamp(q[1], 0.0, float(nodes.shape[1] - 1))
     z = wp.clamp(q[2], 0.0, float(nodes.shape[2] - 1))
@@ -309,7 +309,7 @@ def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
 
 @wp.func
 def absorbed(x: float) -> float:
-    """1 - exp(-x), without cancellation where x is small."""
+    """Computes 1 - exp(-x), without cancellation where x is small."""
     if x < 0.05:
         return x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x / 120.0))))
     return 1.0 - wp.exp(-x)
@@ -317,20 +317,20 @@ def absorbed(x: float) -> float:
 
 @wp.func
 def mean_transparency(x: float) -> float:
-    """(1 - exp(-x)) / x, the mean transparency along a step of optical depth x; 1 where there is no smoke."""
+    """Computes (1 - exp(-x)) / x, the mean transparency along a step of optical depth x; 1 without smoke."""
     return wp.where(x > 0.0, absorbed(x) / x, 1.0)
 
 
 @wp.func
 def phase(g: float, cosine: float) -> float:
-    """Henyey-Greenstein phase function times 4 pi; `cosine` is 1 for light that is not deflected."""
+    """Computes the Henyey-Greenstein phase function times 4 pi; `cosine` is 1 for light that is not deflected."""
     d = 1.0 + g * g - 2.0 * g * cosine
     return (1.0 - g * g) / (d * wp.sqrt(d))
 
 
 @wp.func
 def noise(row: int, column: int, seed: int) -> float:
-    """Interleaved gradient noise in [0, 1) (Jimenez 2014); its sum over a few pixels varies little."""
+    """Computes interleaved gradient noise in [0, 1) (Jimenez 2014); its sum over a few pixels varies little."""
     pattern = float(seed & (_PATTERNS - 1))
     x = float(column) + 5.588238 * pattern
     y = float(row) + 5.588238 * pattern
@@ -342,7 +342,7 @@ def noise(row: int, column: int, seed: int) -> float:
 
 @wp.func
 def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: float) -> Ray:
-    """The ray of a pixel before its first step through the smoke; an offset of 1/2 is the middle of each step."""
+    """Makes the ray of a pixel before its first step through the smoke; an offset of 1/2 is the middle of each step."""
     r = ray(view, row, column)
     r = steps_along(size_of(smoke.density), r.origin, r.direction, step)
     r.offset = offset
@@ -352,7 +352,7 @@ def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: fl
 
 @wp.func
 def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchParameters) -> Ray:
-    """`begin` with samples shifted by gradient noise."""
+    """Calls `begin` with samples shifted by gradient noise."""
     offset = 0.5 + march.jitter * (noise(row, column, march.seed) - 0.5)
     return begin(view, row, column, smoke, march.step, offset)
 
@@ -369,7 +369,7 @@ def look(r: Ray, smoke: Any) -> Ray:
 
 @wp.func
 def pass_step(r: Ray, cutoff: float) -> Ray:
-    """Goes to the next step, or to the end of the ray where less than the cutoff of its transparency is left."""
+    """Advances to the next step, or to the end of the ray if its transparency is below the cutoff."""
     r.done += 1
     if r.x > 0.0:
         r.tau += r.x
@@ -381,7 +381,7 @@ def pass_step(r: Ray, cutoff: float) -> Ray:
 
 @wp.func
 def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
-    """Distance to the first sample whose extinction exceeds the threshold; `depth` is the result so far, 0: none."""
+    """Finds the distance to the first sample above the threshold; `depth` is the result so far, 0: none."""
     if depth == 0.0 and r.sigma > threshold:
         return (r.distance + view.moved) * view.voxel
     return depth
@@ -389,13 +389,13 @@ def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
 
 @wp.func
 def emitted(r: Ray, smoke: Any) -> float:
-    """Light that a step emits and that reaches the camera; fire without smoke emits too."""
+    """Computes the light that a step emits and that reaches the camera; fire without smoke emits too."""
     return r.t * mean_transparency(r.x) * smoke.emission * r.length * density_at(smoke.temperature, r.place)
 
 
 @wp.func
 def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
-    """Optical depth from p out of the smoke, in equal steps no longer than `step`, sampled at their middles (eq. 3)."""
+    """Computes the optical depth from p out of the smoke in equal steps up to `step`, sampled at the middle (eq. 3)."""
     r = steps_along(size_of(smoke.density), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
@@ -405,7 +405,7 @@ def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float
 
 @wp.func
 def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int) -> wp.vec3:
-    """Position of a node of a lattice whose first and last nodes along each axis lie on the border of the smoke."""
+    """Computes a node's position; the first and last nodes along each axis lie on the border of the smoke."""
     return wp.vec3(
         float(i) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
         float(j) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
@@ -414,7 +414,7 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Numbers of nodes of a lattice over the smoke, whose spacing is at most the larger of a step and a voxel."""
+    """Computes the numbers of nodes over the smoke for a spacing of at most the larger of a step and a voxel."""
     # Each node marches to its lights separately, so the work grows with the fourth power of the resolution.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
@@ -430,7 +430,7 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[wp.uint8],
     ):
-        """Whether a row of voxels as long as a brick contains smoke, the voxel beyond either end included."""
+        """Tests whether a row of voxels as long as a brick, plus one voxel at either end, contains smoke."""
         i, j, c = wp.tid()
         smoke = wp.uint8(0)
         for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
@@ -465,7 +465,7 @@ def occupied(medium: Medium) -> wp.array:
     """
     density = medium.density
     shape = tuple(-(-n // BRICK) for n in density.shape)
-    # Rows first: neighbouring threads then read neighbouring voxels, and each voxel once.
+    # Rows are reduced first, so that neighbouring threads read neighbouring voxels, and each voxel once.
     rows, bricks = medium.buffer((*density.shape[:2], shape[2]), wp.uint8), medium.buffer(shape, wp.uint8)
     wp.launch(occupied_kernel(density.dtype), rows.shape, [density], [rows], device=density.device)
     wp.launch(_bricks_of_rows, shape, [rows], [bricks], device=density.device)
@@ -499,7 +499,7 @@ def require_orthographic(view: View, what: str) -> None:
 
 
 def parameters(march: March) -> MarchParameters:
-    """The settings of a march as kernels take them."""
+    """Packs the settings of a march for kernels."""
     values = MarchParameters()
     values.step, values.jitter, values.threshold = float(march.step), float(march.jitter), float(march.threshold)
     values.g, values.cutoff = float(march.g), float(march.cutoff)

@@ -44,7 +44,7 @@ DEPTH = PLANES.index("depth")
 
 @wp.func
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
-    """Depths to the right, left, top and bottom, bilinear between the nodes of plane k."""
+    """Interpolates depths to the right, left, top and bottom bilinearly between the nodes of plane k."""
     sides = wp.vec4()
     for pair in range(2):
         a = wp.lerp(nodes[i, j, k, pair], nodes[i, j + 1, k, pair], fy)

@@ -1,7 +1,7 @@
 """Guiding maps by a march in large steps (neural-six-way-lightmaps, algorithm 1).
 
-The lights from the top and the bottom are marched to from each sample, or, far sooner, from the nodes of a lattice over
-the grid's box, between which their optical depths are interpolated. Units and sampling are those of `march`, except
+Optical depths to the lights from the top and the bottom are marched from each sample or, much faster, from the nodes of
+a lattice over the grid's box and interpolated between them. Units and sampling are those of `march`, except
 that the jitter is a random number per pixel, as in the paper. Read `guide` of `tests/reference/marching.py` first: it
 is algorithm 1 in 20 lines.
 """
@@ -36,7 +36,7 @@ from wlm_kernels.smoke.settings import March
 
 @wp.func
 def _both_depths(smoke: Any, p: wp.vec3, up: wp.vec3, step: float) -> wp.vec2:
-    """Optical depths to the top and to the bottom."""
+    """Interpolates optical depths to the top and to the bottom."""
     return wp.vec2(optical_depth(smoke, p, up, step), optical_depth(smoke, p, -up, step))
 
 

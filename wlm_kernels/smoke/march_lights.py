@@ -69,7 +69,7 @@ def light_kernels(smoke_type: Any) -> _Kernels:
                     light += share * wp.vec2(forth * wp.exp(-depths[0]), back * wp.exp(-depths[1]))
                 else:
                     way = lattice.place - r.place
-                    # Closer than half a step a sample would stand for far more light than its step receives.
+                    # Closer than half a step a sample would represent far more light than its step receives.
                     away = wp.max(wp.length(way), wp.max(lattice.radius, 0.5 * r.length))
                     share = share * phase(march.g, wp.dot(wp.normalize(way), r.direction))
                     light += wp.vec2(share * wp.exp(-depths[0]) / (away * away), 0.0)
@@ -114,7 +114,7 @@ def light(
         view: The camera, [H, W] pixels.
         depths: Result of `depth_lattice.reach`.
         march: Settings.
-        shadow: Extinction on the way to the light over that along the camera's rays; 1 is physical.
+        shadow: Ratio of extinction towards the light to extinction along the camera's rays; 1 is physical.
         out: float [2, H, W], written: light scattered once, of irradiance 4 pi, from the light and from the opposite
             light. For a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """
@@ -124,6 +124,6 @@ def light(
 
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
-    """Computes what a camera sees of smoke without light: `PLANES`, float [3, H, W], written; arguments as `light`."""
+    """Computes a camera's view of unlit smoke: `PLANES`, float [3, H, W], written; arguments as `light`."""
     inputs = [medium.smoke, view, parameters(march)]
     wp.launch(light_kernels(medium.smoke_type).unlit, out.shape[1:], inputs, [out], device=medium.device)

@@ -1,7 +1,7 @@
 """Motion of smoke across the image: along each ray, how far the air carried the visible smoke between two frames.
 
-A step counts by the light that it keeps, T (1 - exp(-sigma h)), so that hidden smoke counts little. The air's
-velocities lie on a grid of their own over the same box, as in `wlm_kernels.fluid.advection`: trilinear between cell
+A step is weighted by the light that it absorbs, T (1 - exp(-sigma h)), so that hidden smoke has little weight. The
+air's velocities lie on a separate grid over the same box, as in `wlm_kernels.fluid.advection`: trilinear between cell
 centres, constant beyond the outermost centres. Smoke is traced back by the midpoint rule, as the solver carries it,
 with the velocities of the later frame. Smoke that entered the box between the frames is taken to have been at the
 nearest position at the border. Read `_loop` of `tests/smoke/test_motion.py` first: the same in float64, pixel by pixel.
@@ -85,7 +85,7 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
     Args:
         medium: The smoke of the later frame.
         view: An orthographic camera, [H, W] pixels, the same for both frames.
-        velocity: vec3 [A, B, C], of the air over the same box, of any number of cells.
+        velocity: vec3 [A, B, C], velocity of the air over the same box, with any number of cells.
         reach: Voxels that a velocity of 1 moves between the frames.
         march: Its step and cutoff; samples lie in the middles of the steps.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.

@@ -49,7 +49,7 @@ _SLAB_BYTES = 2**28  # memory of the four optical depths of a slab
 
 @wp.struct
 class _Slab:
-    """Planes of samples across the view, `gap` apart; sample n lies at distance `start + (n + 1/2) gap`."""
+    """A slab of planes of samples across the view, `gap` apart; sample n lies at distance `start + (n + 1/2) gap`."""
 
     start: float
     gap: float
@@ -79,7 +79,7 @@ class _Kernels:
 
 @wp.func
 def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: float, h: float) -> float:
-    """Optical depth of a step of length h with its sample at distance s, 0 outside the span of the smoke."""
+    """Computes the optical depth of a step of length h with its sample at distance s, 0 outside the smoke's span."""
     if s > span[0] and s < span[1]:
         return smoke.extinction * sample(smoke, p + s * direction) * h
     return 0.0
@@ -118,7 +118,7 @@ def six_kernels(smoke_type: Any) -> _Kernels:
         # out:
         tau: wp.array3d[float],
     ):
-        """Optical depths to a side: 0 right, 1 left, 2 top, 3 bottom. A thread does one row or column of a plane."""
+        """Sums optical depths to a side: 0 right, 1 left, 2 top, 3 bottom. A thread processes one row or column."""
         plane, line = wp.tid()
         s = slab.start + (float(plane) + 0.5) * slab.gap
         u = (float(line) + 0.5 - 0.5 * float(view.width)) * view.pitch
@@ -139,7 +139,7 @@ def six_kernels(smoke_type: Any) -> _Kernels:
         dt = view.pitch / float(parts)
         total = float(0.0)
         top = (0.5 * float(count) - 0.5) * view.pitch
-        # From the border of the smoke to the first pixel.
+        # The first part runs from the border of the smoke to the first pixel.
         if span[1] > top and span[1] > span[0]:
             steps = int(wp.ceil((span[1] - top) / dt))
             inside = steps - int(wp.max(span[0] - top, 0.0) / dt)
@@ -235,7 +235,7 @@ def six_kernels(smoke_type: Any) -> _Kernels:
 
 
 def _extent(shape, origin, direction) -> tuple[float, float]:
-    """Least and greatest distance of the smoke's corners along a direction."""
+    """Computes the least and greatest distance of the smoke's corners along a direction."""
     start = sum(-0.5 * d - o * d for o, d in zip(origin, direction, strict=True))
     spans = [(n + 1) * d for n, d in zip(shape, direction, strict=True)]
     return start + sum(min(s, 0.0) for s in spans), start + sum(max(s, 0.0) for s in spans)
@@ -283,7 +283,7 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     capacity = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
     sides = [medium.buffer((capacity, height, width), float) for _ in range(4)]
     depths.right, depths.left, depths.top, depths.bottom = sides
-    # Once even if there is no plane, for the transparency.
+    # The loop runs once even if there is no plane, to write the transparency.
     for first in range(0, max(planes, 1), capacity):
         count = min(capacity, planes - first)
         slab = _slab(start + first * gap, gap, count)

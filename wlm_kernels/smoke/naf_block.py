@@ -29,12 +29,12 @@ _PER_LANE = 4
     return value;
 """)
 def lane_sum(value: float, count: int) -> float:
-    """Sum of a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value itself."""
+    """Sums a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value itself."""
     ...
 
 
 def lanes(channels: int, cuda: bool) -> int:
-    """Number of threads per row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
+    """Returns the number of threads per row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
     if not cuda:
         return 1
     count = -(-channels // _PER_LANE)

@@ -1,9 +1,9 @@
 """Light of all orders of scattering, predicted per pixel from light scattered once and from diffusion.
 
-At albedo a the light is a S + a^2 R, where S was scattered once. R is a weighted sum of features of a pixel: of S, of
-the same under the opposite light, of opacity, of the R of diffusion, and of the parts of the last two that come from
-thin smoke. The weights are a polynomial in the cosine between light and camera and in the smoke's depth, and are linear
-between the albedos for which they were fitted.
+At albedo a the light is a S + a^2 R, where S was scattered once. R is a weighted sum of features of a pixel: S, S
+under the opposite light, opacity, R by diffusion, and the parts of the last two that come from thin smoke. The weights
+are a polynomial in the cosine between light and camera and in the smoke's depth, and are linear between the albedos for
+which they were fitted.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ THINNEST = 1e-4
 """Transparencies below this have the same optical depth."""
 
 _THINNEST = wp.constant(THINNEST)
-_BRIGHTEST = wp.constant(6.0)  # limit of light over opacity: a white surface under irradiance 4 pi has 4
+_BRIGHTEST = wp.constant(6.0)  # limit of light over opacity; a white surface under irradiance 4 pi has 4
 
 _Features = wp.types.vector(length=FEATURES, dtype=float)
 _Mixes = wp.types.vector(length=MIXES, dtype=float)
@@ -104,7 +104,7 @@ def _write_mixes(
     # out:
     out: wp.array[float],
 ):
-    """For one thread; scales the depth from the range of the fit to -1 to 1."""
+    """Runs in one thread and scales the depth from the range of the fit to -1 to 1."""
     at = (2.0 * depth[0] - known[0] - known[1]) / (known[1] - known[0])
     m = _mixes(cosine, wp.clamp(at, -1.0, 1.0))
     for n in range(MIXES):
@@ -121,7 +121,7 @@ def _weigh(
     # out:
     out: wp.array3d[float],
 ):
-    """Weights of a light's features at an albedo, interpolated between two fitted albedos."""
+    """Computes weights of a light's features at an albedo, interpolated between two fitted albedos."""
     light, a, feature = wp.tid()
     total = float(0.0)
     for n in range(MIXES):
@@ -157,7 +157,7 @@ def _light(
             more += weights[n, a, m] * x[m]
         once = albedos[a] * s
         total = once + albedos[a] * albedos[a] * wp.max(more, 0.0)
-        # At most the light of a white surface, and at least the light scattered once.
+        # The result is at most the light of a white surface, and at least the light scattered once.
         found[a] = wp.max(wp.min(total, _BRIGHTEST * (1.0 - t)), once)
     for channel in range(3):
         out[n, row, column, channel] = found[places[channel]]

@@ -25,7 +25,7 @@ import warp as wp
 from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray
 
 _NEVER = wp.constant(1.0e30)
-_GLOW = 1.0 / BRICK  # least majorant of hot smoke: about one sample of its emission per brick
+_GLOW = 1.0 / BRICK  # least majorant of hot smoke, which gives about one sample of its emission per brick
 _SLACK = 1.0001  # factor of a majorant that covers the rounding of interpolated densities
 _DEEP = 2.0  # largest optical depth through a brick of the densest smoke, up to which bricks are made larger
 _THREADS = 2**20  # threads on a GPU, each of which traces several parts in turn
@@ -52,7 +52,7 @@ class PathLight:
 
 @wp.struct
 class PathSettings:
-    """`albedo` R, G, B; paths end after `highest` scatterings; the first `kept` orders have planes of their own."""
+    """`albedo` R, G, B; paths end after `highest` scatterings; the first `kept` orders have separate planes."""
 
     albedo: wp.vec3
     g: float
@@ -147,7 +147,7 @@ def following(random: wp.uint64) -> wp.uint64:
 
 @wp.func
 def bits(random: wp.uint64) -> wp.uint32:
-    """32 random bits (PCG-XSH-RR, O'Neill 2014)."""
+    """Generates 32 random bits (PCG-XSH-RR, O'Neill 2014)."""
     x = wp.uint32(((random >> wp.uint64(18)) ^ random) >> wp.uint64(27))
     turn = wp.uint32(random >> wp.uint64(59))
     return (x >> turn) | (x << ((wp.uint32(32) - turn) & wp.uint32(31)))
@@ -155,7 +155,7 @@ def bits(random: wp.uint64) -> wp.uint32:
 
 @wp.func
 def uniform(random: wp.uint64) -> float:
-    """A number of at least 0 and below 1, of 24 bits."""
+    """Generates a number of 24 bits in [0, 1)."""
     return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
@@ -168,7 +168,7 @@ def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
         cosine = (1.0 + g * g - share * share) / (2.0 * g)
     cosine = wp.clamp(cosine, -1.0, 1.0)
     sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
-    # Two directions across d, without division by a number near 0 (Duff et al. 2017).
+    # Two directions orthogonal to d are computed without division by a number near 0 (Duff et al. 2017).
     sign = wp.where(d[2] >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + d[2])
     b = d[0] * d[1] * a
@@ -180,7 +180,7 @@ def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
 
 @wp.func
 def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
-    """Radiance of the sky in a direction."""
+    """Returns the radiance of the sky in a direction."""
     rows = sky.radiance.shape[0]
     columns = sky.radiance.shape[1]
     row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
@@ -193,7 +193,7 @@ def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def chance_of(sky: Sky, radiance: wp.vec3) -> float:
-    """Probability per solid angle of a direction in a texel of a radiance."""
+    """Returns the probability per solid angle of a direction in a texel of a given radiance."""
     return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
 
 
@@ -258,7 +258,7 @@ class _Walk:
 
 @wp.func
 def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
-    """Distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
+    """Computes the distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
     if d > 1.0e-9 and cell < count - 1:
         return (float(cell + 1) * edge - p) / d
     if d < -1.0e-9 and cell > 0:
@@ -268,7 +268,7 @@ def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
 
 @wp.func
 def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
-    """The brick in which a ray from p begins; the walk is empty if the ray misses the smoke up to its limit."""
+    """Finds the brick in which a ray from p begins; the walk is empty if the ray misses the smoke up to its limit."""
     w = _Walk()
     q = p - grid.low
     span = clip(grid.size, q, d)
@@ -286,13 +286,13 @@ def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
 
 @wp.func
 def _further(cell: int, count: int, leave: float, across: float) -> float:
-    """Distance at which a ray leaves the brick that it has just entered along an axis."""
+    """Computes the distance at which a ray leaves the brick that it has just entered along an axis."""
     return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
 
 
 @wp.func
 def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
-    """The walk in the next brick, or at its end."""
+    """Advances the walk to the next brick, or to its end."""
     w.t = w.border
     if w.t < w.end:
         if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
@@ -311,7 +311,7 @@ def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
 
 @wp.func
 def drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
-    """Density of one of the voxels around a position, drawn such that its mean is `density_at`."""
+    """Draws one of the voxels around a position and returns its density, whose mean is `density_at`."""
     x = bits(random)
     i = int(wp.floor(p[0] + (float(x & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
     j = int(wp.floor(p[1] + (float((x >> wp.uint32(10)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
@@ -402,9 +402,10 @@ class _Kernels:
 @functools.cache
 def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
     """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`; `solid`: with obstacles."""
+
     @wp.struct
     class Scene:
-        """Everything that paths meet: smoke, lights, the sky, and the mesh of obstacles in voxels."""
+        """The scene of paths: smoke, lights, the sky, and the mesh of obstacles in voxels."""
 
         smoke: smoke_type
         grid: _Grid
@@ -465,7 +466,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
-        """Distance to the first obstacle along a ray; `_NEVER` if there is none."""
+        """Finds the distance to the first obstacle along a ray; `_NEVER` if there is none."""
         if wp.static(solid):
             found = wp.mesh_query_ray(mesh, p, d, _NEVER)
             return wp.where(found.result, found.t, _NEVER)
@@ -617,7 +618,7 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
 
 @dataclass(frozen=True)
 class Majorants:
-    """Largest extinction per voxel that a sample in each brick can find, for the part of the grid with smoke.
+    """The largest extinction per voxel that a sample in each brick can read, for the part of the grid with smoke.
 
     `most` is float [X, Y, Z], a number per brick of `edge` voxels. The first brick begins at `low`; the bricks extend
     `size` voxels from there. There is no smoke outside them.
@@ -654,7 +655,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
 
 
 def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
-    """Smallest box of true cells: the first, and past the last, along each axis; one cell if none is true."""
+    """Finds the smallest box of true cells: first and one past the last along each axis; one cell if none is true."""
     begin, end = [], []
     for axis in range(3):
         found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))

@@ -115,7 +115,7 @@ def _light_solids(
 
 @wp.func
 def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
-    """Colour of an emission: linear between the stops, constant beyond them; grey without stops."""
+    """Computes the colour of an emission: linear between the stops, constant beyond them; grey without stops."""
     if count == 0:
         return wp.vec3(emission, emission, emission)
     colour = colours[0]
@@ -150,7 +150,7 @@ def _behind(
     solid_light: wp.array2d(dtype=wp.vec3),
     solid_depth: wp.array2d(dtype=float),
 ) -> wp.vec4:
-    """Light of the obstacle or background at a pixel, and 1 if it is an obstacle in front of the smoke."""
+    """Returns the light of the obstacle or background at a pixel, and 1 if it is an obstacle in front of the smoke."""
     if solids != 0 and solid_depth[i, j] < wp.inf:
         light = solid_light[i, j]
         return wp.vec4(light[0], light[1], light[2], wp.where(solid_depth[i, j] < surface[i, j], 1.0, 0.0))
@@ -263,7 +263,7 @@ def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp
         ramp: Stops float [S] and their colours vec3 [S]; None: grey.
         glow: vec3 [H, W], written.
     """
-    # Without a ramp, arrays that are not read.
+    # Without a ramp, the kernel gets arrays that it does not read.
     stops, colours = ramp or (emission.flatten(), glow.flatten())
     inputs = [emission, stops, colours, 0 if ramp is None else stops.shape[0]]
     wp.launch(_glow_of, emission.shape, inputs, [glow], device=glow.device)
@@ -306,7 +306,7 @@ def compose_lights(
     solids: tuple[wp.array, wp.array, wp.array] | None,
     image: wp.array,
 ) -> None:
-    """`compose` for images vec3 [L, H, W] of each light at an irradiance, or intensity, of 4 pi."""
+    """Runs `compose` for images vec3 [L, H, W] of each light at an irradiance, or intensity, of 4 pi."""
     inputs = [planes, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
     inputs += [lamps.irradiance, lamps.visibility, wp.vec3(*background)]
     inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]

@@ -65,7 +65,7 @@ def _srgb(linear: float) -> float:
 
 @wp.func
 def _linear(code: float) -> float:
-    """Inverse of `_srgb`; values below 0 count as 0."""
+    """Inverts `_srgb`; values below 0 count as 0."""
     if code <= FOOT_CODE:
         return wp.max(code, 0.0) / 12.92
     return wp.pow((code + 0.055) / 1.055, 2.4)
@@ -114,7 +114,7 @@ def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.arr
         near, far: Distances at which the smoke begins and ends, near < far.
         hot: Whether the smoke emits light; otherwise that plane is 0.
         out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
-            share of the span, 1 at its near end, 0 where there is no surface. A NaN stays one.
+            share of the span, 1 at its near end, 0 where there is no surface. NaN stays NaN.
     """
     inputs = [planes, far, far - near, hot]
     wp.launch(_encode_six, planes.shape[1:], inputs=inputs, outputs=[out], device=planes.device)
@@ -143,7 +143,7 @@ def decode(planes: wp.array, out: wp.array) -> None:
     Args:
         planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
         out: float [PLANES, H, W], written: six lights, transparency, emission up to the largest half float. Values
-            outside a plane's range are clamped to it; a NaN stays one.
+            outside a plane's range are clamped to it; NaN stays NaN.
     """
     wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
 
@@ -249,7 +249,7 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
                     for y in range(wp.static(STRIP + edge - 1)):
                         r = row + y - wp.static(middle)
                         inside = across and r >= 0 and r < guide.shape[1]
-                        # Loaded without a branch: all loads are issued at once.
+                        # The load has no branch, so that all loads are issued at once.
                         value = float(guide[c, wp.clamp(r, 0, guide.shape[1] - 1), q])
                         values[y] = wp.where(inside, value, 0.0)
                     for y in range(wp.static(edge)):

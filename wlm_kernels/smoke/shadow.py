@@ -21,7 +21,7 @@ _SMALLEST = wp.constant(1.0e-9)
 
 @wp.struct
 class _Map:
-    """Position and size of the map, in the light's axes."""
+    """The position and size of the map, in the light's axes."""
 
     middle: wp.vec3
     half: float
@@ -47,7 +47,7 @@ def _place(bounds: wp.array(dtype=float), resolution: float) -> _Map:
 
 @wp.func
 def _on_map(m: _Map, resolution: float, p: wp.vec3) -> wp.vec3:
-    """Column, row and height towards the light of a point in the light's axes; texel centres are at integers."""
+    """Computes column, row and height towards the light of a point in its axes; texel centres are at integers."""
     column = (p[0] - m.middle[0]) / m.texel + 0.5 * resolution - 0.5
     row = (m.middle[1] - p[1]) / m.texel + 0.5 * resolution - 0.5
     return wp.vec3(column, row, p[2])

@@ -43,7 +43,7 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """The values around q, in the grid's units: value i is at i."""
+    """Finds the values around q, in the grid's units: value i is at i."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))
@@ -115,7 +115,7 @@ def _add(grad: wp.array3d[Any], cell: _Cell, g: Any):
 
 @wp.func
 def _share_slope(x: float) -> float:
-    """The derivative of `mean_transparency`, without cancellation where x is small."""
+    """Computes the derivative of `mean_transparency`, without cancellation where x is small."""
     if x < 0.05:
         return -0.5 + x * (1.0 / 3.0 - x * (0.125 - x * (1.0 / 30.0 - x / 144.0)))
     return (wp.exp(-x) - absorbed(x) / x) / x
@@ -264,7 +264,7 @@ def depths(density, toward, step: float, nodes) -> None:
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """Adjoint of `depths`.
+    """Computes the adjoint of `depths`.
 
     Args:
         toward, step: Arguments of `depths`.
@@ -309,7 +309,8 @@ def march_backward(
     grad_emission,
     grad_nodes,
 ) -> None:
-    """Adjoint of `march`; the gradient that reaches the density through the nodes is added by `depths_backward`.
+    """Computes the adjoint of `march`; the gradient that reaches the density through the nodes is added by
+    `depths_backward`.
 
     Args:
         density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.

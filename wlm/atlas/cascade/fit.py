@@ -1,8 +1,8 @@
 """The paper's method: group triangles, pack them, and tune two small textures (lightmap-uv-clustering-cascade,
 sections 3.1 to 3.3).
 
-T_p begins as the regenerated lightmap made smaller by epsilon_p, T_c as the coordinates of its own texels' centres;
-`wlm_kernels.atlas.cascade` says how they are read. Adam then tunes both:
+T_p starts as the regenerated lightmap downscaled by epsilon_p, T_c as the coordinates of its texels' centres;
+`wlm_kernels.atlas.cascade` describes how they are read. Adam then tunes both:
 
     space "views"   A step draws the mesh from one random camera of `views`, once with the old UVs and the lightmap,
                     its gaps filled, and once with the new UVs and the cascade. The loss is the L1 of the colours plus
@@ -346,7 +346,7 @@ class _Step:
             self._lut.clamp_(0.0, 1.0)
 
     def state(self) -> dict[str, np.ndarray]:
-        """The state that later steps depend on."""
+        """Returns the state that later steps depend on."""
         tensors = {"step": self._step}
         for group in self._adam.param_groups:
             for parameter in group["params"]:

@@ -252,7 +252,7 @@ def _curves(
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:
-    """Bits of each choice of each candidate."""
+    """Lists the bits of each choice of each candidate."""
     return np.array([choice.bits for each in tried for choice in each.choices])
 
 

@@ -47,7 +47,7 @@ class Mixtures:
         return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
 
     def factors(self, number: int) -> np.ndarray:
-        """The constant of one mixture, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
+        """Returns one mixture's constant, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
         factor, offset = (each[number].cpu().numpy().astype(np.float64) for each in (self.factor, self.offset))
         constant = -np.einsum("mkc,kc->mc", factor, offset)
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
@@ -123,7 +123,7 @@ def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
 
 
 def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
-    """The directions [3, M, K] of most energy; the first has no negative numbers."""
+    """Computes the directions [3, M, K] of most energy; the first has no negative numbers."""
     space = np.linalg.eigh(moment)[1][:, :, ::-1][:, :, :rank].copy()
     space[:, :, 0] *= np.where(space[:, :, 0].sum(1) < 0.0, -1.0, 1.0)[:, None]
     return space
@@ -134,12 +134,12 @@ def _projection(space: np.ndarray) -> np.ndarray:
 
 
 def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
-    """The energy of each tile that each subspace keeps, [T, G]."""
+    """Computes the energy of each tile that each subspace keeps, [T, G]."""
     return flat @ np.stack([_projection(each) for each in spaces]).T
 
 
 def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:
-    """The offsets of components, [K, 3], that make them positive."""
+    """Computes the offsets [K, 3] that make the components positive."""
     # With one state the only direction is the light itself, and black stays black.
     if not len(texels) or space.shape[1] == 1:
         return np.zeros((space.shape[2], len(space)))

@@ -266,7 +266,7 @@ def _hopeless(
 
 
 def _room(bits: float, layout: Layout, planes: int, numbers: int) -> float:
-    """Bits that remain for tiles and factors after T_c and the table of sheets."""
+    """Computes the bits that remain for tiles and factors after T_c and the table of sheets."""
     return bits - planes * SHEET_BITS - math.prod(layout.shape) * numbers // 2 * LUT_BITS
 
 

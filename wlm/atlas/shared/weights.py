@@ -134,7 +134,7 @@ def _counts(
 
 
 class Detail:
-    """How much the light of a scene varies, on a device.
+    """The variation of a scene's light, on a device.
 
     Args:
         scene: The scene.
