@@ -185,7 +185,7 @@ def test_finished_hours_are_kept(tmp_path):
     results = each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu", resume=True), table, make, None)
     assert made == [18] and [float(each["light"][0]) for each in results] == [6, 12, 18]
     changed = replace(task, scene=task.scene.model_copy(update={"samples": 8}))
-    with pytest.raises(WlmError, match="set.partial: a checkpoint of another"):
+    with pytest.raises(WlmError, match="set.partial: the checkpoint is of another fit: it was made with scene samples=256, not 8"):
         open_checkpoint(output, changed, "lightmaps", "cpu", resume=True)
 
 
@@ -204,11 +204,11 @@ def test_what_is_written_is_a_set(tmp_path):
     assert (lightmaps.frames == light).all() and lightmaps.mesh.is_file()
     assert baked.error == pytest.approx([0.01, 0.01], rel=0.01)
     told = inspect(tmp_path / "set")
-    assert len(told) == 1 and told[0].command.startswith("wlm lightmap compress")
+    assert len(told) == 1 and told[0].command.startswith("wlm compress")
     direction = generator.random((2, 16, 16, 4)).astype(np.float16)
     write_lightmaps(tmp_path / "set", task, replace(baked, direction=direction))
     told = inspect(tmp_path / "set")
-    assert len(told) == 1 and "dir" in told[0].what and told[0].command.startswith("wlm lightmap compress")
+    assert len(told) == 1 and "dir" in told[0].what and told[0].command.startswith("wlm compress")
     layers = load(tmp_path / "set").sheets
     shown = {(sheet.layer, sheet.channels): own.frames for sheet, own in layers.items()}
     assert (shown["light", ("R", "G", "B")] == light).all()

@@ -14,7 +14,7 @@ BAKED = ROOM.parent / "data" / "cornell"
 
 def test_lightmaps_are_of_the_scenes_hours():
     scene, _, _ = load_scene(ROOM / "room.yaml", False)
-    lightmaps = load(BAKED)
+    lightmaps = load(BAKED).light
     assert lightmaps.times.tolist() == list(scene.hours) and lightmaps.period == scene.period
     assert lightmaps.mask.shape == (scene.lightmap.resolution, scene.lightmap.resolution)
     means = (float(frame[lightmaps.mask].mean()) for frame in lightmaps.frames)

@@ -16,6 +16,7 @@ from builders.smoke_samples import file_content
 
 import wlm
 from wlm.errors import WlmError
+from wlm.export import export
 from wlm.formats.exr import write_exr
 from wlm.formats.folder import UNFINISHED, read_index
 from wlm.probe.data import save_probes
@@ -92,14 +93,16 @@ def command(request, tmp_path_factory):
     def older(name: str):
         return lambda path: path.write_bytes((FILES / name).read_bytes())
 
-    def exported(system: str, name: str):
+    def exported(name: str):
         model = wlm.load(FILES / name)
-        return lambda path: getattr(wlm, system).export(model, path)
+        return lambda path: export(model, path)
 
     words = tuple(request.param.split())
+    if words[0] != "smoke":
+        words = words[1:2]  # the input says which system
     match request.param:
         case "lightmap compress":
-            lightmaps = small_sets.moving_light(40, 24)
+            lightmaps = small_sets.moving_light(40, 24).light
             for hour, frame in zip(lightmaps.times, lightmaps.frames, strict=True):
                 write_exr(place / f"light_{hour:g}h.exr", frame)
             profile = settings(small_sets.tiny_profile(steps=1500).model_dump(mode="json"))
@@ -116,8 +119,8 @@ def command(request, tmp_path_factory):
             cascade = {"name": "tiny", "method": "cascade", "steps": 400, "resolution": 64, "views": 4}
             tiles = {"name": "tiny", "views": 4}
             light = atlas_meshes.sheet(height=200, width=240)
-            profile = settings(tiles if len(words) == 2 else cascade | {"fallback": False})
-            words = (*words[:2], *atlas_meshes.write_files(place, light), "--profile", profile, *EVERY)
+            profile = settings(cascade | {"fallback": False} if "cascade" in request.param else tiles)
+            words += (*atlas_meshes.write_files(place, light), "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("atlas-tiles.wlm"), file_bytes, kept_or_whole, beside)
         case "smoke simulate":
             words += (settings(JET | {"frames": 40}), *EVERY)
@@ -148,13 +151,13 @@ def command(request, tmp_path_factory):
             lightmaps = small_sets.moving_light(40, 24)
             wlm.lightmap.compress(lightmaps, small_sets.tiny_profile()).save(place / "a.wlm")
             check = earlier_or_unfinished("bundle.json")
-            earlier = exported("lightmap", "lightmap.wlm")
+            earlier = exported("lightmap.wlm")
             return Command((*words, place / "a.wlm"), "out", earlier, file_bytes, check, None)
         case "probe export":
             profile = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=30, hidden=16, latent=3)
             wlm.probe.compress(probe_sets.synthetic(300), profile).save(place / "a.wlm")
             check = earlier_or_unfinished("bundle.json")
-            return Command((*words, place / "a.wlm"), "out", exported("probe", "probe.wlm"), file_bytes, check, None)
+            return Command((*words, place / "a.wlm"), "out", exported("probe.wlm"), file_bytes, check, None)
     raise WlmError(request.param)
 
 

@@ -49,8 +49,8 @@ def test_rectangles_are_counted_and_probes_have_their_command(unity):
     rectangles = read_lighting_data(path).rectangles
     assert [(each.lightmap, each.scale_offset) for each in rectangles] == [(0, RECTANGLE), (1, RECTANGLE)]
     found = inspect(path)[0]
-    assert "2 light probes of 9 RGB coefficients" in found.what and "2 renderers' rectangles" in found.what
-    assert found.command == f"wlm probe compress {path} -o OUT.wlm"
+    assert "2 light probes of 9 RGB coefficients" in found.what and "2 rectangles of renderers" in found.what
+    assert found.command == f"wlm compress {path} -o OUT.wlm"
 
 
 def test_what_has_no_probes_says_so(unity):

@@ -426,7 +426,8 @@ def test_from_arrays_checks_shapes():
     frames = _frames()
     assert "[T, H, W, 3]" in error_of(from_arrays, frames[..., :2], TIMES)
     assert "none of them 0" in error_of(from_arrays, frames[:0], [])
-    assert "3 times" in error_of(from_arrays, frames, [0, 1])
+    message = error_of(from_arrays, frames, [0, 1])
+    assert "expected frames [2, H, W, C]" in message and "got (3, " in message and "times (2,)" in message
     assert "mask" in error_of(from_arrays, frames, TIMES, np.ones((WIDTH, HEIGHT), bool))
 
 

@@ -70,7 +70,7 @@ def test_what_cannot_be_compared(tmp_path):
         ((FILES / "lightmap.wlm", tmp_path / "probe.wlm"), "expected a model of lightmap"),
         ((tmp_path / "probe.wlm", tmp_path / "fewer.wlm"), "expected 200 probes"),
         ((tmp_path / "probe.wlm", tmp_path / "probe.wlm"), "--original"),
-        ((FILES / "smoke.wlm", FILES / "smoke.wlm"), "wlm smoke evaluate"),
+        ((FILES / "smoke.wlm", FILES / "smoke.wlm"), "networks are compared by wlm evaluate"),
         ((tmp_path, tmp_path), "found a folder"),
     ):
         with pytest.raises(WlmError, match=said):

@@ -39,7 +39,7 @@ def test_a_report_shows_its_score_with_pictures_and_loads_nothing(scored, tmp_pa
     assert "<script" not in text and not re.search(r'(?:src|href)="(?!data:)', text)
     if scored[0] == "lightmap":
         report = scored[-1]
-        assert f"{report.between:.2f} dB" in text and f"tile {report.worst_seen['tile']} at" in text
+        assert f"{report.between:.2f} dB" in text and f"tile {report.light.worst_seen['tile']} at" in text
     pictures = text.count("data:image/png;base64,")
     assert pictures >= {"lightmap": 5, "atlas": 6, "probe": 1}[scored[0]]
 

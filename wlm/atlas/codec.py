@@ -44,6 +44,7 @@ from wlm.texels import MOST_SIDE, check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # limit on the length of an axis of a part
+_MOST_UV_SET = 9999  # as in the names that `wlm.formats.gltf` reads
 _GEOMETRY = ("mesh", "mask")
 
 _Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
@@ -71,7 +72,7 @@ class _Header(Header):
     separate: Literal[True] | None = None
     profile: Profile
     objects: list[_Object]
-    uv_set: int = Field(ge=0)
+    uv_set: int = Field(ge=0, le=_MOST_UV_SET)
     metres: bool
     hides: bool
     report: dict[str, JsonValue]

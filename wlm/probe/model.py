@@ -81,7 +81,7 @@ class Content(ABC):
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
-        """Returns figures for `wlm probe info`, as JSON values by name."""
+        """Returns figures for `wlm info`, as JSON values by name."""
 
 
 @dataclass(frozen=True, eq=False)

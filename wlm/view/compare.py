@@ -95,7 +95,7 @@ def compare(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Comparison:
-    """Compares two models of one input.
+    """Compares two models of one input. Of lightmaps with several sheets the first sheet of radiance is compared.
 
     Args:
         first, second: Two `.wlm` of lightmaps, probes or atlases.
@@ -118,7 +118,7 @@ def compare(
         return _probes(paths, models, original, key, device, progress)
     if systems[0] == "atlas":
         return _atlases(paths, models, original, device, progress)
-    raise WlmError(f"{paths[0]}: networks are compared by wlm smoke evaluate, which gives each the same smoke")
+    raise WlmError(f"{paths[0]}: networks are compared by wlm evaluate, which gives each the same smoke")
 
 
 def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
@@ -141,10 +141,10 @@ def _facts(paths: Sequence[Path], models: Sequence[Model]) -> dict[str, Any]:
 def _lightmaps(
     paths: Sequence[Path], models: Sequence[Any], original: _Path | None, device: str, progress: OnProgress | None
 ) -> Comparison:
-    sizes = [(model.width, model.height) for model in models]
+    sizes = [(model.light.width, model.light.height) for model in models]
     if sizes[0] != sizes[1]:
         raise WlmError(f"{paths[1]}: expected lightmaps of {_size(sizes[0])}, found {_size(sizes[1])}")
-    decoders = [model.decoder(device) for model in models]
+    decoders = [model.decoder(device).light for model in models]
     times = models[0].times
     frames, meter = [], Meter(progress, "decode", len(times))
     for time in times:
@@ -164,11 +164,11 @@ def _lightmaps(
             for model, name in zip(models, "AB", strict=True)
         ]
         names = {"PSNR dB": "psnr", "worst PSNR dB": "worst_psnr", "seen dB": "seen", "SSIM": "ssim", "FLIP": "flip"}
-        scores = {title: tuple(getattr(report, name) for report in reports) for title, name in names.items()}
+        scores = {title: tuple(getattr(report.light, name) for report in reports) for title, name in names.items()}
         nearest = int(np.abs(lightmaps.times - times[furthest]).argmin())
-        mask = lightmaps.mask[..., None]
+        mask = lightmaps.light.mask[..., None]
         pictures = {name: light * mask for name, light in pictures.items()}
-        pictures["original"] = lightmaps.frames[nearest] * mask
+        pictures["original"] = lightmaps.light.frames[nearest] * mask
     where = f"Furthest apart at time {times[furthest]:g}: {by_time[furthest]:.2f} dB"
     mean = float(np.mean(by_time))
     return Comparison(**_facts(paths, models), apart=mean, scores=scores, pictures=pictures, where=where)
@@ -216,7 +216,7 @@ def _atlases(
     pictures, scores = {"A": light[0], "B": light[1]}, {}
     if original is not None:
         if len(scene.sheets) * len(scene.states) > 1:
-            raise WlmError(f"{original}: expected models of one lightmap; wlm atlas evaluate scores scenes")
+            raise WlmError(f"{original}: expected models of one lightmap; wlm evaluate scores scenes")
         picture = np.nan_to_num(read_light(original)[0][..., :3].astype(np.float32), posinf=65504.0)
         if picture.shape[:2] != sizes[0][0]:
             raise WlmError(

@@ -50,7 +50,7 @@ def test_one_seed_gives_one_result():
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (3, 5, 3), (2, 3, 131)])
 def test_sizes(shape):
-    frames = moving_light(*shape[1:], hours=tuple(range(shape[0]))).frames
+    frames = moving_light(*shape[1:], hours=tuple(range(shape[0]))).light.frames
     rival = encode(frames)
     assert rival.decoded.shape == frames.shape
     assert psnr(frames, rival.decoded) > 12.0
