@@ -153,9 +153,10 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 def test_marching(dtype: type, tmp_path: Path):
     """Marches through densities of either type."""
     _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "bricks")
-    _compile_all(vars(march_guide.guide_kernels(dtype)).values(), tmp_path / "guide")
-    _compile_all(vars(march_six.six_kernels(dtype)).values(), tmp_path / "six")
-    _compile_all([march_motion.motion_kernel(dtype)], tmp_path / "motion")
+    bricks = smoke_march.smoke_struct(dtype, True)
+    _compile_all(vars(march_guide.guide_kernels(smoke_march.smoke_struct(dtype, False))).values(), tmp_path / "guide")
+    _compile_all(vars(march_six.six_kernels(bricks)).values(), tmp_path / "six")
+    _compile_all([march_motion.motion_kernel(bricks)], tmp_path / "motion")
 
 
 @pytest.mark.slow
@@ -163,18 +164,20 @@ def test_marching(dtype: type, tmp_path: Path):
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
     """The march of all six lights in large steps, with emission and without."""
-    depths = vars(depth_lattice.depth_kernels(dtype)).values()
-    _compile_all([march_coarse.coarse_kernel(dtype, hot), *depths], tmp_path)
+    smoke = smoke_march.smoke_struct(dtype, True)
+    depths = vars(depth_lattice.depth_kernels(smoke, 2)).values()
+    _compile_all([march_coarse.coarse_kernel(smoke, hot), *depths], tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
 def test_lights_and_paths(dtype: type, tmp_path: Path):
     """The march to lights, light from points by diffusion, and the path tracer."""
-    _compile_all(vars(march_lights.light_kernels(dtype)).values(), tmp_path / "lights")
-    _compile_all(vars(diffusion.light_kernels(dtype)).values(), tmp_path / "points")
+    smoke = smoke_march.smoke_struct(dtype, True)
+    _compile_all(vars(march_lights.light_kernels(smoke)).values(), tmp_path / "lights")
+    _compile_all(vars(diffusion.light_kernels(smoke)).values(), tmp_path / "points")
     for solid in (False, True):
-        kernels = path.path_kernels(dtype, solid)
+        kernels = path.path_kernels(smoke, solid)
         _compile_all([kernels.majorants, kernels.window, kernels.coarser, kernels.trace], tmp_path / f"path{solid}")
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, sample, size_of, smoke_struct
+from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, sample, size_of
 from wlm_kernels.smoke.settings import March
 
 MOST_NODES = 2**28
@@ -111,9 +111,8 @@ class _Kernels:
 
 
 @functools.cache
-def depth_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
+def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`, and a number of pairs of lights."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def measure(
@@ -128,7 +127,7 @@ def depth_kernels(dtype: Any) -> _Kernels:
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
         size = size_of(smoke.density)
-        for pair in range(gaps.shape[3]):
+        for pair in range(wp.static(pairs)):
             tau = float(0.0)
             if wp.where(pair == 0, i, j) < wp.where(pair == 0, gaps.shape[0], gaps.shape[1]) - 1:
                 along = axis(lattice, pair)
@@ -222,7 +221,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
     gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)
-    kernel = depth_kernels(medium.density.dtype).measure
+    kernel = depth_kernels(medium.smoke_type, pairs).measure
     wp.launch(kernel, tuple(counts), [medium.smoke, lattice, parts], [gaps], device=medium.device)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
     wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
@@ -256,7 +255,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
     nodes = medium.buffer(counts, wp.vec2)
-    kernel = depth_kernels(medium.density.dtype).reach
+    kernel = depth_kernels(medium.smoke_type, 1).reach
     wp.launch(kernel, counts, [medium.smoke, lattice, step], [nodes], device=medium.device)
     return lattice, nodes
 

@@ -30,7 +30,6 @@ from wlm_kernels.smoke.march import (
     pass_step,
     sample,
     size_of,
-    smoke_struct,
     steps_along,
 )
 from wlm_kernels.smoke.settings import March
@@ -282,9 +281,8 @@ class _Kernels:
 
 
 @functools.cache
-def light_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
+def light_kernels(smoke_type: Any) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def shoot(
@@ -411,7 +409,7 @@ def shoot(
         out: float [X, Y, Z], cells.
     """
     inputs = [medium.smoke, place, radius, step, cell, power / _RAYS]
-    wp.launch(light_kernels(medium.density.dtype).shoot, _RAYS, inputs, [out], device=medium.device)
+    wp.launch(light_kernels(medium.smoke_type).shoot, _RAYS, inputs, [out], device=medium.device)
 
 
 def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array) -> None:
@@ -427,7 +425,7 @@ def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: 
     lattice, nodes = depths
     parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))
     inputs = [medium.smoke, nodes, lattice, cell, parts]
-    wp.launch(light_kernels(medium.density.dtype).stop, out.shape, inputs, [out], device=medium.device)
+    wp.launch(light_kernels(medium.smoke_type).stop, out.shape, inputs, [out], device=medium.device)
 
 
 def gather(
@@ -445,4 +443,4 @@ def gather(
         thin: float [H, W], written: the opacity of thin smoke, weighted alike.
     """
     inputs = [medium.smoke, view, parameters(march), cell, light]
-    wp.launch(light_kernels(medium.density.dtype).gather, out.shape[1:], inputs, [out, thin], device=medium.device)
+    wp.launch(light_kernels(medium.smoke_type).gather, out.shape[1:], inputs, [out, thin], device=medium.device)

@@ -45,14 +45,20 @@ _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power
 
 
 @functools.cache
-def smoke_struct(dtype: Any) -> Any:
-    """Builds (once) the struct by which kernels take smoke of `wp.float32` or `wp.float16`."""
+def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
+    """Builds (once) the struct by which kernels take smoke.
+
+    Args:
+        dtype: Type of the densities, `wp.float32` or `wp.float16`.
+        in_bricks: Whether the occupancy of bricks is known. Without it `bricks` is an integer without a meaning, so
+            that marches contain no test of bricks.
+    """
 
     @wp.struct
     class Smoke:
         density: wp.array3d[dtype]
         temperature: wp.array3d[dtype]
-        bricks: wp.array3d[wp.uint8]
+        bricks: wp.array3d[wp.uint8] if in_bricks else int
         extinction: float
         emission: float
 
@@ -94,15 +100,21 @@ class Medium:
         """Returns the same smoke with the occupancy of its bricks. Skipping empty bricks changes no result."""
         return replace(self, bricks=occupied(self))
 
+    @property
+    def smoke_type(self) -> Any:
+        """Type of `smoke`, by which kernels are specialised."""
+        return smoke_struct(self.density.dtype, self.bricks is not None)
+
     @functools.cached_property
     def smoke(self) -> Any:
         """Packs the smoke for kernels; cold smoke has its density in place of a temperature, and emission 0."""
-        smoke = smoke_struct(self.density.dtype)()
+        smoke = self.smoke_type()
         smoke.density, smoke.extinction = self.density, float(self.extinction)
         smoke.temperature, smoke.emission = self.density, 0.0
         if self.temperature is not None:
             smoke.temperature, smoke.emission = self.temperature, float(self.emission)
-        smoke.bricks = self.buffer((0, 0, 0), wp.uint8) if self.bricks is None else self.bricks
+        if self.bricks is not None:
+            smoke.bricks = self.bricks
         return smoke
 
 
@@ -256,15 +268,24 @@ def density_at(density: wp.array3d[Any], p: wp.vec3) -> float:
 
 
 @wp.func
+def _in_brick(density: wp.array3d[Any], bricks: wp.array3d[wp.uint8], p: wp.vec3) -> float:
+    i = wp.clamp(int(p[0]) // BRICK, 0, bricks.shape[0] - 1)
+    j = wp.clamp(int(p[1]) // BRICK, 0, bricks.shape[1] - 1)
+    k = wp.clamp(int(p[2]) // BRICK, 0, bricks.shape[2] - 1)
+    if bricks[i, j, k] == wp.uint8(0):
+        return 0.0
+    return density_at(density, p)
+
+
+@wp.func
+def _in_brick(density: wp.array3d[Any], bricks: int, p: wp.vec3) -> float:
+    return density_at(density, p)
+
+
+@wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
     """Computes `density_at`, with an early return in an empty brick. `p` lies at most half a voxel outside the grid."""
-    if smoke.bricks.shape[0] > 0:
-        i = wp.clamp(int(p[0]) // BRICK, 0, smoke.bricks.shape[0] - 1)
-        j = wp.clamp(int(p[1]) // BRICK, 0, smoke.bricks.shape[1] - 1)
-        k = wp.clamp(int(p[2]) // BRICK, 0, smoke.bricks.shape[2] - 1)
-        if smoke.bricks[i, j, k] == wp.uint8(0):
-            return 0.0
-    return density_at(smoke.density, p)
+    return _in_brick(smoke.density, smoke.bricks, p)
 
 
 @wp.func

@@ -32,7 +32,6 @@ from wlm_kernels.smoke.march import (
     pass_step,
     phase,
     require_orthographic,
-    smoke_struct,
     surface,
 )
 from wlm_kernels.smoke.settings import March
@@ -57,9 +56,8 @@ def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy:
 
 
 @functools.cache
-def coarse_kernel(dtype: Any, hot: bool) -> wp.Kernel:
+def coarse_kernel(smoke_type: Any, hot: bool) -> wp.Kernel:
     """Builds (once) the kernel for densities of a type; `hot`: for smoke with a temperature."""
-    smoke_type = smoke_struct(dtype)
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def gather(
@@ -140,6 +138,6 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     spacing, light_step = spacing_of(march)
     lattice, counts = make_lattice(medium.density.shape, (view.right, view.up, view.forward), spacing, view.origin)
     nodes = add_up(medium, lattice, counts, 2, light_step)
-    kernel = coarse_kernel(medium.density.dtype, medium.temperature is not None)
+    kernel = coarse_kernel(medium.smoke_type, medium.temperature is not None)
     inputs = [medium.smoke, nodes, view, lattice, parameters(march)]
     wp.launch(kernel, out.shape[1:], inputs, [out], device=medium.device)

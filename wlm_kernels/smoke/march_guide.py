@@ -29,7 +29,6 @@ from wlm_kernels.smoke.march import (
     pass_step,
     phase,
     size_of,
-    smoke_struct,
     surface,
 )
 from wlm_kernels.smoke.settings import March
@@ -49,9 +48,8 @@ class _Kernels:
 
 
 @functools.cache
-def guide_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
+def guide_kernels(smoke_type: Any) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def lattice(
@@ -123,7 +121,7 @@ def lattice(medium: Medium, up: Sequence[float], step: float) -> wp.array:
     """
     nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
     inputs = [medium.smoke, wp.vec3(*map(float, up)), step]
-    wp.launch(guide_kernels(medium.density.dtype).lattice, nodes.shape, inputs, [nodes], device=medium.device)
+    wp.launch(guide_kernels(medium.smoke_type).lattice, nodes.shape, inputs, [nodes], device=medium.device)
     return nodes
 
 
@@ -145,7 +143,7 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         shared: Whether pixels share the marches to the top and the bottom, on a lattice with a node per step (per
             voxel for smaller steps); otherwise each sample marches to them.
     """
-    kernels = guide_kernels(medium.density.dtype)
+    kernels = guide_kernels(medium.smoke_type)
     if shared:
         nodes, kernel = lattice(medium, view.up, march.step), kernels.guide
     else:

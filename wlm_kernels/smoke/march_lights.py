@@ -24,7 +24,6 @@ from wlm_kernels.smoke.march import (
     parameters,
     pass_step,
     phase,
-    smoke_struct,
     surface,
 )
 from wlm_kernels.smoke.settings import March
@@ -40,9 +39,8 @@ class _Kernels:
 
 
 @functools.cache
-def light_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
+def light_kernels(smoke_type: Any) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def gather(
@@ -122,10 +120,10 @@ def light(
     """
     lattice, nodes = depths
     inputs = [medium.smoke, nodes, view, lattice, parameters(march), shadow]
-    wp.launch(light_kernels(medium.density.dtype).gather, out.shape[1:], inputs, [out], device=medium.device)
+    wp.launch(light_kernels(medium.smoke_type).gather, out.shape[1:], inputs, [out], device=medium.device)
 
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Computes a camera's view of unlit smoke: `PLANES`, float [3, H, W], written; arguments as `light`."""
     inputs = [medium.smoke, view, parameters(march)]
-    wp.launch(light_kernels(medium.density.dtype).unlit, out.shape[1:], inputs, [out], device=medium.device)
+    wp.launch(light_kernels(medium.smoke_type).unlit, out.shape[1:], inputs, [out], device=medium.device)

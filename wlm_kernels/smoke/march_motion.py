@@ -25,7 +25,6 @@ from wlm_kernels.smoke.march import (
     pass_step,
     require_orthographic,
     size_of,
-    smoke_struct,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -34,9 +33,8 @@ _CLEAR = wp.constant(1e-3)  # largest opacity of a pixel that counts as free of 
 
 
 @functools.cache
-def motion_kernel(dtype: Any) -> wp.Kernel:
+def motion_kernel(smoke_type: Any) -> wp.Kernel:
     """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def motion(
@@ -96,5 +94,6 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         ValueError: The camera is in perspective.
     """
     require_orthographic(view, "motion vectors")
-    inputs = [medium.in_bricks().smoke, velocity, reach, view, parameters(march)]
-    wp.launch(motion_kernel(medium.density.dtype), out.shape[1:], inputs, [out], device=medium.device)
+    medium = medium.in_bricks()
+    inputs = [medium.smoke, velocity, reach, view, parameters(march)]
+    wp.launch(motion_kernel(medium.smoke_type), out.shape[1:], inputs, [out], device=medium.device)

@@ -37,7 +37,6 @@ from wlm_kernels.smoke.march import (
     require_orthographic,
     sample,
     size_of,
-    smoke_struct,
 )
 from wlm_kernels.smoke.settings import March
 
@@ -87,9 +86,8 @@ def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: flo
 
 
 @functools.cache
-def six_kernels(dtype: Any) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`."""
-    smoke_type = smoke_struct(dtype)
+def six_kernels(smoke_type: Any) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def column(
@@ -263,7 +261,7 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     require_orthographic(view, "six-way lightmaps")
     medium, device = medium.in_bricks(), medium.device
     height, width = view.height, view.width
-    kernels = six_kernels(medium.density.dtype)
+    kernels = six_kernels(medium.smoke_type)
     out.zero_()
     near, far = _extent(medium.density.shape, view.origin, view.forward)
     start = max(near, 0.0)
@@ -314,5 +312,6 @@ def lit(medium: Medium, view: View, toward: Sequence[float], march: March, out: 
         march: Its g and its step, along rays and to the light; samples lie in the middles of the steps.
         out: float [H, W], written.
     """
-    inputs = [medium.in_bricks().smoke, view, wp.vec3(*map(float, toward)), parameters(march)]
-    wp.launch(six_kernels(medium.density.dtype).lit, out.shape, inputs, [out], device=medium.device)
+    medium = medium.in_bricks()
+    inputs = [medium.smoke, view, wp.vec3(*map(float, toward)), parameters(march)]
+    wp.launch(six_kernels(medium.smoke_type).lit, out.shape, inputs, [out], device=medium.device)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray, smoke_struct
+from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray
 
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant of hot smoke, which gives about one sample of its emission per brick
@@ -400,9 +400,8 @@ class _Kernels:
 
 
 @functools.cache
-def path_kernels(dtype: Any, solid: bool) -> _Kernels:
-    """Builds (once) the kernels for densities of a type, `wp.float32` or `wp.float16`; `solid`: with obstacles."""
-    smoke_type = smoke_struct(dtype)
+def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
+    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`; `solid`: with obstacles."""
 
     @wp.struct
     class Scene:
@@ -639,7 +638,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
         densest: Its largest extinction per voxel.
     """
     density, device, edge = medium.density, medium.device, BRICK
-    kernels = path_kernels(density.dtype, False)
+    kernels = path_kernels(medium.smoke_type, False)
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
     wp.launch(kernels.majorants, most.shape, [medium.smoke, _GLOW, _SLACK], [most], device=device)
     begin, end = _filled(most.numpy() > 0.0)
@@ -693,7 +692,7 @@ def trace(
             emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above
             `settings.kept`. The sum over all parts is the mean over all samples.
     """
-    kernels = path_kernels(medium.density.dtype, mesh != 0)
+    kernels = path_kernels(medium.smoke_type, mesh != 0)
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
     together = max(1, traced * view.height * view.width // _THREADS) if medium.device.is_cuda else 1
