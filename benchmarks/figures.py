@@ -112,7 +112,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "tiles_seconds": Figure("tiles", "s", ".2g"),  # scenes only
         "curves_seconds": Figure("curves", "s", ".2g"),
         "balance_seconds": Figure("balance", "s", ".2g"),
-        "apart_seconds": Figure("apart", "s", ".2g"),  # scenes only: tiles of each state apart
+        "separate_seconds": Figure("separate", "s", ".2g"),  # scenes only: separate tiles of each state
         "allocate_seconds": Figure("allocate", "s", ".2g"),
         "solve_seconds": Figure("solve", "s", ".2g"),
         "cluster_seconds": Figure("cluster", "s", ".2g"),
@@ -121,6 +121,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "fit_seconds": Figure("fit", "s", ".2g"),
         "write_seconds": Figure("write", "s", ".2g"),
         "compare_seconds": Figure("compare", "s", ".2g"),
+        "mips_seconds": Figure("mips", "s", ".2g"),
     },
     "Volume": {  # around a viewer of probes
         "coverage": Figure("coverage", "%", ".1f"),

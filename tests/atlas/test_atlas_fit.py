@@ -158,7 +158,7 @@ def test_charts_that_overlap_have_no_area_or_one_texel(name: str):
     text = " ".join(mesh.warnings)
     assert "their UVs overlap" in text and "without area" in text and mesh.sheets[0].mask[32, 32]
     extra = {"steps": 20, "resolution": 64} if name == "cascade" else {"budget": 0.5}
-    decoded = Decoder(compress(mesh, name, views=2, **extra)).lightmap(mesh)
+    decoded = Decoder(compress(mesh, name, views=2, **extra)).lightmap()
     error = np.abs(decoded - image)[mesh.sheets[0].mask]
     assert error.max() < 0.5 and np.sqrt(np.square(error).mean()) < 0.05
 

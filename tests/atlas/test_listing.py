@@ -29,7 +29,7 @@ def test_each_picture_of_a_folder_is_a_sheet(tmp_path):
     assert all(scene.file(each.files[0], False).is_file() for each in scene.sheets) and scene.objects is None
     write_room(tmp_path / "room.glb")
     (found,) = inspect(tmp_path)
-    assert found.command == f"wlm atlas compress {tmp_path / 'room.glb'} {tmp_path} -o OUT.wlm"
+    assert found.command == f"wlm compress {tmp_path / 'room.glb'} {tmp_path} -o OUT.wlm"
 
 
 def test_the_list_in_a_folder_is_read(tmp_path):

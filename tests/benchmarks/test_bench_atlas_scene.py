@@ -48,7 +48,7 @@ def lights():
 
 @pytest.fixture(scope="module")
 def scene():
-    return cut(from_arrays(lights(), [6.0, 12.0], name="boxes"), *arrays(), factor=2)
+    return cut(from_arrays(lights(), [6.0, 12.0], name="boxes").light, *arrays(), factor=2)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def rows(scene, few):
 def test_objects_keep_their_light(scene):
     """Whole: the same light where the same point is read. Smaller: means of squares of a chart's own texels."""
     position, triangle, uv = arrays()
-    whole = cut(from_arrays(lights(), [6.0, 12.0], name="boxes"), position, triangle, uv)
+    whole = cut(from_arrays(lights(), [6.0, 12.0], name="boxes").light, position, triangle, uv)
     assert len(whole.sheets) == len(scene.sheets) == 2  # the screw belongs to the crate
     room, crate = whole.sheets
     assert len(room.triangle) == 12 and len(crate.triangle) == 24 and whole.metres
@@ -92,7 +92,7 @@ def test_one_object_of_few_texels():
         np.array([[0, 1, 2]]),
         np.eye(3)[:, :2],
     )
-    scene = cut(from_arrays(np.ones((1, 2, 2, 3)), [0.0]), position, triangle, uv)
+    scene = cut(from_arrays(np.ones((1, 2, 2, 3)), [0.0]).light, position, triangle, uv)
     assert len(scene.sheets) == 1 and (scene.sheets[0].lightmaps == 1.0).all()
 
 

@@ -130,6 +130,15 @@ def vary_compact(draw: Random, data: bytes) -> bytes:
     return data[:4] + compact_digest(data[:4], body) + body
 
 
+def edit_compact(data: bytes, change: Callable[[Any, bytes], tuple[Any, bytes]]) -> bytes:
+    """A probe file with the header and the unpacked parts that `change` makes of its own; signed."""
+    end = 10 + int.from_bytes(data[8:10], "little")
+    settings, parts = change(json.loads(data[10:end]), zstandard.ZstdDecompressor().decompress(data[end:]))
+    header = json.dumps(settings, separators=(",", ":")).encode()
+    body = len(header).to_bytes(2, "little") + header + zstd.compress(parts)
+    return data[:4] + compact_digest(data[:4], body) + body
+
+
 def compact_digest(begin: bytes, body: bytes) -> bytes:
     """The digest of a compact artifact."""
     return hashlib.blake2b(begin + body, digest_size=4).digest()

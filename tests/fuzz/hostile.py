@@ -21,7 +21,7 @@ import numpy as np
 
 from wlm.formats.exr import write_exr
 
-from .containers import edit_artifact
+from .containers import edit_artifact, edit_compact
 from .reader import corpus, stored
 
 _FILES = Path(__file__).resolve().parents[1] / "files" / "hostile"
@@ -43,6 +43,11 @@ def _artifact(name: str, change: Callable[[Any, dict[str, np.ndarray]], Any]) ->
     return lambda path: path.write_bytes(edit_artifact(stored(name)()[0], change))
 
 
+def _compact(name: str, change: Callable[[Any, bytes], tuple[Any, bytes]]) -> Write:
+    """A stored model's compact file with another header or parts, and a digest that fits."""
+    return lambda path: path.write_bytes(edit_compact(stored(name)()[0], change))
+
+
 def _with(**settings: Any) -> Callable[[Any, dict[str, np.ndarray]], Any]:
     return lambda old, parts: old | settings
 
@@ -50,14 +55,18 @@ def _with(**settings: Any) -> Callable[[Any, dict[str, np.ndarray]], Any]:
 # Artifacts.
 
 
+def _of_size(*size: float) -> Callable[[Any, dict[str, np.ndarray]], Any]:
+    return lambda old, parts: old | {"sheets": [old["sheets"][0] | {"size": size}]}
+
+
 def _empty_tiles(settings: Any, parts: dict[str, np.ndarray]) -> Any:
-    parts |= {name: np.zeros(0, np.uint8) for name in parts if name not in ("kind", "times")}
-    parts["kind"] = np.zeros(1 << 16, np.uint8)
-    return settings | {"size": [1 << 15, 1 << 15]}
+    parts |= {name: np.zeros(0, np.uint8) for name in parts if name not in ("0.kind", "times")}
+    parts["0.kind"] = np.zeros(1 << 16, np.uint8)
+    return _of_size(1 << 15, 1 << 15)(settings, parts)
 
 
 def _kind_2d(settings: Any, parts: dict[str, np.ndarray]) -> Any:
-    parts["kind"] = parts["kind"][None]
+    parts["0.kind"] = parts["0.kind"][None]
     return settings
 
 
@@ -67,15 +76,19 @@ def _times_2d(settings: Any, parts: dict[str, np.ndarray]) -> Any:
 
 
 def _affine_nan(settings: Any, parts: dict[str, np.ndarray]) -> Any:
-    parts["affine"] = np.full_like(parts["affine"], np.nan)
+    parts["0.affine"] = np.full_like(parts["0.affine"], np.nan)
     return settings
 
 
-def _many_outputs(settings: Any, parts: dict[str, np.ndarray]) -> Any:
-    profile = {"latent": 9, "hidden": 64} | settings["profile"]
-    latent, hidden, outputs = profile["latent"], profile["hidden"], 20_000
-    parts["net"] = np.zeros((latent + 4) * hidden + (hidden + 1) * (hidden + outputs), np.float16)
-    return settings | {"outputs": outputs}
+def _infinite_probes(settings: Any, parts: bytes) -> tuple[Any, bytes]:
+    return settings | {"probes": float("inf")}, parts
+
+
+def _many_outputs(settings: Any, parts: bytes) -> tuple[Any, bytes]:
+    latent, hidden, outputs = settings["profile"]["latent"], settings["profile"]["hidden"], 20_000
+    # The network comes last, in four bytes a weight.
+    old, new = (4 * ((latent + 4) * hidden + (hidden + 1) * (hidden + count)) for count in (27, outputs))
+    return settings | {"outputs": outputs}, parts[:-old] + bytes(new)
 
 
 def _large_plain(settings: Any, parts: dict[str, np.ndarray]) -> Any:
@@ -217,7 +230,7 @@ _ARCHIVES = ("volume-npz", "probes-npz", "positions-npz")
 _POINTS = {"position": np.zeros((4, 3), np.float32)}
 
 HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
-    "size-infinity.wlm": (["lightmap"], _artifact("lightmap.wlm", _with(size=[float("inf"), 1]))),
+    "size-infinity.wlm": (["lightmap"], _artifact("lightmap.wlm", _of_size(float("inf"), 1))),
     "empty-tiles.wlm": (["lightmap"], _artifact("lightmap.wlm", _empty_tiles)),
     "kind-2d.wlm": (["lightmap"], _artifact("lightmap.wlm", _kind_2d)),
     "times-2d.wlm": (["lightmap"], _artifact("lightmap.wlm", _times_2d)),
@@ -226,8 +239,8 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
         f"period-{period}.wlm": (["lightmap"], _artifact("lightmap.wlm", _with(period=period)))
         for period in (0, -5, float("nan"), float("inf"), "24")
     },
-    "probes-infinity.wlm": (["probe"], _artifact("probe.wlm", _with(probes=float("inf")))),
-    "many-outputs.wlm": (["probe"], _artifact("probe.wlm", _many_outputs)),
+    "probes-infinity.wlm": (["probe"], _compact("probe.wlm", _infinite_probes)),
+    "many-outputs.wlm": (["probe"], _compact("probe.wlm", _many_outputs)),
     "large-plain.wlm": (["atlas"], _artifact("atlas-plain.wlm", _large_plain)),
     "no-weights.wlm": (["smoke-network"], _artifact("smoke.wlm", _no_weights)),
     **{f"{name}.npz": (_ARCHIVES, _copy(f"{name}.npz")) for name in ("paren", "huge", "huge-mem", "indent")},

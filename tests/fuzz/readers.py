@@ -31,6 +31,7 @@ from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
+from wlm.inspection.finding import UNREADABLE
 from wlm.probe.data import load_positions
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
@@ -67,7 +68,7 @@ def _exr(path: Path) -> None:
 def _inspect(path: Path) -> None:
     for each in inspect(path.parent):
         assert not any("\n" in line for line in (each.what, *each.problems))
-        if each.what.endswith("can't be read"):
+        if each.what.endswith(UNREADABLE):
             raise WlmError(f"{path}: {each.problems[0]}")
 
 

@@ -51,7 +51,7 @@ def test_a_predictor_for_many_frames(smoke):
     assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))
     assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
     # Of smoke as smooth as this, on a grid as small, the march says all.
-    assert float(predictor.share) < 0.2 and "the coarse march that it reads is as near or nearer" in predictor.note()
+    assert float(predictor.share) < 0.2 and "its guide, the coarse march, is as accurate" in predictor.note()
 
 
 @pytest.mark.parametrize("options", [{}, {"perspective": True}, {"aspect": 2.0, "toward": (0, 1, 0)}])

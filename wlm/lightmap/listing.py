@@ -133,7 +133,7 @@ def list_set(
     elif path.is_file():
         if path.suffix.lower() != ".json":
             lone = path.suffix.lower() in SUFFIXES
-            found = "one lightmap, which wlm compress takes after its mesh" if lone else "a file of another kind"
+            found = "one lightmap, which wlm compress takes with its mesh" if lone else "a file of another kind"
             raise WlmError(f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found {found}")
         listing = _parse(path, times, trust)
     else:

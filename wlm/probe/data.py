@@ -307,7 +307,7 @@ def _read_json(path: Path, key: str | None) -> _Raw:
 def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
     """Returns positions, values and convention of an export for an engine; None for other content."""
     form = content.get("format") if isinstance(content, dict) else None
-    if form not in _EXPORTS:
+    if not isinstance(form, str) or form not in _EXPORTS:
         return None
     module, function, convention = _EXPORTS[form]
     return *getattr(import_module(module), function)(path, content), convention

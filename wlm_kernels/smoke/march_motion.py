@@ -94,5 +94,6 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         ValueError: The camera is in perspective.
     """
     require_orthographic(view, "motion vectors")
-    inputs = [medium.in_bricks().smoke, velocity, reach, view, parameters(march)]
+    medium = medium.in_bricks()
+    inputs = [medium.smoke, velocity, reach, view, parameters(march)]
     wp.launch(motion_kernel(medium.smoke_type), out.shape[1:], inputs, [out], device=medium.device)

@@ -312,5 +312,6 @@ def lit(medium: Medium, view: View, toward: Sequence[float], march: March, out: 
         march: Its g and its step, along rays and to the light; samples lie in the middles of the steps.
         out: float [H, W], written.
     """
-    inputs = [medium.in_bricks().smoke, view, wp.vec3(*map(float, toward)), parameters(march)]
+    medium = medium.in_bricks()
+    inputs = [medium.smoke, view, wp.vec3(*map(float, toward)), parameters(march)]
     wp.launch(six_kernels(medium.smoke_type).lit, out.shape, inputs, [out], device=medium.device)

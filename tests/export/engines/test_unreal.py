@@ -64,10 +64,10 @@ def test_lightmap_nodes_decode_an_hour_and_fill_its_gaps(kinds, tmp_path, monkey
         want = Decoder(model).frame(float(model.times[number]))
         np.testing.assert_allclose(found, want, rtol=0, atol=want.max() / 200)
     for time in (0.0, 3.0, 7.5, 12.9, 23.0):
-        assert script.names["neighbours"](time) == pytest.approx(model.axis.neighbours(time))
+        assert script.names["neighbours"](time) == pytest.approx(model.light.axis.neighbours(time))
     script.names["set_hour"](12.9)
     values = script.unreal.MaterialLibrary.set_scalar_parameter_value.call_args.args
-    assert values[2:] == ("Share", pytest.approx(model.axis.neighbours(12.9)[2]))
+    assert values[2:] == ("Share", pytest.approx(model.light.axis.neighbours(12.9)[2]))
 
 
 def test_times_without_a_day(tmp_path, monkeypatch):
@@ -75,7 +75,7 @@ def test_times_without_a_day(tmp_path, monkeypatch):
     export(model, tmp_path, "unreal")
     neighbours = Script(tmp_path / "wlm_lightmap.py", monkeypatch).names["neighbours"]
     for time in (0.0, 7.5, 10.0, 19.0):
-        early, late, share = model.axis.neighbours(time)
+        early, late, share = model.light.axis.neighbours(time)
         found = neighbours(time)
         mixed = lambda pair: (1 - pair[2]) * pair[0] + pair[2] * pair[1]  # noqa: E731
         assert mixed(found) == pytest.approx(mixed((early, late, share)))
