@@ -185,7 +185,8 @@ def test_finished_hours_are_kept(tmp_path):
     results = each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu", resume=True), table, make, None)
     assert made == [18] and [float(each["light"][0]) for each in results] == [6, 12, 18]
     changed = replace(task, scene=task.scene.model_copy(update={"samples": 8}))
-    with pytest.raises(WlmError, match="set.partial: the checkpoint is of another fit: it was made with scene samples=256, not 8"):
+    said = "set.partial: the checkpoint is of another fit: it was made with scene samples=256, not 8"
+    with pytest.raises(WlmError, match=said):
         open_checkpoint(output, changed, "lightmaps", "cpu", resume=True)
 
 
