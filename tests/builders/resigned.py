@@ -15,6 +15,20 @@ from wlm.formats.artifact import read_artifact, write_artifact
 GONE = object()
 """In place of a value: the file is to be without it."""
 
+WEIRD = {
+    "none": None,
+    "true": True,
+    "negative": -1,
+    "zero": 0,
+    "fraction": 1.5,
+    "huge": 10**400,
+    "text": "24",
+    "list": [],
+    "table": [[1, 2], [3, 4]],
+    "mapping": {"a": {"b": 1}},
+}
+"""Values of other types and magnitudes, to put in place of a setting."""
+
 
 def rewrite(
     path: Path,

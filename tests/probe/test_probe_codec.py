@@ -8,6 +8,7 @@ import pytest
 from builders.checks import assert_same
 from builders.probe_models import random_model, whole_model, with_whole
 from builders.probe_sets import synthetic
+from builders.resigned import GONE, WEIRD
 
 import wlm
 from wlm.errors import WlmError
@@ -160,6 +161,52 @@ def test_parts_that_do_not_fit_are_one_line(method, changes, tmp_path):
     with pytest.raises(WlmError, match="a.wlm: (the file's parts do not fit|setting |part)") as error:
         read(header, parts)
     assert "\n" not in str(error.value)
+
+
+# What is a good value after all.
+ACCEPTED = {("dropped", "zero"), ("dropped", "gone"), ("positions", "true")}
+# What is a good value of a file with other parts.
+OTHER_PARTS = {("live", "none"), ("live", "gone"), ("positions", "gone")}
+
+
+@pytest.mark.parametrize("method", ["gaussians", "pca"])
+def test_weird_settings_are_one_line(method, tmp_path):
+    model = whole_model(positions=True) if method == "gaussians" else wlm.probe.compress(synthetic(100, dead=5))
+    header, parts, read = stored(model, tmp_path)
+    assert {"probes", "source", "profile", "count", "live"} <= set(header)
+    weird = WEIRD | {"gone": GONE, "nan": float("nan"), "infinity": float("inf"), "minus": float("-inf")}
+    for key in header:
+        for kind, value in weird.items():
+            changed = {name: one for name, one in (header | {key: value}).items() if one is not GONE}
+            if (key, kind) in ACCEPTED:
+                read(changed, parts)
+                continue
+            said = "parts: expected " if (key, kind) in OTHER_PARTS else f"setting {key}"
+            with pytest.raises(WlmError) as error:
+                read(changed, parts)
+            line = str(error.value)
+            assert "\n" not in line and "a.wlm" in line and said in line, (key, kind, line)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"outputs": 4097}, "setting outputs: expected less than or equal to 4096"),
+        ({"probes": 2**40}, "setting probes: expected less than or equal to 16777216"),
+    ],
+)
+def test_settings_out_of_range_are_one_line(settings, said, tmp_path):
+    header, parts, read = stored(whole_model(), tmp_path)
+    with pytest.raises(WlmError, match=said):
+        read(header | settings, parts)
+
+
+def test_a_name_does_not_reach_the_terminal_as_orders(tmp_path):
+    header, parts, read = stored(whole_model(), tmp_path)
+    assert read(header | {"profile": header["profile"] | {"name": "p\x9b2J"}}, parts).profile.name == "p 2J"
+    path = tmp_path / "a\x1b[2J\u202eb.wlm"
+    (tmp_path / "a.wlm").rename(path)
+    assert load(path).name == "a [2J b"
 
 
 @pytest.mark.parametrize("at", range(0, 60, 2))
