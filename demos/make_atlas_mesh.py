@@ -303,7 +303,7 @@ def _on_grid(point: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np
 
 
 def _nearest(sample: np.ndarray, texel: np.ndarray, count: int) -> np.ndarray:
-    """Of each texel's samples the one next to their middle."""
+    """Selects for each texel the sample nearest to the middle of its samples."""
     size = np.bincount(texel, minlength=count)
     middle = np.stack([np.bincount(texel, sample[:, c], count) for c in range(3)], -1) / size[:, None]
     order = np.lexsort((((sample - middle[texel]) ** 2).sum(1), texel))

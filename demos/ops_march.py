@@ -66,7 +66,7 @@ def picture(radiance: torch.Tensor, transmittance: torch.Tensor) -> np.ndarray:
 
 
 def psnr(first: Sequence[torch.Tensor], second: Sequence[torch.Tensor]) -> float:
-    """Of radiance and transmittance together, with 1 as the peak."""
+    """PSNR over radiance and transmittance together, with 1 as the peak."""
     error = torch.cat([(a - b).detach().flatten() for a, b in zip(first, second, strict=True)])
     return -10.0 * math.log10(float(error.square().mean()))
 

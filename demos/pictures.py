@@ -73,7 +73,7 @@ class Browser:
 
 
 def take(page: Any, part: str = "body") -> Image.Image:
-    """What a page shows after the next frame, or a part of it."""
+    """Takes a picture of a page, or of a part of it, after the next frame."""
     page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     return Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
 
@@ -227,7 +227,7 @@ def page_and_phone(pages: Browser) -> Image.Image:
 
 
 def window(out: Path, name: str) -> Image.Image:
-    """What `wlm view` shows."""
+    """Takes a picture of the window of `wlm view`."""
     files, options, view, values = VIEWS[name]
     shown = Window(open_scene([out / file for file in files], **options), size=(1080, 480))
     try:

@@ -145,7 +145,7 @@ def turned(light: LightSettings, degrees: float) -> LightSettings:
 
 
 def psnr(predicted: SixWay, target: SixWay) -> dict[str, float]:
-    """Of the six lightmaps in sRGB, and of the emission if there is any."""
+    """PSNR over the six lightmaps in sRGB, and over the emission if there is any."""
     off = (encode_lightmaps(predicted) - encode_lightmaps(target)).square()
     values = {"": psnr_from_mse(float(off[: len(DIRECTIONS)].mean()), 1.0)}
     if target.emission is not None:

@@ -69,7 +69,7 @@ _JSON = json.JSONDecoder(parse_float=_finite, parse_constant=_finite)
 
 @dataclass(frozen=True)
 class Artifact:
-    """What an artifact holds.
+    """Content of an artifact.
 
     Attributes:
         system: The system that wrote it, "lightmap" for example.

@@ -1,4 +1,4 @@
-"""What a GPU holds of probes: the buffers, the shader and the reference of a model, and those of a volume."""
+"""Bundles of probes: the buffers, the shader and the reference of a model, and those of a volume."""
 
 from wlm.bundle import Bundle
 from wlm.probe.model import ProbeModel
