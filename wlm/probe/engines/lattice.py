@@ -1,12 +1,10 @@
 """The light of a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.probe.data import load_positions
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
 
@@ -51,20 +49,6 @@ class Lattice:
         axes = [low + self.size * (np.arange(n) + shift) for low, n in zip(self.low, count, strict=True)]
         z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
         return np.stack([x, y, z], -1).reshape(-1, 3)
-
-
-def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
-    """Returns the positions of a model's probes in another file, float64 [N, 3]; None without a file.
-
-    Raises:
-        WlmError: The file cannot be read or has other probes.
-    """
-    if original is None:
-        return None
-    position = load_positions(original)
-    if not model.has_probes_at(position):
-        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
-    return position
 
 
 def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | None, device: str) -> Lattice:

@@ -18,7 +18,8 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import write_index
 from wlm.formats.ktx2 import write_ktx2
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of, positions_of
+from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.places import positions_of
 
 FORMAT = "wlm-light-probe-grid"
 _VERSION = 1

@@ -15,7 +15,7 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import compact_json, rounded
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import positions_of
+from wlm.probe.places import positions_of
 from wlm.probe.sphere import sh_count
 
 FORMAT = "wlm-unity-probes"

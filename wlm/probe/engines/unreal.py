@@ -18,7 +18,8 @@ from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
 from wlm.formats.folder import write_index
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import CELLS, lattice_of, positions_of
+from wlm.probe.engines.lattice import CELLS, lattice_of
+from wlm.probe.places import positions_of
 
 FORMAT = "wlm-unreal-light"
 _VERSION = 1
