@@ -28,7 +28,6 @@ from wlm.cli.options import (
     ExactShader,
     Key,
     ModelFile,
-    PageFile,
     Profile,
     ReportFile,
     Resume,
@@ -101,7 +100,6 @@ def evaluate(
     file: ModelFile,
     probes_path: _Probes,
     json_path: ReportFile = None,
-    html_path: PageFile = None,
     volume: Annotated[
         bool, typer.Option("--volume", help="Also score the light sampled from the cascaded volume along a walk.")
     ] = False,
@@ -119,8 +117,6 @@ def evaluate(
     """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes."""
     if json_path is not None:
         check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
     quiet_warp()
     from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
     from wlm.probe import evaluate, load
@@ -134,10 +130,6 @@ def evaluate(
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
     if not probes.source.startswith(model.source):
         note(f"warning: {probes_path}: not the input of {file}; another key, convention or file?")
-    if html_path is not None:
-        from wlm.view.reports import probe_report
-
-        probe_report(html_path, model, probes, report)
     pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
     walks = score_walks(model, probes, device) if volume else {}
     if json_path is not None:
