@@ -1,26 +1,11 @@
 """The cascaded lighting volume: nested grids of blocks around the viewer, filled from the probes as the viewer moves.
 
-Follows gaussian-probe-compression, section 3.4: four levels whose blocks are 1, 2, 4 and 16 times as wide as the finest
-(2, 4, 8 and 32 m in the paper), and at most 64 blocks decoded per frame. Where the paper leaves a choice, or we depart:
+It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are rows of a pool,
+which is also the cache: a block that left its window stays until its row is needed. A block without a probe near it is
+never queued, takes no memory and is missing for a read. The finest level that has a point answers, as
+`wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
 
-- The finest block is 1.25 times as wide as the probes' spacing (`wlm.probe.volume.index.finest_side`), in any unit.
-  Windows have 32 blocks along an axis where the paper has 16, since most are empty and empty blocks take no memory.
-- A level's window has the blocks whose centres are nearest to the viewpoint along each axis, so it depends on the
-  viewpoint alone.
-- A block's light comes from up to 16 probes within one side of its centre along each axis, weighted so that a read at a
-  probe is nearly that probe's light (`wlm_kernels.probe.volume_weights`). The paper takes the probes inside the block
-  and names no weights; a mean weighted by distance blurs differences between probes.
-- A block without a probe that near is empty: it is never queued, takes no budget and is missing for a read.
-- Blocks are rows of a pool, which is also the cache: a block that left its window stays until its row is needed. If it
-  is still there when it enters the window again, it is available in the same frame at no cost.
-- Blocks wait in the order of their distance to the viewpoint in units of their own side, so that all levels grow
-  outwards together. After a teleport the first frame covers the surroundings coarsely; filling the finest level first
-  would leave the rest of the scene black until that level was complete.
-- A point is answered by the finest level that has it, as `wlm_kernels.probe.volume.read` describes. With all blocks
-  present this is the paper's choice by the distance to the viewer.
-
-Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
-graph.
+Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is a graph.
 """
 
 import itertools
@@ -271,24 +256,6 @@ class Volume:
                 overflow.
         """
         start = time.perf_counter()
-        entered = self.advance(viewpoint)
-        counters = self._frame_work.counters.numpy()
-        seconds = time.perf_counter() - start
-        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
-        return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
-
-    def advance(self, viewpoint: np.ndarray) -> int:
-        """Does the work of `update`; on CUDA the frame is queued, not awaited, as a renderer needs it.
-
-        Args:
-            viewpoint: As for `update`.
-
-        Returns:
-            Number of blocks that entered a window.
-
-        Raises:
-            WlmError: As for `update`.
-        """
         viewpoint = np.array(viewpoint, np.float64)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
@@ -304,7 +271,10 @@ class Volume:
         with interop.stream(self.device):
             self._look(base, views, self._frame)
             self._step()
-        return len(self.sizes) * self.side**3 - int(kept)
+        counters = self._frame_work.counters.numpy()
+        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        entered = len(self.sizes) * self.side**3 - int(kept)
+        return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
         """Runs the part of a frame that a CUDA graph contains."""
@@ -344,27 +314,13 @@ class Volume:
             values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
             level = wp.empty(len(points), dtype=int, device=self.device)
             weight = wp.empty(len(points), dtype=float, device=self.device)
-            ahead = None
+            ahead = self._nowhere
             if normals is not None:
                 ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
-            self.read_into(on_device, values, level, weight, ahead)
+            windows = self._windows
+            place = (windows.pages, windows.bases, windows.views, self.side, on_device)
+            kernels.read(self._pool, *place, ahead, values, level, weight)
             return Reading(values.numpy(), level.numpy(), weight.numpy())
-
-    def read_into(
-        self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array, normals: wp.array | None = None
-    ) -> None:
-        """Reads the light at points that are on the device, without a copy, as a renderer needs it.
-
-        Args:
-            points: vec3 [M], relative to the viewpoint of the last update.
-            values: float [M, D], written; this and the next two as in `Reading`.
-            level: int [M], written.
-            weight: float [M], written.
-            normals: vec3 [M], unit normals, as for `read`.
-        """
-        windows = self._windows
-        place = (windows.pages, windows.bases, windows.views, self.side, points)
-        kernels.read(self._pool, *place, self._nowhere if normals is None else normals, values, level, weight)
 
     def state(self) -> State:
         """Copies the arrays that a shader reads to the host."""
