@@ -230,8 +230,9 @@ class ProbeBench(Bench):
         fit = self.fit("pca", lambda: compress(self.probes, "pca"))
         decoder = fit.model.decoder(self.device)
         report = score(decoder.decode_probes(), self.probes, fit.bytes)
-        reader = decoder.light(self.probes.position).reader(len(self.position))
-        reader.numbers.assign(np.flatnonzero(self.probes.live).astype(np.int32))
+        live = np.flatnonzero(self.probes.live).astype(np.int32)
+        numbers = wp.array(live, dtype=int, device=self.device)
+        values = wp.zeros((len(live), self.probes.outputs), dtype=float, device=self.device)
         row = self.row(
             "pca",
             f"{fit.model.content.count} components",
@@ -241,7 +242,7 @@ class ProbeBench(Bench):
             irradiance_psnr=report.irradiance_psnr,
             **_size_and_psnr(report, fit.model.content.nbytes),
         )
-        return row, self.replay(reader.run)
+        return row, self.replay(lambda: decoder.read(numbers, values))
 
     def held_out_row(self, fit: Fit) -> Row:
         """Returns the row of the light at probes that were left out of the compression."""

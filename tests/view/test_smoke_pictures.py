@@ -9,7 +9,6 @@ import torch
 from builders.smoke_plumes import plume
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import guide
 from wlm.smoke.march.fine import bake
@@ -18,7 +17,7 @@ from wlm.smoke.shading import Light, Ramp, obstacle_visibility
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import draw_obstacles, guide_pictures, picture, six_pictures
 from wlm_kernels.smoke.settings import March
 
@@ -161,17 +160,6 @@ def test_pictures_of_the_maps(device):
     assert (planes["depth"][nearest] == 255).all() and (planes["transparency"][0, 0] == 255).all()
     nothing = guide(plume(0, device=device), camera)
     assert not guide_pictures(nothing)["depth"].any()
-
-
-def test_a_sequence(tmp_path):
-    frames = [np.full((2, 3, 3), value, np.uint8) for value in (1, 2)]
-    paths = write_sequence(tmp_path / "a", frames, "lit")
-    assert [path.name for path in paths] == ["lit_0001.png", "lit_0002.png"]
-    for path, frame in zip(paths, frames, strict=True):
-        with Image.open(path) as image:
-            np.testing.assert_array_equal(np.asarray(image), frame)
-    with pytest.raises(WlmError, match="cannot write there"):
-        write_sequence(tmp_path / "none" / "a", frames)
 
 
 def test_a_contact_sheet(tmp_path):

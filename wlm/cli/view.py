@@ -43,7 +43,8 @@ def view(
     ] = None,
     tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",
     walk: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as for wlm probe volume --path.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Viewpoints of the volume: a JSON list of x, y, z, or `position` of a .npz."),
     ] = None,
     up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames per second of an animation or of frames.")] = 24.0,

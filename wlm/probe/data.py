@@ -40,9 +40,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,9 +55,6 @@ from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.conventions import (
     CANONICAL,
     CONVENTIONS,
-    THREE_GRID,
-    UNITY_PROBES,
-    UNREAL_LIGHT,
     from_canonical,
     to_canonical,
 )
@@ -133,8 +128,6 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
-    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.export.export(..., "three")`).
-    - `light.json` with its textures, `probes.json`: exports for Unreal and for Unity.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
     - `.lmbake`: a lightmap bake of Godot 4.
@@ -145,8 +138,8 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"). None takes
             the only array whose name begins with "sh".
         convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
-            own: "godot" for `.lmbake`, "unity" for `.asset`, "unreal" for its textures, otherwise the field
-            `convention`, otherwise the canonical one.
+            own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, otherwise the canonical
+            one.
 
     Returns:
         The set, repaired as described in the module's table.
@@ -184,11 +177,8 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
         position = _READERS[kind](path, None).position
     else:
         content = read_json(path)
-        export = _read_export(path, content)
         if isinstance(content, list):
             position = numbers_of(path, _POSITION, content)
-        elif export is not None:
-            position = export[0]
         else:
             position = fields_of(path, content)[1](_POSITION)
     return _check_positions(str(path), position)
@@ -292,33 +282,12 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 def _read_json(path: Path, key: str | None) -> _Raw:
     content = read_json(path)
-    export = _read_export(path, content)
-    if export is not None:
-        position, values, convention = export
-        return _Raw(position, values, _choose(path, (_POSITION, _SH), key), convention)
     names, read = fields_of(path, content)
     name = _choose(path, names, key)
     beside = {field: read(field) for field in _BESIDE if field in names}
     return _Raw(
         read(_POSITION), read(name), name, text_of(path, _CONVENTION, content.get(_CONVENTION, CANONICAL)), beside
     )
-
-
-def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """Returns positions, values and convention of an export for an engine; None for other content."""
-    form = content.get("format") if isinstance(content, dict) else None
-    if not isinstance(form, str) or form not in _EXPORTS:
-        return None
-    module, function, convention = _EXPORTS[form]
-    return *getattr(import_module(module), function)(path, content), convention
-
-
-# By `format` of an index: module and function that read it, and the convention of its coefficients.
-_EXPORTS = {
-    THREE_GRID: ("wlm.probe.engines.three", "read_grid", CANONICAL),
-    UNREAL_LIGHT: ("wlm.probe.engines.unreal", "read_unreal", "unreal"),
-    UNITY_PROBES: ("wlm.probe.engines.unity", "read_unity", "unity"),
-}
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:

@@ -14,6 +14,7 @@ from wlm.formats.atomic import atomic_path
 from wlm.system import Meter, OnProgress
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES
+from wlm.view.pictures import save_png
 from wlm.view.rendering import import_pyvista, require_opengl
 from wlm.view.scene import Scene, Slider, State
 
@@ -188,8 +189,7 @@ class Window:
         Raises:
             WlmError: The file cannot be written.
         """
-        with atomic_path(path) as temporary:
-            Image.fromarray(self.picture()).save(temporary, format="PNG")
+        save_png(path, self.picture())
 
     def movie(
         self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None

@@ -112,10 +112,12 @@ class GaussianDecoder(Decoder):
 
     def run(self, points: Points) -> None:
         """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
-        if points.x.shape[0]:
-            self._kernels.launch(
-                self._rows, self._shapes, self._cubes, self._cut, self._net, self._gain, points.x, points.out
-            )
+        self.launch(points.x, points.out)
+
+    def launch(self, x: wp.array, out: wp.array) -> None:
+        """Decodes normalised points vec3 [M] into float [M, D]; on CUDA the work is queued, not awaited."""
+        if x.shape[0]:
+            self._kernels.launch(self._rows, self._shapes, self._cubes, self._cut, self._net, self._gain, x, out)
 
     def decode(self, position: np.ndarray) -> np.ndarray:
         points = self.points(position)
@@ -140,18 +142,11 @@ class GaussianLight:
         self._decoder = decoder
         self.device, self.channels, self.count = decoder.device, decoder.model.outputs, len(position)
         self._x = wp.array(decoder.model.normalise(position), dtype=wp.vec3, device=self.device)
+        self._points: dict[int, wp.array] = {}
 
-    def reader(self, count: int) -> "_GaussianReader":
-        return _GaussianReader(self._decoder, self._x, count)
-
-
-class _GaussianReader:
-    def __init__(self, decoder: GaussianDecoder, x: wp.array, count: int) -> None:
-        self._decoder, self._x = decoder, x
-        self._points = decoder.points(np.zeros((count, 3)))
-        self.numbers = wp.zeros(count, dtype=int, device=decoder.device)
-        self.values = self._points.out
-
-    def run(self) -> None:
-        frame_kernels.take_points(self._x, self.numbers, self._points.x)
-        self._decoder.run(self._points)
+    def read(self, numbers: wp.array, values: wp.array) -> None:
+        count = numbers.shape[0]
+        if count not in self._points:
+            self._points[count] = wp.zeros(count, dtype=wp.vec3, device=self.device)
+        frame_kernels.take_points(self._x, numbers, self._points[count])
+        self._decoder.launch(self._points[count], values)

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.probe.decode import Decoder
-from wlm.probe.model import CODES, Content, ProbeModel, Profile
+from wlm.probe.model import CODES, Content, ProbeModel
 from wlm_kernels.probe.network import most_outputs
 
 # Channels of a Gaussian as a GPU holds it: centre, logarithm of the scale, quaternion, latent.
@@ -197,10 +197,9 @@ def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str
         )
 
 
-def predicted_bytes(profile: Profile, live: int, outputs: int) -> int:
-    """Returns the GPU bytes of a fit with this profile to `live` probes, if it drops no Gaussian."""
-    count = max(1, round(profile.ratio * live))
-    return gaussian_bytes(count, profile.latent, profile.hidden, outputs)
+def gaussian_count(ratio: float, live: int) -> int:
+    """Returns the number of Gaussians that a fit to `live` probes begins with."""
+    return max(1, round(ratio * live))
 
 
 def least_turned(rows: np.ndarray) -> np.ndarray:

@@ -194,8 +194,7 @@ class Volume:
         device, levels, budget = self.device, len(self.sizes), self.budget
         slots = levels * self.side**3
 
-        reader = self.light.reader(budget * frame_kernels.PROBES)
-        self._arrays = [reader.numbers, reader.values]
+        self._arrays: list[wp.array] = []
 
         def full(shape: int | tuple[int, ...], dtype: type, value: object) -> wp.array:
             self._arrays.append(wp.full(shape, value, dtype=dtype, device=device))
@@ -215,7 +214,7 @@ class Volume:
         windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
         windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
         windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
-        windows.away, windows.forward = full(slots, float, -1.0), full(1, wp.vec3, wp.vec3())
+        windows.away = full(slots, float, -1.0)
         pool = frame_kernels.Pool()
         pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
         pool.rows = full(len(host.block), int, -1)
@@ -230,8 +229,9 @@ class Volume:
         block = (budget, frame_kernels.PROBES)
         work.places, work.hats = full(block, wp.vec4, wp.vec4()), full(block, float, 0.0)
         work.rows = full(block, frame_kernels.Row, frame_kernels.Row())
-        work.numbers, work.weights = reader.numbers, full(block, float, 0.0)
-        self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        work.numbers, work.weights = full(math.prod(block), int, 0), full(block, float, 0.0)
+        self._read_light = full((math.prod(block), self.channels), float, 0.0)
+        self._index, self._windows, self._pool_rows, self._frame_work = index, windows, pool, work
         self._look = frame_kernels.Look(windows, work)
         self._nowhere = full(0, wp.vec3, wp.vec3())
         self._pool = full((rows, self.channels), float, 0.0)
@@ -257,33 +257,31 @@ class Volume:
         """Coordinates of the first block of each window, int64 [L, 3]; block b spans [b, b + 1) times its side."""
         return self._base + self.index.start.astype(np.int64)
 
-    def update(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> FrameStats:
+    def update(self, viewpoint: np.ndarray) -> FrameStats:
         """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
 
         Args:
             viewpoint: [3], in the unit of the positions.
-            forward: [3], viewing direction, of any length: blocks behind the viewer wait as if they were twice as far
-                away. None: all directions are alike.
 
         Returns:
             The work of the frame.
 
         Raises:
-            WlmError: The viewpoint or the direction is not three finite numbers, or the viewpoint is so far away that
-                the coordinates of its block overflow.
+            WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block
+                overflow.
         """
         start = time.perf_counter()
-        entered = self.advance(viewpoint, forward)
+        entered = self.advance(viewpoint)
         counters = self._frame_work.counters.numpy()
         seconds = time.perf_counter() - start
         queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
 
-    def advance(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> int:
+    def advance(self, viewpoint: np.ndarray) -> int:
         """Does the work of `update`; on CUDA the frame is queued, not awaited, as a renderer needs it.
 
         Args:
-            viewpoint, forward: As for `update`.
+            viewpoint: As for `update`.
 
         Returns:
             Number of blocks that entered a window.
@@ -294,10 +292,6 @@ class Volume:
         viewpoint = np.array(viewpoint, np.float64)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
-        ahead = np.zeros(3) if forward is None else np.array(forward, np.float64)
-        if ahead.shape != (3,) or not np.isfinite(ahead).all():
-            raise WlmError(f"forward: expected three finite numbers, got {ahead.tolist()}")
-        ahead = _unit(ahead[None], (1, 3))[0]
         at = viewpoint / self._size[:, None] - self.index.start
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
@@ -308,7 +302,7 @@ class Volume:
         self._frame += 1
         views = np.column_stack([at - (base + self.side // 2) - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            self._look(base, views, ahead, self._frame)
+            self._look(base, views, self._frame)
             self._step()
         return len(self.sizes) * self.side**3 - int(kept)
 
@@ -322,8 +316,8 @@ class Volume:
             return
         frame_kernels.search(self._index, windows, self.side, work)
         volume_weights.weigh(self._index, windows, self.side, work)
-        self._reader.run()
-        frame_kernels.combine(work, self._reader.values, self._pool)
+        self.light.read(work.numbers, self._read_light)
+        frame_kernels.combine(work, self._read_light, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Reads the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
@@ -385,12 +379,12 @@ class Volume:
             float32 [L, side, side, side, D], by level, x, y and z, 0 where a block is missing; and bool
             [L, side, side, side], true where it is present. The first block of each level is that of `base`.
         """
-        shape = (len(self.sizes), self.side, self.side, self.side)
-        with interop.stream(self.device):
-            out = wp.empty((math.prod(shape), self.channels), dtype=float, device=self.device)
-            valid = wp.empty(math.prod(shape), dtype=wp.uint8, device=self.device)
-            kernels.unscroll(self._pool, self._windows.pages, self._windows.bases, self.side, out, valid)
-            return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
+        state, side = self.state(), self.side
+        pages = state.pages.reshape(-1, side, side, side)
+        # A block's slot is its coordinates modulo the side of the window.
+        rows = np.stack([np.roll(page, -base, (0, 1, 2)) for page, base in zip(pages, state.bases, strict=True)])
+        valid = rows >= 0
+        return np.where(valid[..., None], state.pool[rows], np.float32(0.0)), valid
 
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
