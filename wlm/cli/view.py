@@ -69,11 +69,11 @@ def view(
     elif frames is not None:
         raise WlmError("--frames: has no meaning without --movie")
     quiet_warp()
+    from wlm.formats.hdr_blocks import need
     from wlm.view.opening import open_scene
-    from wlm.view.rendering import import_pyvista
     from wlm.view.window import Window
 
-    import_pyvista("view")
+    need("pyvista", "view")
     options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "flat": flat, "up": up}
     options |= {name: values.pop(name) for name in _SETTINGS if name in values}
     with running("view") as progress:
