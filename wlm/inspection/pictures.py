@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import dds, radiance
+from wlm.formats import dds, ktx2, radiance
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import HALF_MAX, read_header
 from wlm.formats.exr import MAGIC as EXR_MAGIC
@@ -30,7 +30,7 @@ class Picture:
     """Facts from the header of a picture.
 
     Attributes:
-        kind: "EXR", "Radiance", "DDS" or "PNG".
+        kind: "EXR", "Radiance", "KTX2", "DDS" or "PNG".
         width, height: Size in texels; 0 if the beginning of the file does not state it.
         channels: Names of the channels; empty if the beginning of the file does not state them.
     """
@@ -76,6 +76,7 @@ def picture_of(path: Path) -> Picture | None:
     if head.startswith(radiance.MAGIC):
         return Picture("Radiance")
     for kind, magic, form, at in (
+        ("KTX2", ktx2.MAGIC, "<2I", 20),
         ("DDS", dds.MAGIC, "<2I", 12),
         ("PNG", PNG_MAGIC, ">2I", 16),
     ):
