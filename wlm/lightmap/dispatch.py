@@ -5,19 +5,21 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
-from wlm.lightmap.targets import TileJob
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
 from wlm.metrics.tiled import nanmean
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers, cores
+
+if TYPE_CHECKING:
+    from wlm.lightmap.fit import SheetFit
 
 _SLICE = 0.5  # seconds of work between two answers of another process
 _POLL = 0.2  # seconds that a signal waits at most to be handled
@@ -44,17 +46,7 @@ class Batch:
     kind: TileKind
     rows: np.ndarray
     first: int
-    fit: "BatchOwner"
-
-
-class BatchOwner(Protocol):
-    """The fit of a sheet, as batches use it; see `wlm.lightmap.fit.SheetFit`."""
-
-    def job(self, batch: Batch) -> TileJob: ...
-
-    def store(self, batch: Batch, parts: Parts) -> None: ...
-
-    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool: ...
+    fit: "SheetFit"
 
 
 @dataclass(eq=False)
