@@ -23,7 +23,7 @@ from wlm.formats.exr import write_exr
 from wlm.probe.data import save_probes
 from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.coarse import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
 from wlm.smoke.scene import Scene
 

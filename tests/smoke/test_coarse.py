@@ -13,7 +13,7 @@ from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
 from wlm.smoke.march.fine import bake
-from wlm_kernels.smoke import depth_lattice, march_coarse
+from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke import march as kernels
 from wlm_kernels.smoke.settings import March
 
@@ -165,7 +165,7 @@ def test_emission_knows_no_nodes(device: str):
     camera = _camera(volume)
     rough, fine = (_planes(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
     assert torch.equal(rough[4:], fine[4:]) and not torch.equal(rough[:4], fine[:4])
-    emission = march_coarse.PLANES.index("emission")
+    emission = marches.PLANES.index("emission")
     assert float(fine[emission].max()) > 0.05
     cold = replace(volume, temperature=None)
     assert _march(cold, camera).emission is None
@@ -186,7 +186,7 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
-    monkeypatch.setattr(march_coarse, "BRICK", 0)
+    monkeypatch.setattr(marches, "BRICK", 0)
     torch.testing.assert_close(_planes(volume, camera, step=1.5), skipped, rtol=0, atol=1e-6)
     assert len(made) == 1
 

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from builders.smoke_axes import axis_faults
 from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.camera import axis_faults
 from wlm.smoke.march.fine import bake
 from wlm.smoke.network import dataset
 from wlm.smoke.network.dataset import (

@@ -13,7 +13,6 @@ result depends on the seed alone. Read `scattered_twice` of `tests/reference/tra
 quadrature.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray
+from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, for_smoke, phase, ray
 
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant of hot smoke, which gives about one sample of its emission per brick
@@ -236,10 +235,6 @@ def toward_sky(sky: Sky, random: wp.uint64) -> _Way:
     return way
 
 
-_NEVER = wp.constant(1.0e30)
-_TENTH_BIT = wp.constant(1.0 / 1024.0)
-
-
 @wp.struct
 class _Walk:
     """A ray's walk through bricks: in `cell` from distance `t` to `border`; the walk ends at `end`.
@@ -390,33 +385,22 @@ def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.
     out[plane, row, column] = out[plane, row, column] + light
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    scene_type: Any
-    majorants: wp.Kernel
-    window: wp.Kernel
-    coarser: wp.Kernel
-    trace: wp.Kernel
+@wp.struct
+class _Scene:
+    """The surroundings of paths: bricks of the smoke, camera, lights, the sky, and the mesh of obstacles in voxels."""
+
+    grid: _Grid
+    view: View
+    lights: wp.array1d[PathLight]
+    sky: Sky
+    mesh: wp.uint64
+    settings: PathSettings
 
 
-@functools.cache
-def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
-    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`; `solid`: with obstacles."""
-
-    @wp.struct
-    class Scene:
-        """The scene of paths: smoke, lights, the sky, and the mesh of obstacles in voxels."""
-
-        smoke: smoke_type
-        grid: _Grid
-        view: View
-        lights: wp.array1d[PathLight]
-        sky: Sky
-        mesh: wp.uint64
-        settings: PathSettings
-
+@for_smoke
+def _majorants(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def majorants(
+    def kernel(
         # in:
         smoke: smoke_type,
         least: float,
@@ -438,31 +422,40 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
             most = wp.max(most, least)
         out[a, b, c] = most
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def window(
-        # in:
-        bounds: wp.array3d[float],
-        begin: wp.vec3i,
-        # out:
-        out: wp.array3d[float],
-    ):
-        a, b, c = wp.tid()
-        out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
+    return kernel
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def coarser(
-        # in:
-        bounds: wp.array3d[float],
-        # out:
-        out: wp.array3d[float],
-    ):
-        a, b, c = wp.tid()
-        most = float(0.0)
-        for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
-            for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
-                for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
-                    most = wp.max(most, bounds[i, j, k])
-        out[a, b, c] = most
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _window(
+    # in:
+    bounds: wp.array3d[float],
+    begin: wp.vec3i,
+    # out:
+    out: wp.array3d[float],
+):
+    a, b, c = wp.tid()
+    out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _coarser(
+    # in:
+    bounds: wp.array3d[float],
+    # out:
+    out: wp.array3d[float],
+):
+    a, b, c = wp.tid()
+    most = float(0.0)
+    for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
+        for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
+            for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
+                most = wp.max(most, bounds[i, j, k])
+    out[a, b, c] = most
+
+
+@for_smoke
+def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
+    """Builds the kernel; `solid`: with obstacles."""
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
@@ -473,7 +466,9 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
         return _NEVER
 
     @wp.func
-    def extend(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> _Path:
+    def extend(
+        smoke: smoke_type, s: _Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]
+    ) -> _Path:
         """Follows a path to its next scattering, or out of the smoke to the sky, where it ends."""
         planes = s.settings.kept + 2
         count = s.lights.shape[0]
@@ -483,7 +478,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
             limit = free(s.mesh, path.p - s.view.moved * path.d, path.d) - s.view.moved
         else:
             limit = free(s.mesh, path.p, path.d)
-        flight = _fly(s.smoke, s.grid, path.p, path.d, limit, path.random)
+        flight = _fly(smoke, s.grid, path.p, path.d, limit, path.random)
         path.random = flight.random
         plane = wp.min(path.order, planes - 1)
         if flight.glow > 0.0:
@@ -513,7 +508,9 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
         return path
 
     @wp.func
-    def connect(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> wp.uint64:
+    def connect(
+        smoke: smoke_type, s: _Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]
+    ) -> wp.uint64:
         """Adds the light of each light and of the sky that is scattered at the end of a path; returns the next random
         state."""
         planes = s.settings.kept + 2
@@ -531,7 +528,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                 strength = 1.0 / wp.max(away * away, 1.0e-12)
                 way = wp.normalize(way)
             if free(s.mesh, path.p, way) >= reach:
-                got = _passed(s.smoke, s.grid, path.p, way, reach, random)
+                got = _passed(smoke, s.grid, path.p, way, reach, random)
                 random = got.random
                 strength = strength * got.share * phase(s.settings.g, wp.dot(path.d, way))
                 light = strength * wp.cw_mul(path.through, s.lights[n].colour)
@@ -540,7 +537,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
             far = toward_sky(s.sky, random)
             random = far.random
             if free(s.mesh, path.p, far.direction) >= _NEVER:
-                got = _passed(s.smoke, s.grid, path.p, far.direction, _NEVER, random)
+                got = _passed(smoke, s.grid, path.p, far.direction, _NEVER, random)
                 random = got.random
                 own = phase(s.settings.g, wp.dot(path.d, far.direction)) / _FOUR_PI
                 strength = got.share * own / (own + far.chance)
@@ -549,9 +546,10 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
         return random
 
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def trace(
+    def kernel(
         # in:
-        s: Scene,
+        smoke: smoke_type,
+        s: _Scene,
         first: int,
         last: int,
         parts: int,
@@ -583,11 +581,11 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                 path.alive = 1
             if part < past:
                 base = (part - first) * (s.lights.shape[0] + 2)
-                path = extend(s, path, base, row, column, out)
+                path = extend(smoke, s, path, base, row, column, out)
                 if path.alive == 1:
-                    random = connect(s, path, base, row, column, out)
+                    random = connect(smoke, s, path, base, row, column, out)
                     # After its last order a path continues only to the sky and to emission.
-                    if path.order == s.settings.highest and s.sky.total == 0.0 and s.smoke.emission == 0.0:
+                    if path.order == s.settings.highest and s.sky.total == 0.0 and smoke.emission == 0.0:
                         path.alive = 0
                     random = following(random)
                     u = uniform(random)
@@ -597,7 +595,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                     path.chance = phase(s.settings.g, wp.dot(before, path.d)) / _FOUR_PI
                     path.random = random
 
-    return _Kernels(Scene, majorants, window, coarser, trace)
+    return kernel
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
@@ -638,18 +636,17 @@ def bounds(medium: Medium, densest: float) -> Majorants:
         densest: Its largest extinction per voxel.
     """
     density, device, edge = medium.density, medium.device, BRICK
-    kernels = path_kernels(medium.smoke_type, False)
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
-    wp.launch(kernels.majorants, most.shape, [medium.smoke, _GLOW, _SLACK], [most], device=device)
+    _majorants(medium, most.shape, [_GLOW, _SLACK], [most])
     begin, end = _filled(most.numpy() > 0.0)
     low = tuple(edge * n for n in begin)
     size = tuple(min(edge * n, most) - least for n, most, least in zip(end, density.shape, low, strict=True))
     inner = medium.buffer(tuple(b - a for a, b in zip(begin, end, strict=True)), float)
-    wp.launch(kernels.window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
+    wp.launch(_window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
     while 2 * edge * densest <= _DEEP and max(inner.shape) > 1:
         edge *= 2
         wider = medium.buffer(tuple(-(-n // 2) for n in inner.shape), float)
-        wp.launch(kernels.coarser, wider.shape, [inner], [wider], device=device)
+        wp.launch(_coarser, wider.shape, [inner], [wider], device=device)
         inner = wider
     return Majorants(inner, edge, low, size)
 
@@ -692,16 +689,14 @@ def trace(
             emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above
             `settings.kept`. The sum over all parts is the mean over all samples.
     """
-    kernels = path_kernels(medium.smoke_type, mesh != 0)
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
     together = max(1, traced * view.height * view.width // _THREADS) if medium.device.is_cuda else 1
-    scene = kernels.scene_type()
-    scene.smoke, scene.view, scene.lights, scene.sky = medium.smoke, view, lights, sky
-    scene.mesh, scene.settings = mesh, settings
+    scene = _Scene()
+    scene.view, scene.lights, scene.sky, scene.mesh, scene.settings = view, lights, sky, mesh, settings
     grid = _Grid()
     grid.bounds, grid.edge = majorants.most, float(majorants.edge)
     grid.low, grid.size = (wp.vec3(*map(float, v)) for v in (majorants.low, majorants.size))
     scene.grid = grid
     size = (-(-traced // together), view.height, view.width)
-    wp.launch(kernels.trace, size, [scene, first, first + traced, parts, together], [out], device=medium.device)
+    _trace(medium, size, [scene, first, first + traced, parts, together], [out], mesh != 0)

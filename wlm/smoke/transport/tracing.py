@@ -69,16 +69,6 @@ class Transport:
         power = float(self.total.double().square().mean())
         return math.sqrt(float(self.total_noise.double().square().mean()) / power) if power > 0 else 0.0
 
-    def up_to(self, order: int) -> torch.Tensor:
-        """Returns the light that was scattered at most `order` times, for each source, [S, H, W, 3].
-
-        Raises:
-            ValueError: The order has no separate plane.
-        """
-        if not 0 <= order <= self.orders:
-            raise ValueError(f"order: expected 0 to {self.orders}, got {order}")
-        return self.planes[:, : order + 1].sum(1)
-
     def with_albedo(self, albedo: Sequence[float]) -> "Transport":
         """Returns the result of the same paths at another albedo: order n is scaled by the n-th power of the ratio.
 
