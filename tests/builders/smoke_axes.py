@@ -1,8 +1,10 @@
-"""Check of the directions of six-way lightmaps."""
+"""Check of the directions of six-way lightmaps, and the inverse of the encoding of their light."""
 
 import numpy as np
+import torch
 
 from wlm.smoke.camera import DIRECTIONS
+from wlm_kernels.smoke.planes import FOOT_CODE
 
 _LEAST_SHIFT = 1e-3  # share of the image between the centres of brightness of opposite maps
 
@@ -30,3 +32,9 @@ def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
     if not total[4] > total[5]:
         faults.append(f"front isn't brighter than back: {total[4]:.4g} and {total[5]:.4g} in all")
     return tuple(faults)
+
+
+def from_srgb(code: torch.Tensor) -> torch.Tensor:
+    """Inverts `to_srgb`; values below 0 count as 0."""
+    curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
+    return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)

@@ -25,7 +25,7 @@ def smoke(layout, _) -> Subject:
     frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
     camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
     book = pack_book([Shot(n, frame) for n, frame in enumerate(frames)], layout, gain=0.5, padding=2)
-    text = smoke_shader(layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
+    text = smoke_shader(book)
     asked, way, expected = [], [], []
     for n, frame in enumerate(frames):
         for row, column in ((0, 0), (3, 7), (5, 8)):
@@ -61,8 +61,8 @@ vec4 shown(ivec2 pixel)
 def smoke_motion(_) -> Subject:
     """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
     random = np.random.default_rng(7)
-    size, scale = {"rows": 2, "columns": 3, "count": 5, "size": (24, 24), "padding": 4}, 0.07
-    text = smoke_shader("unity", **size, motion=scale)
+    scale = 0.07
+    text = smoke_shader(replace(random_book(random_frames(size=(24, 24)), padding=4), scale=scale))
     asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
     way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
     way[0, :2] = ZERO

@@ -191,19 +191,6 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     assert len(made) == 1
 
 
-def test_front_and_back_follow_from_the_transparency(device: str):
-    """(1 - T^2) / 2 and -T ln T, which the fine march finds too."""
-    volume = plume(device=device)
-    exact = bake(volume, _camera(volume), step=0.25, estimate=False)
-    t = exact.transparency.double()
-    torch.testing.assert_close(exact["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=2e-4)
-    back = torch.where(t > 0, -t * t.clamp(min=1e-30).log(), 0.0)
-    torch.testing.assert_close(exact["back"].double(), back, rtol=0, atol=2e-4)
-    result = _march(volume, _camera(volume), step=4.0)
-    t = result.transparency.double()
-    torch.testing.assert_close(result["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=1e-6)
-
-
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
     """The jitter of a single step through the box, by the depth of its sample."""
     volume = from_array(np.ones((8, 8, 8), np.float32), device=device)
@@ -268,10 +255,3 @@ def test_settings_out_of_their_range(name: str, values: tuple[float, ...]):
     for value in values:
         with pytest.raises(ValueError, match=f"^{name}: expected [^\n]*, got {value}$"):
             March(**{name: value})
-
-
-def test_an_eye_is_refused(device: str):
-    volume = from_array(np.ones((4, 4, 4), np.float32), device=device)
-    eye = Camera.look_at((2.0, 2.0, 30.0), (2.0, 2.0, 2.0), extent=0.4, height=4, width=4, perspective=True)
-    with pytest.raises(ValueError, match="orthographic"):
-        _march(volume, eye)

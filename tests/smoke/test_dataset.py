@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from builders.smoke_axes import axis_faults
+from builders.smoke_axes import axis_faults, from_srgb
 from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
@@ -20,7 +20,7 @@ from wlm.smoke.network.dataset import (
     make_validation,
     pool_of_volume,
 )
-from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
+from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
-from wlm.fluid.volume import load_volume, save_volume
+from wlm.fluid.volume import save_volume
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke.data import (
     CHECKPOINT,
@@ -304,16 +304,6 @@ def test_frames_evenly_spread():
         (2, 13),
         (2, 5, 13),
     ]
-
-
-@pytest.mark.parametrize("hot", [False, True])
-def test_a_volume_comes_back(tmp_path, hot, device):
-    volume = plume(hot=hot, device=device)
-    save_volume(tmp_path / "a.npz", volume)
-    result = load_volume(tmp_path / "a.npz", device=device)
-    assert torch.equal(result.density, volume.density)
-    assert (result.temperature is not None) == hot
-    assert not hot or torch.equal(result.temperature, volume.temperature)
 
 
 @pytest.mark.parametrize("hot", [False, True])

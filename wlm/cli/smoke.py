@@ -1,6 +1,6 @@
 """`wlm smoke`: simulate smoke, light it, and make six-way lightmaps by a march or by the network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -41,14 +41,12 @@ from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
 if TYPE_CHECKING:
-    import torch
-
     from wlm.fluid.volume import DensityVolume
     from wlm.smoke.camera import Camera
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SmokeModel
-    from wlm.smoke.scene import Looks
-    from wlm.smoke.transport.lights import AnyLight, Environment
+    from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lights import AnyLight
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
 
@@ -275,19 +273,24 @@ def light(
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
     check_white(white)
-    own, environment = _lights(lights, points), None if around is None else _even(around)
+    own, twelve = _lights(lights, points), () if around is None else _sky_lights(around)
     quiet_warp()
     from wlm.formats.exr import write_exr
+    from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lighting import LitSmoke, light_smoke
+    from wlm.smoke.transport.orders import ScatteredSmoke, orders_march, scatter
+    from wlm.smoke.transport.tracing import HIGHEST, trace
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
 
     frames = options.open(smoke)
     camera = options.view(frames, orthographic=False)
     if frames.scene is not None:
         colour = colour or frames.scene.smoke.albedo
-    if not own and environment is None:
+    if not own and around is None:
         own = [Light((1.0, 1.0, 1.0))] if frames.scene is None else [each.light() for each in frames.scene.lights]
-    settings = {"albedo": colour or (1.0, 1.0, 1.0), "g": g, "single": orders == "single"}
+    colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
     rows = table(str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))])
     pictures = []
@@ -296,14 +299,23 @@ def light(
             note_warnings(volume.warnings)
             view, looks, noise = frames.view(camera, volume), frames.looks(frame), []
             if samples is None:
-                lamps = [*own, *(() if environment is None else environment.lights())]
-                image = _marched(volume, view, lamps, looks, behind, **settings)
+                march, lamps = orders_march(volume, g), [*own, *twelve]
+                if orders == "single":
+                    made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
+                else:
+                    made = scatter(volume, view, lamps, colour, march=march)
+                extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
+                if looks is not None:
+                    extra |= {"obstacles": looks.obstacles, "time": looks.time}
+                image = picture(made, albedo=colour, **extra | ({} if behind is None else {"background": behind}))
             else:
+                solid = None if looks is None else obstacle_mesh(looks.obstacles, looks.time)[:2]
+                paths: dict[str, Any] = {"sky": around, "albedo": colour, "g": g, "obstacles": solid}
                 try:
-                    image, error = _traced(volume, view, own, environment, looks, samples, **settings)
-                except WlmError as fault:
-                    raise WlmError(f"{frames.file(frame)}: {fault}") from fault
-                noise = [f"{error:.2%}"]
+                    traced = trace(volume, view, own, samples=samples, orders=0, highest=highest, **paths)
+                except WlmError as error:
+                    raise WlmError(f"{frames.file(frame)}: {error}") from error
+                image, noise = traced.total, [f"{traced.error:.2%}"]
             path = file(frame)
             if path.suffix.lower() == ".exr":
                 write_exr(path, image.cpu().numpy())
@@ -315,58 +327,6 @@ def light(
     if not frames.single:
         contact_sheet(output / SHEET, {"": pictures})
     show(rows)
-
-
-def _marched(
-    volume: "DensityVolume",
-    camera: "Camera",
-    lights: "Sequence[AnyLight]",
-    looks: "Looks | None",
-    background: Sequence[float] | None,
-    *,
-    albedo: Sequence[float],
-    g: float,
-    single: bool,
-) -> "torch.Tensor":
-    """Lights a frame by marches and draws the scene's obstacles."""
-    from wlm.smoke.transport.lighting import light_smoke
-    from wlm.smoke.transport.orders import orders_march, scatter
-    from wlm.view.smoke import picture
-
-    march = orders_march(volume, g)
-    if single:
-        made = light_smoke(volume, camera, lights, march)
-    else:
-        made = scatter(volume, camera, lights, albedo, march=march)
-    extra: dict[str, Any] = {}
-    if looks is not None:
-        extra = {"ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time, "background": looks.background}
-    if background is not None:
-        extra["background"] = background
-    return picture(made, albedo=albedo, **extra)
-
-
-def _traced(
-    volume: "DensityVolume",
-    camera: "Camera",
-    lights: "Sequence[AnyLight]",
-    environment: "Environment | None",
-    looks: "Looks | None",
-    samples: int,
-    *,
-    albedo: Sequence[float],
-    g: float,
-    single: bool,
-) -> "tuple[torch.Tensor, float]":
-    """Traces the picture of a frame; also returns its relative noise."""
-    from wlm.smoke.scene import obstacle_mesh
-    from wlm.smoke.transport.tracing import HIGHEST, trace
-
-    solid = None if looks is None else obstacle_mesh(looks.obstacles, looks.time)[:2]
-    settings: dict[str, Any] = {"environment": environment, "obstacles": solid, "albedo": albedo, "g": g}
-    highest = 1 if single else HIGHEST
-    made = trace(volume, camera, lights, samples=samples, orders=0, highest=highest, **settings)
-    return made.total, made.error
 
 
 @app.command()
@@ -462,11 +422,11 @@ def _checked(option: str, make: Callable[..., Any], *values: Any) -> Any:
         raise WlmError(f"{option}: {error}") from error
 
 
-def _even(colour: tuple[float, float, float]) -> "Environment":
-    """Returns the uniform sky of `--sky`."""
-    from wlm.smoke.transport.lights import Environment
+def _sky_lights(radiance: tuple[float, float, float]) -> "tuple[Light, ...]":
+    """Returns the lights that approximate the sky of `--sky`."""
+    from wlm.smoke.transport.lights import sky_lights
 
-    return _checked("--sky", Environment.even, colour)
+    return _checked("--sky", sky_lights, radiance)
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":

@@ -9,7 +9,7 @@ import warp as wp
 
 from wlm.interop import device_name, stream, to_warp
 from wlm.ops.raster import rasterize
-from wlm.smoke.camera import Camera, unit, weights
+from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
@@ -77,12 +77,10 @@ class Drawing:
             else:
                 colours.append(checked_colour("intensity", light.intensity))
                 toward.append(np.zeros(3))
-                shares.append(np.zeros(6))
+                shares.append(np.zeros(len(DIRECTIONS)))
 
-        def put(
-            values: Sequence | np.ndarray, shape: tuple[int, ...], kind: torch.dtype = torch.float32
-        ) -> torch.Tensor:
-            return torch.tensor(np.asarray(values), dtype=kind).reshape(shape).to(device)
+        def put(values: Sequence | np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
+            return torch.tensor(np.asarray(values), dtype=torch.float32).reshape(shape).to(device)
 
         with stream(device):
             self.image = torch.zeros((height, width, 3), device=device)
@@ -92,9 +90,9 @@ class Drawing:
             self._visibility = torch.ones((len(lights), height, width), device=device)
             # At least one row: an empty array has no memory.
             rows = max(len(lights), 1)
-            more = [np.zeros((rows - len(lights), n)) for n in (3, 3, 6)]
-            parts = zip((toward, colours, shares), more, strict=True)
-            self._lamps = tuple(put([*values, *zeros], (rows, zeros.shape[1])) for values, zeros in parts)
+            zeros = np.zeros((rows - len(lights), 3))
+            self._lamps = tuple(put([*values, *zeros], (rows, 3)) for values in (toward, colours))
+            self._shares = put(shares, (len(lights), len(DIRECTIONS)))
             self._ramp = None if ramp is None else (put(ramp.stops, (-1,)), put(ramp.colours, (-1, 3)))
             if self._obstacles:
                 points, triangles, owner = (torch.from_numpy(part).to(device) for part in obstacle_mesh(obstacles, 0.0))
@@ -154,11 +152,10 @@ class Drawing:
             transparency = to_warp(seen.transparency.float().contiguous())
             image, common = to_warp(self.image, wp.vec3), (self._as_lamps(), self._background, solids)
             if six is not None:
-                lightmaps = to_warp(six.lightmaps.float().contiguous())
-                kernels.compose(lightmaps, transparency, glow, self._albedo, *common, image)
+                planes = self._of_albedo((self._shares[:, :, None, None] * six.lightmaps.float()).sum(1))
             else:
                 planes = smoke.planes if isinstance(smoke, ScatteredSmoke) else self._of_albedo(smoke.planes)
-                kernels.compose_lights(to_warp(planes, wp.vec3), transparency, glow, *common, image)
+            kernels.compose(to_warp(planes, wp.vec3), transparency, glow, *common, image)
         return self.image
 
     def _of_albedo(self, planes: torch.Tensor) -> torch.Tensor:
@@ -181,9 +178,9 @@ class Drawing:
         return kernels.Solids(to_warp(points, wp.vec3), to_warp(triangles), to_warp(owner), to_warp(tints, wp.vec3))
 
     def _as_lamps(self) -> kernels.Lamps:
-        toward, irradiance, shares = self._lamps
+        toward, irradiance = self._lamps
         visibility = self._visibility if len(self._axes) else self.solid_depth[None]
-        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(shares), to_warp(visibility)
+        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(visibility)
         return kernels.Lamps(len(self._axes), *arrays)
 
 

@@ -4,8 +4,8 @@ Free paths are sampled by delta tracking, transmittances by ratio tracking (Nova
 volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick, and spend an optical depth
 that is drawn once over the bricks of a ray. Where a density is needed, one of the eight voxels around the position is
 drawn by its weight: both kinds of tracking need only the mean, which is that of `density_at`. At each scattering every
-light is sampled (next event estimation). The environment is sampled too, and is also reached by paths that leave the
-smoke; the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
+light is sampled (next event estimation). The sky is sampled too, and is also reached by paths that leave the smoke;
+the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
 for e / majorant.
 
 Units are those of `march`. Light of order n has been scattered n times. Random numbers belong to a pixel, so that the
@@ -51,29 +51,16 @@ class PathLight:
 
 @wp.struct
 class PathSettings:
-    """`albedo` R, G, B; paths end after `highest` scatterings; the first `kept` orders have separate planes."""
+    """`albedo` R, G, B; radiance of the `sky`, the same from all directions; paths end after `highest` scatterings; the
+    first `kept` orders have separate planes."""
 
     albedo: wp.vec3
+    sky: wp.vec3
     g: float
     highest: int
     kept: int
     samples: int
     key: wp.uint64
-
-
-@wp.struct
-class Sky:
-    """Light from infinity in all directions, a map of texels of constant radiance.
-
-    Row 0 is around +y; column 0 begins at +x and columns proceed towards +z. `rows` and `columns` are cumulative
-    probabilities of a row, and of a column within its row. `total` is the integral of the mean radiance over the
-    sphere; 0: there is no sky.
-    """
-
-    radiance: wp.array2d[wp.vec3]
-    rows: wp.array1d[float]
-    columns: wp.array2d[float]
-    total: float
 
 
 @wp.struct
@@ -101,15 +88,6 @@ class _Passed:
     """Share of light that passes, and the next random state."""
 
     share: float
-    random: wp.uint64
-
-
-@wp.struct
-class _Way:
-    """A direction, its probability per solid angle, and the next random state."""
-
-    direction: wp.vec3
-    chance: float
     random: wp.uint64
 
 
@@ -175,64 +153,6 @@ def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
     beside = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
     angle = _TWO_PI * v
     return wp.normalize(cosine * d + sine * (wp.cos(angle) * across + wp.sin(angle) * beside))
-
-
-@wp.func
-def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
-    """Returns the radiance of the sky in a direction."""
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
-    turn = wp.atan2(d[2], d[0])
-    if turn < 0.0:
-        turn += _TWO_PI
-    column = int(turn / _TWO_PI * float(columns))
-    return sky.radiance[wp.clamp(row, 0, rows - 1), wp.clamp(column, 0, columns - 1)]
-
-
-@wp.func
-def chance_of(sky: Sky, radiance: wp.vec3) -> float:
-    """Returns the probability per solid angle of a direction in a texel of a given radiance."""
-    return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
-
-
-@wp.func
-def toward_sky(sky: Sky, random: wp.uint64) -> _Way:
-    """Samples a direction by the brightness of the sky."""
-    way = _Way()
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    random = following(random)
-    u = uniform(random)
-    row = int(0)
-    past = rows - 1
-    while row < past:
-        middle = (row + past) // 2
-        if sky.rows[middle] > u:
-            past = middle
-        else:
-            row = middle + 1
-    random = following(random)
-    u = uniform(random)
-    column = int(0)
-    past = columns - 1
-    while column < past:
-        middle = (column + past) // 2
-        if sky.columns[row, middle] > u:
-            past = middle
-        else:
-            column = middle + 1
-    top = wp.cos(0.5 * _TWO_PI * float(row) / float(rows))
-    bottom = wp.cos(0.5 * _TWO_PI * float(row + 1) / float(rows))
-    random = following(random)
-    height = wp.lerp(top, bottom, uniform(random))
-    random = following(random)
-    turn = _TWO_PI * (float(column) + uniform(random)) / float(columns)
-    across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
-    way.direction = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
-    way.chance = chance_of(sky, sky.radiance[row, column])
-    way.random = random
-    return way
 
 
 @wp.struct
@@ -387,12 +307,11 @@ def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.
 
 @wp.struct
 class _Scene:
-    """The surroundings of paths: bricks of the smoke, camera, lights, the sky, and the mesh of obstacles in voxels."""
+    """The surroundings of paths: bricks of the smoke, camera, lights, and the mesh of obstacles in voxels."""
 
     grid: _Grid
     view: View
     lights: wp.array1d[PathLight]
-    sky: Sky
     mesh: wp.uint64
     settings: PathSettings
 
@@ -484,12 +403,11 @@ def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
         if flight.glow > 0.0:
             _add(out, (base + count + 1) * planes + plane, row, column, flight.glow * path.through)
         if flight.hit == 0:
-            if s.sky.total > 0.0 and limit >= 0.5 * _NEVER:
-                light = texel(s.sky, path.d)
+            if wp.max(s.settings.sky) > 0.0 and limit >= 0.5 * _NEVER:
                 share = float(1.0)
                 if path.chance > 0.0:
-                    share = path.chance / (path.chance + chance_of(s.sky, light))
-                _add(out, (base + count) * planes + plane, row, column, share * wp.cw_mul(path.through, light))
+                    share = path.chance / (path.chance + 1.0 / _FOUR_PI)
+                _add(out, (base + count) * planes + plane, row, column, share * wp.cw_mul(path.through, s.settings.sky))
             path.alive = 0
             return path
         path.p = path.p + flight.t * path.d
@@ -533,15 +451,18 @@ def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
                 strength = strength * got.share * phase(s.settings.g, wp.dot(path.d, way))
                 light = strength * wp.cw_mul(path.through, s.lights[n].colour)
                 _add(out, (base + n) * planes + plane, row, column, light)
-        if s.sky.total > 0.0:
-            far = toward_sky(s.sky, random)
-            random = far.random
-            if free(s.mesh, path.p, far.direction) >= _NEVER:
-                got = _passed(smoke, s.grid, path.p, far.direction, _NEVER, random)
+        if wp.max(s.settings.sky) > 0.0:
+            random = following(random)
+            height = 1.0 - 2.0 * uniform(random)
+            random = following(random)
+            turn = _TWO_PI * uniform(random)
+            across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
+            way = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
+            if free(s.mesh, path.p, way) >= _NEVER:
+                got = _passed(smoke, s.grid, path.p, way, _NEVER, random)
                 random = got.random
-                own = phase(s.settings.g, wp.dot(path.d, far.direction)) / _FOUR_PI
-                strength = got.share * own / (own + far.chance)
-                light = strength * wp.cw_mul(path.through, texel(s.sky, far.direction))
+                own = phase(s.settings.g, wp.dot(path.d, way))
+                light = got.share * own / (own + 1.0) * wp.cw_mul(path.through, s.settings.sky)
                 _add(out, (base + count) * planes + plane, row, column, light)
         return random
 
@@ -585,7 +506,7 @@ def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
                 if path.alive == 1:
                     random = connect(smoke, s, path, base, row, column, out)
                     # After its last order a path continues only to the sky and to emission.
-                    if path.order == s.settings.highest and s.sky.total == 0.0 and smoke.emission == 0.0:
+                    if path.order == s.settings.highest and wp.max(s.settings.sky) == 0.0 and smoke.emission == 0.0:
                         path.alive = 0
                     random = following(random)
                     u = uniform(random)
@@ -666,7 +587,6 @@ def trace(
     view: View,
     majorants: Majorants,
     lights: wp.array,
-    sky: Sky,
     mesh: wp.uint64,
     settings: PathSettings,
     first: int,
@@ -680,7 +600,6 @@ def trace(
         view: The camera, [H, W] pixels; paths go through pixel centres.
         majorants: From `bounds`.
         lights: `PathLight` [L]; L may be 0.
-        sky: The environment; total 0: none.
         mesh: Mesh of obstacles in voxels, which absorb all light; 0: none.
         settings: Settings of the paths.
         first: First part to trace.
@@ -693,7 +612,7 @@ def trace(
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
     together = max(1, traced * view.height * view.width // _THREADS) if medium.device.is_cuda else 1
     scene = _Scene()
-    scene.view, scene.lights, scene.sky, scene.mesh, scene.settings = view, lights, sky, mesh, settings
+    scene.view, scene.lights, scene.mesh, scene.settings = view, lights, mesh, settings
     grid = _Grid()
     grid.bounds, grid.edge = majorants.most, float(majorants.edge)
     grid.low, grid.size = (wp.vec3(*map(float, v)) for v in (majorants.low, majorants.size))

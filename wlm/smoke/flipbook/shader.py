@@ -5,7 +5,7 @@ import math
 from wlm.bundle import sampler
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.flipbook.book import Book
-from wlm.smoke.flipbook.motion import ZERO, mip_levels
+from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.shading import Ramp
 
 _TEXT = """\
@@ -86,59 +86,33 @@ vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
 """
 
 
-def smoke_shader(
-    layout: str,
-    *,
-    rows: int,
-    columns: int,
-    count: int,
-    size: tuple[int, int],
-    padding: int = 0,
-    gain: float = 1.0,
-    hot: bool = True,
-    motion: float | None = None,
-) -> str:
-    """Writes the shader of a flip book.
-
-    Args:
-        layout: One of `wlm.smoke.camera.LAYOUTS`.
-        rows, columns, count: Numbers of rows and columns of cells, and of frames.
-        size: Height and width of a frame in pixels, without padding.
-        padding: Pixels around a frame.
-        gain: Factor of the light in the textures.
-        hot: Whether there is a channel of emission.
-        motion: Range of the texture of motion; None: no such texture.
-
-    Raises:
-        ValueError: Unknown layout.
-    """
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+def smoke_shader(book: Book) -> str:
+    """Writes the functions that read a flip book's textures."""
     places = {
         name: f"{texture}.{letter}"
-        for texture, names in zip(("first", "second"), LAYOUTS[layout], strict=True)
+        for texture, names in zip(("first", "second"), LAYOUTS[book.layout], strict=True)
         for name, letter in zip(names, "rgba", strict=True)
     }
-    height, width = (n + 2 * padding for n in size)
+    height, width = (n + 2 * book.padding for n in book.size)
     alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
     text = _TEXT.format(
-        layout=layout,
-        rows=rows,
-        columns=columns,
-        count=count,
-        last=count - 1,
-        inset_x=_number(padding / width),
-        inset_y=_number(padding / height),
-        share_x=_number(size[1] / width),
-        share_y=_number(size[0] / height),
-        factor=_number(1.0 / gain),
-        levels=mip_levels(*size, padding),
+        layout=book.layout,
+        rows=book.rows,
+        columns=book.columns,
+        count=book.count,
+        last=book.count - 1,
+        inset_x=_number(book.padding / width),
+        inset_y=_number(book.padding / height),
+        share_x=_number(book.size[1] / width),
+        share_y=_number(book.size[0] / height),
+        factor=_number(1.0 / book.gain),
+        levels=book.levels,
         alpha=alpha,
-        emission=f"{emission} * {_number(1.0 / gain)}" if hot else "0.0",
+        emission=f"{emission} * {_number(1.0 / book.gain)}" if book.hot else "0.0",
         **places,
     )
-    if motion is not None:
-        text += _MOTION.format(zero=_number(ZERO), reach=_number(2.0 * motion))
+    if book.scale is not None:
+        text += _MOTION.format(zero=_number(ZERO), reach=_number(2.0 * book.scale))
     return text
 
 
@@ -218,9 +192,7 @@ def billboard_shader(book: Book) -> str:
         share=f"{0.25 / math.pi:.9g}",
         glow=_glow(book.ramp) if book.hot else "    return vec3(0.0, 0.0, 0.0);",
     )
-    names = ("rows", "columns", "count", "size", "padding", "gain", "hot")
-    functions = smoke_shader(book.layout, **{name: getattr(book, name) for name in names}, motion=book.scale)
-    return f"{functions}\n{textures}{text}"
+    return f"{smoke_shader(book)}\n{textures}{text}"
 
 
 def _glow(ramp: Ramp | None) -> str:
