@@ -5,9 +5,8 @@ Rows of each set, by method:
 - "ours": one row for each profile, and for the first profile at each ratio of gaussian-probe-compression, tables 2 and
   3. Size on disk and on a GPU, time of the fit with the writing, errors against the input, decode time of all live
   probes. "pca" is the same for the profile of principal components.
-- "decode": the first profile, one row for each way to build the lists of Gaussians and to bound their support. "sphere"
-  is the paper's way (eq. 6), another fit with spherical supports; "sphere lists" only builds the lists of the first
-  fit's ellipsoids from spheres. Cuts below 3 apply to the decode only.
+- "decode": the first profile, with ellipsoids as supports and with the spheres of the paper (eq. 6), which are another
+  fit; and with the points in the order of the file.
 - "fit": the first profile on the first set: speed of the fit; "dense torch": as many steps in plain torch, all of them
   on CUDA, otherwise a few.
 - The rivals of `benchmarks.rivals.probe` at shares of the probes' size as float32, and Unreal's packing, which has one
@@ -47,7 +46,6 @@ from wlm.probe.evaluation import Report, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.gaussian.decode import GaussianDecoder, Points
-from wlm.probe.gaussian.model import CUT
 from wlm.probe.gaussian.trainer import CODE_BITS, FINAL_RATE
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.views import VIEWS, score_views
@@ -68,7 +66,6 @@ _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 _QUICK_PROBE_STEPS = 600_000
 _QUICK_FRAMES = 60
 _DENSE_STEPS = 10  # steps of the fit in plain torch, where it is not run to its end
-_CUTS = (2.5, 2.0)
 _RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
     # The paper's own rival: clusters of places, nothing but half floats.
     "CPCA in halves": ("clustered_pca", (None,)),
@@ -230,8 +227,9 @@ class ProbeBench(Bench):
         fit = self.fit("pca", lambda: compress(self.probes, "pca"))
         decoder = fit.model.decoder(self.device)
         report = score(decoder.decode_probes(), self.probes, fit.bytes)
-        reader = decoder.light(self.probes.position).reader(len(self.position))
-        reader.numbers.assign(np.flatnonzero(self.probes.live).astype(np.int32))
+        live = np.flatnonzero(self.probes.live).astype(np.int32)
+        numbers = wp.array(live, dtype=int, device=self.device)
+        values = wp.zeros((len(live), self.probes.outputs), dtype=float, device=self.device)
         row = self.row(
             "pca",
             f"{fit.model.content.count} components",
@@ -241,7 +239,7 @@ class ProbeBench(Bench):
             irradiance_psnr=report.irradiance_psnr,
             **_size_and_psnr(report, fit.model.content.nbytes),
         )
-        return row, self.replay(reader.run)
+        return row, self.replay(lambda: decoder.read(numbers, values))
 
     def held_out_row(self, fit: Fit) -> Row:
         """Returns the row of the light at probes that were left out of the compression."""
@@ -266,16 +264,10 @@ class ProbeBench(Bench):
         spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
         exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
         ways = {
-            "none": (GaussianDecoder(model, self.device, culling="none"), exact),
             "sphere": (GaussianDecoder(spheres, self.device), sphere_exact),
-            "sphere lists": (GaussianDecoder(model, self.device, culling="sphere"), exact),
-            "box": (GaussianDecoder(model, self.device, culling="box"), exact),
-            "exact": (GaussianDecoder(model, self.device, culling="exact"), exact),
-            "exact, given order": (GaussianDecoder(model, self.device, culling="exact"), exact),
+            "exact": (GaussianDecoder(model, self.device), exact),
+            "exact, given order": (GaussianDecoder(model, self.device), exact),
         }
-        for cut in _CUTS:
-            if cut < CUT:
-                ways[f"cut {cut:g}"] = (GaussianDecoder(model, self.device, cut=cut), exact)
         return [self._way(fit, option, *way) for option, way in ways.items()]
 
     def _way(

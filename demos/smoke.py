@@ -36,7 +36,7 @@ from wlm.smoke.simulation import simulate
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import light_smoke
 from wlm.system import Progress
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
@@ -92,7 +92,6 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
     error = six.error
     if not error.rms <= MOST_STEP_ERROR:
         raise WlmError(f"demo: {name}: expected a step's error of at most {MOST_STEP_ERROR}, got {error.rms:.3g}")
-    write_sequence(out / f"{name}_frames", drawn)
     rows = {"lit": drawn} | {key: [each[key] for each in maps] for key in maps[0]}
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):g} s" for number in frames.numbers])
     if not all(later > earlier > 0 for earlier, later in itertools.pairwise(amounts)):
@@ -118,7 +117,6 @@ def plume(out: Path, device: str) -> dict[str, float]:
     _check_lightmaps("plume", six)
     lights = [Light((np.sin(angle), 0.4, np.cos(angle))) for angle in np.arange(8) * np.pi / 4]
     drawn = [to_bytes(six.shade([light], background=(0.03, 0.04, 0.055))) for light in lights]
-    write_sequence(out / "plume_frames", drawn)
     planes = [to_bytes(plane) for plane in (*six.lightmaps, 1.0 - six.transparency, six.emission)]
     contact_sheet(out / "plume.png", {"light from eight sides": drawn, "six ways, opacity, emission": planes})
     maps = guide(volume, camera, March(4.0)).maps

@@ -41,7 +41,7 @@ from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.network.settings import Profile
 from wlm.smoke.scene import Grid, LightSettings, Scene, load_scene, make_camera
 from wlm.smoke.simulation import simulate
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
@@ -109,7 +109,6 @@ def light(out: Path, name: str, scene: Scene, model: SmokeModel, turn: float, de
                 for what, value in psnr(six, lightmaps["reference"]).items():
                     scores.setdefault(f"{method}, {what}dB", []).append(value)
         check_clear(f"{name}, frame {number}", lightmaps["network"], lightmaps["reference"])
-    write_sequence(out / f"{name}_frames", [np.concatenate(images, 1) for images in zip(*rows.values(), strict=True)])
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):.2g} s" for number in footage.numbers])
     mean = {method: sum(values) / len(values) for method, values in scores.items()}
     if model.settings.guide == "six":

@@ -40,11 +40,11 @@ def flip_book(held_out: HeldOut) -> Entry:
     number = torch.arange(len(pool), device=pool.device)
     others = number[(number % views > 0) & held_out.keep]
     baked = pool.targets[others - others % views]
-    return Entry(others, pool.take(others), lambda _, part: baked[part].float())
+    return Entry(pool.take(others), lambda _, part: baked[part].float())
 
 
 RIVALS: dict[str, Contender] = {
-    COARSE: lambda held_out: Entry(held_out.kept, held_out.pool("six"), coarse),
+    COARSE: lambda held_out: Entry(held_out.pool("six"), coarse),
     FLIP_BOOK: flip_book,
 }
 """Rivals of a network in `wlm.smoke.evaluate`, by name."""

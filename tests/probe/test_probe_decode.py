@@ -6,7 +6,7 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
 from wlm.probe.exact import decode64
-from wlm.probe.gaussian.decode import CULLINGS, GaussianDecoder
+from wlm.probe.gaussian.decode import GaussianDecoder
 from wlm.probe.gaussian.model import check_outputs
 from wlm_kernels.probe.network import most_outputs, probes_at_once
 
@@ -47,29 +47,6 @@ def test_far_from_the_origin(device):
     model = random_model(origin=np.array([1e6, -2e6, 5e5]))
     position = points(100, model)
     close(GaussianDecoder(model, device).decode(position), model, position)
-
-
-def test_all_lists_give_the_same(device):
-    model = random_model(count=60)
-    position = points(200, model)
-    decoders = [
-        GaussianDecoder(model, device, culling=culling, cube=cube) for culling in CULLINGS for cube in (None, 0.07)
-    ]
-    decoded = [decoder.decode(position) for decoder in decoders]
-    for other in decoded[1:]:
-        np.testing.assert_allclose(other, decoded[0], rtol=0, atol=3e-6 * np.abs(decoded[0]).max())
-    fewest, boxes, spheres, everything = (decoders[i].pairs for i in (1, 3, 5, 7))
-    assert everything == 60 and fewest < boxes < spheres
-
-
-def test_a_tighter_cut_costs_what_is_cut(device):
-    model = random_model(count=60)
-    position = points(200, model)
-    whole = GaussianDecoder(model, device).decode(position)
-    errors = [
-        np.abs(GaussianDecoder(model, device, cut=cut).decode(position) - whole).mean() for cut in (2.5, 2.0, 1.5)
-    ]
-    assert 0 < errors[0] < errors[1] < errors[2]
 
 
 def test_outside_is_the_nearest_point_of_the_box(device):

@@ -15,7 +15,7 @@ from benchmarks.rivals.smoke import COARSE, FLIP_BOOK, RIVALS
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.metrics.error import psnr_from_mse
-from wlm.smoke.evaluation import HALF, NETWORK, REFERENCE, compare, evaluate, of_decoder, of_network, score
+from wlm.smoke.evaluation import HALF, NETWORK, compare, evaluate, of_decoder, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation
 from wlm.smoke.network.planes import OPACITY_PLANE
@@ -119,8 +119,6 @@ def test_all_methods_on_all_sets(tmp_path, device):
         # A volume stands still.
         assert volume.methods[NETWORK].flicker < 1e-6 and math.isnan(volume.methods[NETWORK].flicker_ratio)
         assert json.dumps(smoke.to_json(), allow_nan=False)
-        for comparison in (smoke, volume):
-            _check_images(comparison)
     assert [(progress.done, progress.total) for progress in reports] == [(1, 2), (2, 2)] * 2
     # What needs no network is the same beside any.
     for ours, papers in zip(*results.values(), strict=True):
@@ -133,27 +131,6 @@ def test_all_methods_on_all_sets(tmp_path, device):
     assert report.psnr == pytest.approx(results["paper"][0].methods[NETWORK].psnr, abs=0.05)
     assert abs(report.psnr - validation.psnr) > 0.1
     assert {progress.stage for progress in reports} == {"dataset", "evaluate"}
-
-
-def _check_images(comparison):
-    """One frame pair from three sides, the first of which the flip book was baked from."""
-    assert comparison.turns.tolist() == [0.0, 30.0, 60.0]
-    for name, scores in comparison.methods.items():
-        images = comparison.images[name]
-        assert images.shape == (2, 3)
-        assert sorted(images[np.isfinite(images)]) == sorted(scores.images)
-        assert np.isnan(images[:, 0]).all() == (name == FLIP_BOOK)
-    images = comparison.images[NETWORK]
-    first, second = comparison.worst
-    assert images[first.frame, first.view] == images.min() and second.view != first.view
-    assert images[second.frame, second.view] == np.delete(images, first.view, 1).min()
-    for example in comparison.worst:
-        have = [name for name, images in comparison.images.items() if np.isfinite(images[example.frame, example.view])]
-        assert [*example.planes] == [REFERENCE, *have]
-        for name in set(example.planes) - {REFERENCE}:
-            off = example.planes[name].float().clamp(min=0) - example.planes[REFERENCE].float()
-            found = psnr_from_mse(float(off[:6].square().mean()), 1.0)
-            assert found == pytest.approx(comparison.images[name][example.frame, example.view], abs=0.02)
 
 
 def test_smoke_is_required(device):

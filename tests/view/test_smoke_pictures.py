@@ -10,14 +10,13 @@ from builders.smoke_plumes import plume
 from builders.smoke_shadows import shadow_of
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
+from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import Drawing, picture
 
 FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
@@ -144,17 +143,6 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
         picture(replace(six, transparency=None), [light])
     with pytest.raises(ValueError, match="depth"):
         picture(six, [light], obstacles=[_ball()])
-
-
-def test_a_sequence(tmp_path):
-    frames = [np.full((2, 3, 3), value, np.uint8) for value in (1, 2)]
-    paths = write_sequence(tmp_path / "a", frames, "lit")
-    assert [path.name for path in paths] == ["lit_0001.png", "lit_0002.png"]
-    for path, frame in zip(paths, frames, strict=True):
-        with Image.open(path) as image:
-            np.testing.assert_array_equal(np.asarray(image), frame)
-    with pytest.raises(WlmError, match="cannot write there"):
-        write_sequence(tmp_path / "none" / "a", frames)
 
 
 def test_a_contact_sheet(tmp_path):

@@ -9,7 +9,7 @@ from wlm.inspection.files import kind_of
 from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
 from wlm.system import system_of
 
-_PROBES = ("probes", "godot bake", "probe export", "unity asset")
+_PROBES = ("probes", "godot bake", "unity asset")
 
 
 def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]]:

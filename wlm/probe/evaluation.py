@@ -2,21 +2,6 @@
 
 The paper scores pictures rendered in an engine. This module scores the coefficients themselves, and the irradiance of a
 diffuse surface under them, which needs neither a scene nor a camera; `wlm.probe.views` scores pictures.
-
-Behaviour in special cases:
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-decoded exactly                       PSNR is 120 dB, the cap of `wlm.metrics`; the error is 0
-all coefficients equal (range 0)      PSNR is NaN, null in JSON: there is no scale to compare with
-constant irradiance                   the same for its PSNR
-D is not 3 (l + 1)²                   the scores of bands and irradiance are None
-no live probe                         `psnr_live` and `irradiance_psnr` are NaN
-one probe, one coefficient            scored like any other
-NaN or Inf in a decoded probe         error that names the first such probe
-another number of probes or outputs   error
-====================================  ================================================================
 """
 
 import math
@@ -60,10 +45,10 @@ class Report(BaseReport):
         mse, mean_abs_error, max_abs_error: Errors over all coefficients of all probes.
         worst_probe: The probe of the largest mean squared error: `probe` (its index), `psnr` and `position`; None if
             all are exact.
-        psnr_by_band: PSNR of each SH band over all probes and RGB; None where D is not 3 (l + 1)².
+        psnr_by_band: PSNR of each SH band over all probes and RGB.
         psnr_by_coefficient: PSNR of each number, float64 [D], over all probes.
         irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
-            range of the input's irradiance there. None as for `psnr_by_band`.
+            range of the input's irradiance there.
         warnings: Lost light that the means hide.
         between_psnr: PSNR half-way between probes, see `wlm.probe.between`; None if it was not computed.
         held_out: Score at probes that a second fit left out; None if it was not computed.
@@ -146,7 +131,8 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         file_bytes: Size of the compressed file.
 
     Returns:
-        The report.
+        The report. A PSNR is 120 dB at most, the cap of `wlm.metrics`, and NaN if all numbers of the input are equal
+        or no probe is live. The scores of bands and irradiance are None if D is not 3 (l + 1)².
 
     Raises:
         WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.

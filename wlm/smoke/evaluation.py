@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from wlm import system
@@ -41,14 +40,10 @@ Method = Callable[[Pool, slice], torch.Tensor]
 NETWORK, HALF = "network", "network, half floats"
 """Names of a network's methods in a `Comparison`."""
 
-REFERENCE = "reference"
-"""Name of the fine march in an `Example`."""
-
 DENSITIES = (0.5, 1.0, 2.0)
 """Factors of the density, those of the paper's ablation (figure 5)."""
 
 _BATCH = 8  # samples
-_EXAMPLES = 2  # images shown in a comparison
 _STILL = 1e-4  # a flicker up to this, a fortieth of a level of 8 bits, counts as none
 
 
@@ -221,42 +216,21 @@ class HeldOut:
         same = guide == self.settings.guide
         return (self.whole if same else self.make(_with_guide(self.settings, guide))).take(self.keep)
 
-    @property
-    def kept(self) -> torch.Tensor:
-        """Numbers of the scored samples, int [n]."""
-        return self.keep.nonzero().flatten()
-
 
 class Entry(NamedTuple):
     """A method, with the samples on which it is scored.
 
     Attributes:
-        numbers: int [n], numbers of the samples; may be empty.
-        pool: These samples, with the guiding maps that the method reads.
+        pool: The samples, with the guiding maps that the method reads; may be empty.
         method: The method.
     """
 
-    numbers: torch.Tensor
     pool: Pool
     method: Method
 
 
 Contender = Callable[[HeldOut], Entry]
 """Function that returns the entry of a method for test samples."""
-
-
-@dataclass(frozen=True, eq=False)
-class Example:
-    """An image on which the network has a low score.
-
-    Attributes:
-        frame, view: Index in `Comparison.images`.
-        planes: float16 [8, H, W] on the CPU, encoded lightmaps of `REFERENCE` and of each method that has this image.
-    """
-
-    frame: int
-    view: int
-    planes: dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,18 +241,11 @@ class Comparison:
         name: Name of the test set.
         samples: Number of frame pairs and views.
         methods: Scores by name.
-        turns: float [views], angle of each view about the smoke in degrees.
-        images: PSNR of each image by the method's name, [frames, views]; NaN where the method has no such image. The
-            two frames of a pair are adjacent; those of a volume are equal.
-        worst: Samples with the lowest scores of the network, lowest first, each with its worse frame.
     """
 
     name: str
     samples: int
     methods: dict[str, Score]
-    turns: np.ndarray
-    images: dict[str, np.ndarray]
-    worst: tuple[Example, ...]
 
     @property
     def half_loss(self) -> float | None:
@@ -326,11 +293,9 @@ def compare(
 
     def at_run_time(held_out: HeldOut) -> Entry:
         pool = held_out.pool(guide)
-        return Entry(held_out.kept, pool, _at_run_time(model, device, pool))
+        return Entry(pool, _at_run_time(model, device, pool))
 
-    contenders: dict[str, Contender] = {
-        NETWORK: lambda held_out: Entry(held_out.kept, held_out.pool(guide), of_network(network))
-    }
+    contenders: dict[str, Contender] = {NETWORK: lambda held_out: Entry(held_out.pool(guide), of_network(network))}
     if device != "cpu":
         contenders[HALF] = at_run_time
     contenders |= rivals or {}
@@ -349,7 +314,7 @@ def compare(
     for name, (make, least_coverage) in sets.items():
         whole = make(complete)
         held_out = HeldOut(whole, whole.covered() > least_coverage, complete, make)
-        if not len(held_out.kept):
+        if not held_out.keep.any():
             raise WlmError(f"{name}: expected frames with smoke, found none")
         comparisons.append(_compare(name, held_out, contenders))
         meter.report(len(comparisons), PSNR_dB=comparisons[-1].methods[NETWORK].psnr)
@@ -358,34 +323,14 @@ def compare(
 
 @torch.no_grad()
 def _compare(name: str, held_out: HeldOut, contenders: Mapping[str, Contender]) -> Comparison:
-    """Scores methods on one smoke; the first is the network, which selects the images to show."""
-    views = held_out.settings.views
-    scores: dict[str, Score] = {}
-    images: dict[str, np.ndarray] = {}
-    worst: list[tuple[int, int]] = []  # samples, each with its worse frame
-    planes: list[dict[str, torch.Tensor]] = []
+    """Scores methods on one smoke."""
+    scores = {}
     for method_name, contender in contenders.items():
         # One method at a time: each pool is a copy.
-        numbers, pool, method = contender(held_out)
-        if not len(pool):
-            continue
-        scores[method_name] = score(method, pool)
-        found = np.full((len(held_out.whole), 2), np.nan)
-        found[numbers.cpu().numpy()] = np.reshape(scores[method_name].images, (-1, 2))
-        images[method_name] = found.reshape(-1, views, 2).swapaxes(1, 2).reshape(-1, views)
-        if not worst:
-            order = np.argsort(np.nan_to_num(found.min(1), nan=np.inf))[: min(len(pool), _EXAMPLES)]
-            worst = [(int(sample), int(found[sample].argmin())) for sample in order]
-            planes = [{REFERENCE: held_out.whole.targets[place].cpu()} for place in worst]
-        for (sample, frame), shown in zip(worst, planes, strict=True):
-            for i in (numbers == sample).nonzero().flatten().tolist():
-                shown[method_name] = method(pool, slice(i, i + 1))[0, frame].half().cpu()
-    examples = tuple(
-        Example(2 * (sample // views) + frame, sample % views, shown)
-        for (sample, frame), shown in zip(worst, planes, strict=True)
-    )
-    turns = held_out.settings.arc / views * np.arange(views)
-    return Comparison(name, len(held_out.kept), scores, turns, images, examples)
+        pool, method = contender(held_out)
+        if len(pool):
+            scores[method_name] = score(method, pool)
+    return Comparison(name, int(held_out.keep.sum()), scores)
 
 
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:

@@ -1,9 +1,7 @@
 """The optimisers of Gaussians and network, one number per thread: Adan or Adam (gaussian-probe-compression, section 5).
 
-They are ours because a whole step has to be in one CUDA graph, which libraries that count steps in Python can't be.
-
-The twins to read first: torch's Adam and pytorch-optimizer's Adan, to which `tests/kernels/test_probe_step.py` holds
-these.
+A whole step must be in one CUDA graph, which excludes libraries that count steps in Python. The references are torch's
+Adam and pytorch-optimizer's Adan, with which `tests/kernels/test_probe_step.py` compares these.
 """
 
 import functools
@@ -12,7 +10,7 @@ import warp as wp
 
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions
 
-# log of the scale, in the normalised frame: a Gaussian can't collapse to nothing nor grow past all use.
+# Range of the logarithm of a scale, in the normalised frame.
 LOG_SCALES = wp.constant(wp.vec2(-9.21, 1.39))  # 1e-4 to 4
 ADAM = wp.constant(wp.vec2(0.9, 0.999))
 ADAN = wp.constant(wp.vec3(0.98, 0.92, 0.99))  # as Xie et al. and pytorch-optimizer have them
@@ -26,14 +24,14 @@ class Optimiser:
     """Settings of the two optimisers.
 
     Attributes:
-        control: int [1], the number of the step, from 1.
+        control: int [1], number of the step, from 1.
         schedule: float [steps], factor of all rates at each step.
         rates: float [10 + L], of each channel of a Gaussian.
-        net_rate: Of the network.
-        bounds: float [2, 10 + L].
-        keep: 1 to keep the rows within `bounds`.
-        move: 0 leaves the Gaussians where they are.
-        adan: 1 for Adan (Xie et al. 2024), 0 for Adam, for the Gaussians; the network's is always Adam.
+        net_rate: Rate of the network.
+        bounds: float [2, 10 + L], lowest and highest value of each channel.
+        keep: 1 to clamp the rows to `bounds`.
+        move: 0 to leave the Gaussians unchanged.
+        adan: 1 to train the Gaussians by Adan (Xie et al. 2024), 0 by Adam; the network is always trained by Adam.
     """
 
     control: wp.array1d[int]
@@ -48,7 +46,7 @@ class Optimiser:
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds (once) the kernel of `step.StepKernels.update` for latents of length L."""
+    """Builds the kernel of `step.StepKernels.update` for latents of length L, once."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent
@@ -74,7 +72,7 @@ def update_kernel(latent: int):
             g = float(0.0)
             whole = partial.shape[0] // 8 * 8
             for b in range(0, whole, 8):
-                # Eight loads under way at once.
+                # Eight loads are in flight at once.
                 part = _vec8()
                 for u in range(8):
                     part[u] = partial[b + u, i]
@@ -94,7 +92,7 @@ def update_kernel(latent: int):
             c = (i - net.shape[0]) % wp.static(channels)
             g = float(0.0)
             if c < LATENT:
-                # Of what the step used: the rows are being changed by other threads.
+                # The values that the step used, since other threads are changing the rows.
                 s = vec_sums()
                 for a in range(SHAPE_NUMBERS):
                     s[a] = sums[k, a]

@@ -1,15 +1,12 @@
 """A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); `network` has the rest of it.
 
-Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
-launches: which Gaussians meet which groups, as bit masks (`touch`); the Gaussians' sum at each probe (`features`);
-the network, forward and backward (`network`); the sums that the gradients of each Gaussian are made of
-(`collect`); and the optimisers (`update`). A launch runs over probes, or over Gaussians, and nothing is added up by
-atomics: one seed gives one result, on either device.
+Probes are sorted along a space-filling curve and divided into groups of 64 neighbours, each with a bounding box. A step
+has five launches: bit masks of the Gaussians that meet each group (`touch`); the Gaussians' sum at each probe
+(`features`); the network, forward and backward (`network`); the sums from which the gradients of each Gaussian follow
+(`collect`); and the optimisers (`update`). There are no atomic additions: a seed gives one result on each device.
 
-The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
-nothing to count, scan and sort (`cubes` does, for points at any place).
-
-The twin to read first: `tests/reference/gaussians.py`.
+The masks replace the paper's sorted lists of cubes, since probes do not move in training: nothing has to be counted,
+scanned and sorted. The reference is `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -23,8 +20,8 @@ from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions,
 from wlm_kernels.probe.optimiser import update_kernel
 
 GROUP = 64  # probes
-SPLITS = 4  # threads that share a probe's sum on CUDA, where 15,000 probes alone leave most of a GPU idle
-_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the widest one sets the pace
+SPLITS = 4  # threads that share a probe's sum on CUDA; one thread for each of 15,000 probes leaves most of a GPU idle
+_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA
 
 
 @wp.struct
@@ -32,9 +29,9 @@ class Groups:
     """Probes in groups; N is a multiple of `GROUP`, G = N / GROUP.
 
     Attributes:
-        x: [N], positions in the normalised frame; those behind `count` only fill the last group.
-        middle, half: [G], the groups' boxes.
-        count: Probes.
+        x: [N], positions in the normalised frame; positions after `count` only fill the last group.
+        middle, half: [G], centres and half sizes of the groups' boxes.
+        count: Number of probes.
     """
 
     x: wp.array1d[wp.vec3]
@@ -73,7 +70,9 @@ def _count_step(control: wp.array1d[int]):
 
 
 @wp.func
-def _meet(groups: Groups, shapes: wp.array1d[Shape], g: int, k: int) -> int:
+def _meet(groups: Groups, shapes: wp.array1d[Shape], transposed: int, row: int, column: int) -> int:
+    g = wp.where(transposed != 0, column, row)
+    k = wp.where(transposed != 0, row, column)
     if g < groups.middle.shape[0] and k < shapes.shape[0]:
         if touches(shapes[k], groups.middle[g], groups.half[g]):
             return 1
@@ -92,12 +91,7 @@ def _touch_cpu(
     row, word = wp.tid()
     word_bits = wp.uint32(0)
     for b in range(32):
-        column = word * 32 + b
-        met = int(0)
-        if transposed == 0:
-            met = _meet(groups, shapes, row, column)
-        else:
-            met = _meet(groups, shapes, column, row)
+        met = _meet(groups, shapes, transposed, row, word * 32 + b)
         word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
     bits[row, word] = word_bits
 
@@ -112,14 +106,8 @@ def _touch_cuda(
     bits: wp.array2d[wp.uint32],
 ):
     row, word, b = wp.tid()
-    column = word * 32 + b
-    met = int(0)
-    if transposed == 0:
-        met = _meet(groups, shapes, row, column)
-    else:
-        met = _meet(groups, shapes, column, row)
-    # Threads 0 to 31 of the last dimension are one warp, whole in every launch.
-    word_bits = _ballot(met)
+    # The last dimension has 32 threads, which are one warp in every launch.
+    word_bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + b))
     if b == 0:
         bits[row, word] = word_bits
 
@@ -163,13 +151,13 @@ class StepKernels:
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
-        """Prepares the parameters for a step: rounded to the file's levels if asked for, and as shapes.
+        """Rounds the parameters to codes, if asked for, and converts them to shapes.
 
         Args:
             rows: float [K, 10 + L], the parameters.
             bounds: float [2, 10 + L], lowest and highest value of each channel.
-            quantised: 1 to round to the levels of the file (eq. 13 and 14), 0 to use the rows as they are.
-            levels: float [10 + L], each channel's highest code.
+            quantised: 1 to round to codes (eq. 13 and 14), 0 to use the rows unchanged.
+            levels: float [10 + L], highest code of each channel.
             cut, sphere: As for `gaussians.shape_of`.
             used: float [K, 10 + L], written.
             shapes: Shape [K], written.
@@ -188,7 +176,7 @@ class StepKernels:
         Args:
             groups, shapes, used, by_group, cut: As above.
             f: float [S, L, N], written: S parts of the sum, S = `SPLITS` on CUDA and 1 on the CPU.
-            base, count: On the CPU, the probes from `base` on.
+            base, count: On the CPU, first probe and number of probes of this launch.
         """
         probes = groups.x.shape[0]
         dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
@@ -202,13 +190,13 @@ class StepKernels:
         )
 
     def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
-        """Sums over the probes the terms of each Gaussian's gradient.
+        """Sums the terms of each Gaussian's gradient over the probes.
 
         Args:
             groups, shapes, used, by_gaussian, cut: As above.
-            grad_f: float [L, N], the gradient of the sum; 0 behind `groups.count`.
+            grad_f: float [L, N], the gradient of the sum; 0 after `groups.count`.
             sums: float [K, 9 + L], written.
-            base, count: On the CPU, the Gaussians from `base` on.
+            base, count: On the CPU, first Gaussian and number of Gaussians of this launch.
         """
         gaussians = used.shape[0]
         dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
@@ -227,13 +215,13 @@ class StepKernels:
         Args:
             optimiser: `optimiser.Optimiser`.
             rows: float [K, 10 + L], updated.
-            used: float [K, 10 + L], what the gradients were taken at.
+            used: float [K, 10 + L], values at which the gradients were taken.
             shapes: Shape [K].
             sums: float [K, 9 + L], of `collect`.
             moments: float [4, K, 10 + L], updated.
             net: float [P], updated.
             net_moments: float [2, P], updated.
-            partial: float [B, P], parts of the network's gradient.
+            partial: float [B, P], partial gradients of the network.
         """
         wp.launch(
             self._update,
@@ -246,7 +234,7 @@ class StepKernels:
 
 @functools.cache
 def step_kernels(latent: int, device_kind: str) -> StepKernels:
-    """Builds (once) the launches.
+    """Builds the launches, once.
 
     Args:
         latent: L.
@@ -337,13 +325,13 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
             while bits != wp.uint32(0):
                 g = w * 32 + next_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
-                # The groups go round among those who share the Gaussian.
+                # The threads that share the Gaussian take the groups in turn.
                 turn += 1
                 if turn % stride != first:
                     continue
                 for j in range(lane, GROUP, lanes):
                     i = g * GROUP + j
-                    # A group that is met at a corner is hardly reached: test before loading gradients.
+                    # Most probes of a group may be out of reach: the test comes before their gradients are loaded.
                     if not touches(shape, groups.x[i], wp.vec3()):
                         continue
                     gradient = vec_latent()

@@ -1,6 +1,5 @@
 """Every shader that we export, in every language that runs here, beside what Python decodes."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -339,15 +338,13 @@ def test_metal_as_the_cpp_that_it_is(name, tmp_path):
     np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
 
 
-def test_heads_tell_what_other_languages_hold(tmp_path):
-    """Macros are decided there, and nothing is of GLSL."""
-    for name in ("lightmap", "atlas mips", "scene", "probes", "volume"):
-        text = SUBJECTS[name](tmp_path / name).text
-        for defined in ((), ("WLM_ATLAS_EXACT", "WLM_LIGHTMAP_EXACT")):
-            written = translate(text, "hlsl", defined)
-            assert not re.search(r"//.*(_EXACT|before this file|GLSL|#version|WLM_\w+\(\w\))", written), name
-            exact = "our texels are fetched and mixed in floats." in written
-            assert exact == (bool(defined) and name in ("lightmap", "atlas mips"))
+def test_heads_state_language_and_macros():
+    text = "// A shader.\n#ifdef WLM_A\nconst int A = 1;\n#endif\n"
+    for defined, macros in (((), ""), (("WLM_A",), " with WLM_A defined")):
+        written = translate(text, "hlsl", defined)
+        head = "// HLSL, shader model 5 and later, translated from the GLSL that is described below"
+        assert written.startswith(f"{head}{macros}; macros are expanded.\n//\n// A shader.\n")
+        assert ("int A = 1" in written) == bool(defined)
 
 
 def test_what_is_no_shader_of_ours():

@@ -19,8 +19,8 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.godot import lmbake_bytes, relit
 from wlm.probe.conventions import from_canonical
-from wlm.probe.data import load_positions
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of, positions_of
+from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.places import positions_of
 
 BAKE_FILE = "light.lmbake"
 _MOST_CELLS = 64
@@ -91,9 +91,7 @@ def write_kit(
             raise WlmError(f"cells: expected none with {bake}, whose probes have positions")
         if model.outputs != NUMBERS:
             raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers per probe, got {model.outputs}")
-        places = load_positions(bake)
-        if not model.has_probes_at(places):
-            raise WlmError(f"{bake}: expected the {model.probes} probes of {model.name}, in their order")
+        places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
     (folder / BAKE_FILE).write_bytes(content)
     return {"about": _ABOUT} | info

@@ -15,13 +15,13 @@ import numpy as np
 
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
-from wlm.formats.dds import read_word_volume, write_dds
+from wlm.formats.dds import write_dds
 from wlm.formats.folder import write_index
-from wlm.formats.reading import named_file
-from wlm.probe.conventions import UNREAL_LIGHT as FORMAT
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import CELLS, grid_places, lattice_of, positions_of, read_cells
+from wlm.probe.engines.lattice import CELLS, lattice_of
+from wlm.probe.places import positions_of
 
+FORMAT = "wlm-unreal-light"
 _VERSION = 1
 INFO_FILE = "light.json"
 AMBIENT_FILE = "ambient.dds"
@@ -29,7 +29,6 @@ SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
 SHADER_FILE = "WlmProbes.usf"
 _MOST_CELLS = 128
 _BANDS = 3
-_ROWS = 65536  # probes unpacked at a time
 _AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
 
 # Ranges of coefficients 1 to 8 over the ambient one, as in the engine: sqrt(3) for L1, the bound for non-negative
@@ -167,33 +166,6 @@ def write_kit(
     (folder / SHADER_FILE).write_text(text, encoding="utf-8")
     write_index(folder / INFO_FILE, document)
     return {"about": _ABOUT}
-
-
-def read_unreal(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the textures that `write_kit` wrote, as probes at the centres of the cells.
-
-    Args:
-        path: Path of `light.json`.
-        document: Its content.
-
-    Returns:
-        float64 [N, 3], positions; float32 [N, 9, 3], values with Unreal's signs.
-
-    Raises:
-        WlmError: A field is missing or wrong, or a texture cannot be read or has another format or size.
-    """
-    box, cells = read_cells(path, document, _MOST_CELLS)
-    size = tuple(int(count) for count in cells)
-    ambient, *ratios = (
-        read_word_volume(named_file(path, name, f"{path}: {name}"), fmt, size).ravel()
-        for name, fmt in ((AMBIENT_FILE, _AMBIENT), *((name, _RATIOS) for name in SH_FILES))
-    )
-    values = np.empty((len(ambient), _BANDS**2, 3), np.float32)
-    for start in range(0, len(ambient), _ROWS):
-        rows = slice(start, start + _ROWS)
-        level = np.stack([ratio[rows] for ratio in ratios], 1).view(np.uint8).reshape(-1, 3, _BANDS**2 - 1)
-        values[rows] = _unpacked(ambient[rows], level)
-    return grid_places(box, cells), values
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
