@@ -20,7 +20,7 @@ from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.coarse import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
 from wlm.smoke.scene import Scene
 
