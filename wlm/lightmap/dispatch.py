@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
 from wlm.metrics.tiled import nanmean
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers, cores
-
-if TYPE_CHECKING:
-    from wlm.lightmap.fit import SheetFit
 
 _SLICE = 0.5  # seconds of work between two answers of another process
 _POLL = 0.2  # seconds that a signal waits at most to be handled
@@ -39,14 +36,14 @@ class Batch:
         kind: STATIC or DYNAMIC.
         rows: int [n], positions of the tiles among the tiles of the sheet's fit.
         first: Number of tiles of that kind in earlier batches of the sheet.
-        fit: The fit of the sheet.
+        fit: The `wlm.lightmap.fit.SheetFit` of the sheet.
     """
 
     number: int
     kind: TileKind
     rows: np.ndarray
     first: int
-    fit: "SheetFit"
+    fit: Any
 
 
 @dataclass(eq=False)
