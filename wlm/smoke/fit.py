@@ -98,7 +98,7 @@ def train(
         output: The network's file.
         seed: Seed of the initial weights, the pools and the order of samples.
         device: "cpu", "cuda" or "cuda:N".
-        minutes: Time limit at which the training stops with a checkpoint, after at least `_CHUNK` steps; None: none.
+        minutes: Time after which the training stops with a checkpoint; None: no limit.
         resume: Whether to continue from the checkpoint, if it exists.
         checkpoint_every: Seconds between checkpoints during the steps; 0: after every `_CHUNK` steps. There is also one
             at the end of each round.
