@@ -1,7 +1,7 @@
 """Lights smoke by a network's six-way lightmaps, beside a fine and a coarse march, and checks the results.
 
-There are three scenes: a jet under a turning camera and light, a sphere that crosses a jet, and a glowing explosion. The
-results are a contact sheet for each. The network is the shipped one or that of `--network`; `--train` first trains a
+There are three scenes: a jet under a turning camera and light, a sphere that crosses a jet, and a glowing explosion.
+Each leaves a contact sheet. The network is the shipped one or that of `--network`; `--train` first trains a
 small network, for half a minute.
 
 The coarse march is the network's guide. On grids as small as these its steps are shorter than a voxel, so that it is

@@ -156,7 +156,8 @@ class _Run:
         seed: int,
         minutes: float | None,
     ) -> None:
-        self.profile, self.settings, self.output, self.checkpoint = profile, profile.training, output, checkpoint
+        self.settings, self.output, self.checkpoint = profile.training, output, checkpoint
+        self.facts = {"profile": profile.name, "seed": seed, "dataset": profile.dataset.model_dump(mode="json")}
         self.meter, self.seed, self.device = meter, seed, device
         self.trainer = Trainer(profile.network, profile.training, seed=seed, device=device)
         self.limit = math.inf if minutes is None else 60.0 * minutes
@@ -282,14 +283,12 @@ class _Run:
 
     def _save_network(self) -> None:
         summary = {
-            "profile": self.profile.name,
-            "seed": self.seed,
+            **self.facts,
             "steps": self.trainer.step,
             "seconds": round(self.seconds, 1),
             "device": "cpu" if self.device == "cpu" else torch.cuda.get_device_name(self.device),
             **self.score.to_json(),
             "training": self.settings.model_dump(mode="json"),
-            "dataset": self.profile.dataset.model_dump(mode="json"),
         }
         SmokeModel(self.trainer.average, summary).save(self.output)
 

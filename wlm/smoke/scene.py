@@ -190,7 +190,7 @@ class _Timed(_Settings):
         return self
 
     def active(self, time: float) -> bool:
-        """Whether the source is active at a time in seconds."""
+        """Returns whether the source is active at a time in seconds."""
         return self.start <= time and (self.stop is None or time < self.stop)
 
 

@@ -165,7 +165,7 @@ class Drawing:
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Returns the light that the smoke emits, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
+        """Returns emitted light, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
         if emission is None:
             return None
         ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))

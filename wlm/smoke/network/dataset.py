@@ -238,7 +238,7 @@ class _Maker:
         return guides, targets, moved
 
     def _shots(self, scene: Scene, random: np.random.Generator) -> list[_Shot]:
-        """The views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
+        """Returns the views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
         settings = self._settings
         if self._validation:
             seeds = random.integers(2**30, size=settings.views)
