@@ -111,7 +111,7 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
     with pytest.raises(WlmError, match="expected the positions of its own 400 probes"):
         model.decoder(position=probes.position[:7])
     with pytest.raises(WlmError, match="expected the positions of its own 400 probes"):
-        decoder.decode_probes(probes.position + 1.0)
+        decoder.light(probes.position + 1.0)
 
 
 def test_the_choice_is_by_error_at_equal_gpu_bytes():
