@@ -20,7 +20,7 @@ from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.data import load_frames, read_six_way
 from wlm.smoke.march.coarse import bake_coarse
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.network import dataset, onnx_file
+from wlm.smoke.network import onnx_file
 from wlm.smoke.network.planes import GUIDES, encode_lightmaps, render_guide
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.network.trainer import Trainer
@@ -114,26 +114,6 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
 
 
-def test_a_training_is_stopped_before_its_first_step(trained, tmp_path, monkeypatch):
-    folder, _, _ = trained
-    words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
-
-    def interrupted(*_, progress, **__):
-        os.kill(os.getpid(), signal.SIGINT)
-        progress(None)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(dataset, "make_pool", interrupted)
-        call(*words, "--resume", code=130)
-    assert "a.safetensors.partial: there is nothing to resume; starting at step 0" in call.stderr
-    assert "stopped at step 0: repeat the command with --resume to continue" in call.stderr
-    call(*words, "--resume")
-    assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
-    content = (tmp_path / "a.safetensors").read_bytes()
-    assert "a.safetensors: is finished; without --resume it is trained anew" in fails(*words, "--resume")
-    assert (tmp_path / "a.safetensors").read_bytes() == content
-
-
 def test_predict_marches_as_in_training(network, volume, tmp_path):
     out = tmp_path / "a.exr"
     text = call("smoke", "predict", volume, "-o", out, "--network", network, "--resolution", 20, "--seed", 4)
@@ -154,11 +134,10 @@ def test_predict_marches_as_in_training(network, volume, tmp_path):
     call("smoke", "shade", out, "-o", tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("words, step", [((), 24 / 130), (("--step", 4), 4.0)])
-def test_predict_by_the_coarse_march_alone(volume, tmp_path, words, step):
-    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", *words, "--resolution", 20, "--seed", 2)
+def test_predict_by_the_coarse_march_alone(volume, tmp_path):
+    call("smoke", "predict", volume, "-o", tmp_path / "a.exr", "--coarse", "--resolution", 20, "--seed", 2)
     six = read_six_way(tmp_path / "a.exr")
-    expected = bake_coarse(load_frames(volume).load(1), six.camera, March(step, step, seed=2))
+    expected = bake_coarse(load_frames(volume).load(1), six.camera, March(24 / 130, seed=2))
     for name in ("lightmaps", "transparency", "emission"):
         torch.testing.assert_close(getattr(six, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
 
@@ -204,14 +183,6 @@ def test_evaluate(network, volume, tmp_path):
     assert (facts["steps"], facts["seconds"]) == (model.summary["steps"], model.summary["seconds"])
 
 
-def test_a_report_says_of_a_network_what_its_file_does(network, tmp_path):
-    old, model = tmp_path / "old.safetensors", wlm.load(network)
-    SmokeModel(model.network, {"dataset": model.summary["dataset"], "seed": 5}).save(old)
-    call("evaluate", old, "--resolution", 8, "--json", tmp_path / "a.json")
-    facts = json.loads((tmp_path / "a.json").read_text())["network"]
-    assert facts["seed"] == 5 and not {"profile", "steps", "seconds", "device"} & facts.keys()
-
-
 def test_export(network, tmp_path):
     """ONNX computes what the network does, of a size that its levels' squares don't divide."""
     for package in ("onnx", "onnxscript"):
@@ -230,8 +201,6 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     out = tmp_path / "a.exr"
     predict = ("smoke", "predict", volume, "-o", out)
     assert "--coarse: expected no --network" in fails(*predict, "--coarse", "--network", network)
-    assert "--step: expected --coarse: a network" in fails(*predict, "--step", 3)
-    assert "--step" in fails(*predict, "--coarse", "--step", 0)
     assert "gone.safetensors: cannot read" in fails(*predict, "--network", tmp_path / "gone.safetensors")
     assert "expected an artifact" in fails(*predict, "--network", volume)
     assert "device 'tpu'" in fails(*predict, "--network", network, "--device", "tpu")

@@ -14,9 +14,11 @@ FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS = 8, 12, 16, 20, 24, 28
 PIXEL_FLAGS, FOUR_CC, CAPS, CAPS2 = 80, 84, 108, 112
 FORMAT, DIMENSION, MISC, ARRAY, ALPHA = 128, 132, 136, 140, 144
 FOUR_BYTES = (
+    "R16G16_FLOAT",
     "R16G16_UNORM",
     "R16G16_UINT",
     "R9G9B9E5_SHAREDEXP",
+    "R10G10B10A2_UNORM",
     "R11G11B10_FLOAT",
     "R8G8B8A8_UNORM",
 )
@@ -42,13 +44,13 @@ def test_pillow_reads_the_same_picture(tmp_path):
 
 def test_the_header_of_a_picture(tmp_path):
     path = tmp_path / "a.dds"
-    write_dds(path, _blocks(6 * 4), width=22, height=13)
+    write_dds(path, _blocks(6 * 4), width=22, height=13, fmt="BC7_UNORM_SRGB")
     data = path.read_bytes()
     assert len(data) == 148 + 24 * 16 and data[:4] == b"DDS " and data[FOUR_CC : FOUR_CC + 4] == b"DX10"
     values = [_field(data, at) for at in (4, FLAGS, HEIGHT, WIDTH, PITCH, DEPTH, MIPS, 76, PIXEL_FLAGS)]
     assert values == [124, 0x81007, 13, 22, 384, 0, 1, 32, 4]
     assert [_field(data, at) for at in (CAPS, CAPS2)] == [0x1000, 0]
-    assert [_field(data, at) for at in (FORMAT, DIMENSION, MISC, ARRAY, ALPHA)] == [98, 3, 0, 1, 0]
+    assert [_field(data, at) for at in (FORMAT, DIMENSION, MISC, ARRAY, ALPHA)] == [99, 3, 0, 1, 0]
 
 
 def test_the_header_of_mips(tmp_path):

@@ -11,7 +11,15 @@ from wlm.formats.ktx2 import VK_FORMATS, write_ktx2
 # Byte offsets, from the KTX specification's section on the file's structure.
 FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME = range(12, 48, 4)
 DESCRIPTOR, DESCRIPTOR_BYTES, PAIRS, PAIRS_BYTES, LEVEL, LEVEL_BYTES = 48, 52, 56, 60, 80, 88
-TEXEL = {"R16G16B16A16_SFLOAT": 8}
+TEXEL = {
+    "R16G16_UNORM": 4,
+    "R16G16_UINT": 4,
+    "R16G16_SFLOAT": 4,
+    "R16G16B16_SFLOAT": 6,
+    "R32G32_SFLOAT": 8,
+    "R16G16B16A16_SFLOAT": 8,
+    "E5B9G9R9_UFLOAT_PACK32": 4,
+}
 ONE, MINUS_ONE = 0x3F800000, 0xBF800000
 
 
@@ -33,7 +41,7 @@ def test_the_header(tmp_path, fmt):
     found = [_word(data, at) for at in (FORMAT, TYPE_SIZE, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, LEVELS, SCHEME)]
     assert found == [
         VK_FORMATS[fmt],
-        2 if fmt in TEXEL else 1,
+        (4 if fmt.startswith(("E", "R32")) else 2) if fmt in TEXEL else 1,
         5,
         3,
         0,
@@ -57,7 +65,17 @@ def test_the_header(tmp_path, fmt):
 @pytest.mark.parametrize(
     ("fmt", "model", "sides", "plane", "samples"),
     [
+        ("R16G16_UNORM", 1, 0, 4, [(0, 15, 0, 0, 0xFFFF), (16, 15, 1, 0, 0xFFFF)]),
+        ("R16G16_UINT", 1, 0, 4, [(0, 15, 0, 0, 1), (16, 15, 1, 0, 1)]),
+        ("R16G16_SFLOAT", 1, 0, 4, [(0, 15, 0xC0, MINUS_ONE, ONE), (16, 15, 0xC1, MINUS_ONE, ONE)]),
+        ("R32G32_SFLOAT", 1, 0, 8, [(32 * i, 31, 0xC0 + i, MINUS_ONE, ONE) for i in range(2)]),
+        ("R16G16B16_SFLOAT", 1, 0, 6, [(16 * i, 15, 0xC0 + i, MINUS_ONE, ONE) for i in range(3)]),
         ("R16G16B16A16_SFLOAT", 1, 0, 8, [(16 * i, 15, 0xC0 + (i, 15)[i == 3], MINUS_ONE, ONE) for i in range(4)]),
+        (
+            "E5B9G9R9_UFLOAT_PACK32", 1, 0, 4,
+            [pair for i in range(3) for pair in ((9 * i, 8, i, 0, 8448), (27, 4, 0x20 + i, 15, 31))],
+        ),
+        ("BC6H_UFLOAT_BLOCK", 133, 0x303, 16, [(0, 127, 0x80, 0, ONE)]),
         ("ASTC_4x4_SFLOAT_BLOCK", 162, 0x303, 16, [(0, 127, 0xC0, MINUS_ONE, ONE)]),
     ],
 )  # fmt: skip
@@ -76,7 +94,7 @@ def test_the_data_format_descriptor(tmp_path, fmt, model, sides, plane, samples)
 
 @pytest.mark.parametrize("change", [{"fmt": "R8_UNORM"}, {"width": 0}, {"height": 16385}, {"data": b"\0" * 61}])
 def test_what_does_not_fit_is_a_value_error(tmp_path, change):
-    fields = {"data": _data("R16G16B16A16_SFLOAT"), "width": 5, "height": 3, "fmt": "R16G16B16A16_SFLOAT", **change}
+    fields = {"data": _data("R16G16_UNORM"), "width": 5, "height": 3, "fmt": "R16G16_UNORM", **change}
     with pytest.raises(ValueError):
         write_ktx2(tmp_path / "a.ktx2", **fields)
     assert os.listdir(tmp_path) == []

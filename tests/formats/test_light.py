@@ -1,4 +1,4 @@
-"""Light in DDS files: every code of every format, and what is refused."""
+"""Light in KTX2 and DDS files: every code of every format, orientations, supercompression, and what is refused."""
 
 import struct
 import sys
@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 import texture2ddecoder
 from builders.checks import error_of
-from builders.textures import make_dds
+from builders.textures import make_dds, make_ktx2
 
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
-from wlm.formats.hdr_blocks import encode_bc6h
+from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, encode_bc6h
+from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.light import read_light
 
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
+FORMAT, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, PAIRS_BYTES = 12, 20, 24, 28, 32, 36, 44, 48, 60
+LEVEL, LEVEL_BYTES, LEVEL_SIZE = 80, 88, 96
 DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2, DXGI, DIMENSION, MISC, ARRAY = (
     4,
     12,
@@ -51,43 +54,48 @@ def _exponents(codes, mantissa, bias=15):
     return np.where(e == 31, np.where(m == 0, np.inf, np.nan), values)
 
 
-def test_every_code_of_11_11_10(tmp_path):
+@pytest.mark.parametrize("make", [lambda *a: make_ktx2(122, *a[:2], [a[2]]), lambda *a: make_dds(26, *a)])
+def test_every_code_of_11_11_10(tmp_path, make):
     red = np.arange(2048).reshape(32, 64)
     green, blue = red[::-1], red[:, ::-1] % 1024
     words = (red | green << 11 | blue << 22).astype("<u4")
-    pixels, names = _read(tmp_path / "a", make_dds(26, 64, 32, words.tobytes()))
+    pixels, names = _read(tmp_path / "a", make(64, 32, words.tobytes()))
     assert names == RGB
     expected = np.stack([_exponents(red, 6), _exponents(green, 6), _exponents(blue, 5)], -1)
     np.testing.assert_array_equal(pixels, expected)
 
 
-def test_every_code_of_a_shared_exponent(tmp_path):
+@pytest.mark.parametrize("make", [lambda *a: make_ktx2(123, *a[:2], [a[2]]), lambda *a: make_dds(67, *a)])
+def test_every_code_of_a_shared_exponent(tmp_path, make):
     exponent, red = np.mgrid[:32, :512]
     green, blue = 511 - red, (red * 7 + exponent) % 512
     words = (red | green << 9 | blue << 18 | exponent << 27).astype("<u4")
-    pixels, names = _read(tmp_path / "a", make_dds(67, 512, 32, words.tobytes()))
+    pixels, names = _read(tmp_path / "a", make(512, 32, words.tobytes()))
     assert names == RGB
     np.testing.assert_array_equal(pixels, np.stack([red, green, blue], -1) * 2.0 ** (exponent - 24.0)[..., None])
     assert pixels.max() == 65408  # the largest of the format
 
 
 @pytest.mark.parametrize(
-    ("channels", "kind", "codes"),
+    ("channels", "kind", "number", "others"),
     [
-        (4, "<f2", [(10, b"DX10"), (0, struct.pack("<I", 113))]),
-        (3, "<f4", [(6, b"DX10")]),
-        (4, "<f4", [(2, b"DX10"), (0, struct.pack("<I", 116))]),
+        (3, "<f2", 90, []),
+        (4, "<f2", 97, [(10, b"DX10"), (0, struct.pack("<I", 113))]),
+        (3, "<f4", 106, [(6, b"DX10")]),
+        (4, "<f4", 109, [(2, b"DX10"), (0, struct.pack("<I", 116))]),
     ],
 )
-def test_plain_floats(tmp_path, channels, kind, codes):
+def test_plain_floats(tmp_path, channels, kind, number, others):
     if kind == "<f2":
         values = np.arange(65536, dtype=np.uint16).view("<f2").reshape(128, 512)
     else:
         values = np.geomspace(1e-45, 3e38, 65536, dtype="<f4").reshape(128, 512)
         values[0, :5] = np.nan, np.inf, -np.inf, -0.0, -1.5
     light = np.stack([np.roll(values, 5 * i, 1) for i in range(channels)], -1)
-    for dxgi, code in codes:
-        pixels, names = _read(tmp_path / "a", make_dds(dxgi, 512, 128, light.tobytes(), code))
+    files = [make_ktx2(number, 512, 128, [light.tobytes()])]
+    files += [make_dds(dxgi, 512, 128, light.tobytes(), code) for dxgi, code in others]
+    for content in files:
+        pixels, names = _read(tmp_path / "a", content)
         assert names == (RGB, RGBA)[channels == 4]
         np.testing.assert_array_equal(pixels, light.astype(np.float32))
 
@@ -96,63 +104,135 @@ def test_bc6h_by_two_decoders(tmp_path):
     light = np.random.default_rng(3).random((8, 12, 3)).repeat(4, 0).repeat(3, 1).astype(np.float16)
     blocks = encode_bc6h(light, "slow", "test")
     bgra = np.frombuffer(texture2ddecoder.decode_bc6(blocks, 36, 32), np.uint8).reshape(32, 36, 4)
-    pixels, names = _read(tmp_path / "a", make_dds(95, 34, 31, blocks))
-    assert names == RGB and pixels.shape == (31, 34, 3)
-    assert abs(255 * pixels.clip(0, 1) - bgra[:31, :34, 2::-1]).max() <= 1.0
-    assert abs(pixels - light[:31, :34]).mean() < 0.02
+    for content in (make_ktx2(143, 34, 31, [blocks]), make_dds(95, 34, 31, blocks)):
+        pixels, names = _read(tmp_path / "a", content)
+        assert names == RGB and pixels.shape == (31, 34, 3)
+        assert abs(255 * pixels.clip(0, 1) - bgra[:31, :34, 2::-1]).max() <= 1.0
+        assert abs(pixels - light[:31, :34]).mean() < 0.02
 
 
 def test_bc6h_reaches_the_ends_and_goes_below_zero(tmp_path):
     light = _light(8, 8)
     light[:4, :4] = 65504
     blocks = encode_bc6h(light, "slow", "test")
-    pixels = _read(tmp_path / "a", make_dds(95, 8, 8, blocks))[0]
+    pixels = _read(tmp_path / "a", make_ktx2(143, 8, 8, [blocks]))[0]
     assert (pixels[:4, :4] > 65000).all() and np.isfinite(pixels).all()
     draw = np.random.default_rng(0).integers(0, 256, (64, 16), np.uint8)
-    pixels = _read(tmp_path / "a", make_dds(96, 32, 32, draw.tobytes()))[0]
-    np.testing.assert_array_equal(pixels, imagecodecs.bcn_decode(draw.tobytes(), -6, shape=(32, 32, 3)))
-    assert pixels.min() < -100 and pixels.max() > 100
+    for content in (make_ktx2(144, 32, 32, [draw.tobytes()]), make_dds(96, 32, 32, draw.tobytes())):
+        pixels = _read(tmp_path / "a", content)[0]
+        np.testing.assert_array_equal(pixels, imagecodecs.bcn_decode(draw.tobytes(), -6, shape=(32, 32, 3)))
+        assert pixels.min() < -100 and pixels.max() > 100
+
+
+@pytest.mark.parametrize("block", ASTC_BLOCKS[::4])
+def test_astc_of_high_dynamic_range(tmp_path, block):
+    y, x = np.mgrid[:31, :50]
+    light = np.stack([100 * y + 1, 30 * x + 1, 0 * x + 500], -1).astype(np.float16)
+    blocks = astc(block, ASTC_MEDIUM, "test").encode(light)
+    number = 1000066000 + ASTC_BLOCKS.index(block)
+    pixels, names = _read(tmp_path / "a", make_ktx2(number, 50, 31, [blocks]))
+    assert names == RGB and pixels.shape == (31, 50, 3)
+    assert abs(pixels - light).mean() < 60 and abs(pixels - light).max() < 900
 
 
 def test_what_the_atlas_exports_is_read(tmp_path):
     light = _light(8, 8, 4)
+    write_ktx2(tmp_path / "a", light[..., :3].tobytes(), 8, 8, "R16G16B16_SFLOAT")
+    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light[..., :3])
     write_dds(tmp_path / "a", light.tobytes(), 8, 8, fmt="R16G16B16A16_FLOAT")
     np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light)
     blocks = encode_bc6h(light[..., :3], "fast", "test")
+    write_ktx2(tmp_path / "a", blocks, 8, 8, "BC6H_UFLOAT_BLOCK")
     write_dds(tmp_path / "b", blocks, 8, 8, fmt="BC6H_UF16")
-    decoded = imagecodecs.bcn_decode(blocks, 6, shape=(8, 8, 3))
-    np.testing.assert_array_equal(read_light(tmp_path / "b")[0], decoded)
+    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], read_light(tmp_path / "b")[0])
 
 
 def test_a_picture_of_several_bands_is_one(tmp_path, monkeypatch):
     blocks = np.random.default_rng(0).integers(0, 256, (8, 8, 16), np.uint8).tobytes()
-    whole = _read(tmp_path / "a", make_dds(95, 31, 29, blocks))[0]
+    whole = _read(tmp_path / "a", make_ktx2(143, 31, 29, [blocks]))[0]
     monkeypatch.setattr("wlm.formats.float_texels._BAND", 300)
-    np.testing.assert_array_equal(_read(tmp_path / "a", make_dds(95, 31, 29, blocks))[0], whole)
+    np.testing.assert_array_equal(_read(tmp_path / "a", make_ktx2(143, 31, 29, [blocks]))[0], whole)
 
 
-def test_the_largest_level_alone_is_read(tmp_path):
+@pytest.mark.parametrize("scheme", [0, 2, 3])
+def test_the_largest_level_alone_is_read(tmp_path, scheme):
     levels = [_light(4 >> i, 6 >> i, 4).tobytes() if i < 2 else bytes(8) for i in range(3)]
-    pixels, names = _read(tmp_path / "a", make_dds(10, 6, 4, b"".join(levels), mips=3))
+    pixels, names = _read(tmp_path / "a", make_ktx2(97, 6, 4, levels, scheme))
     assert names == RGBA
     np.testing.assert_array_equal(pixels, _light(4, 6, 4))
+    pixels = _read(tmp_path / "a", make_dds(10, 6, 4, b"".join(levels), mips=3))[0]
+    np.testing.assert_array_equal(pixels, _light(4, 6, 4))
+
+
+@pytest.mark.parametrize("orientation", ["rd", "ru", "ld", "lu"])
+def test_the_first_row_is_the_top(tmp_path, orientation):
+    light = _light(5, 3)
+    stored = light[:: 1 if orientation[1] == "d" else -1, :: 1 if orientation[0] == "r" else -1]
+    pairs = {"KTXorientation": orientation, "KTXwriter": "a test"}
+    pixels = _read(tmp_path / "a", make_ktx2(90, 3, 5, [stored.tobytes()], pairs=pairs))[0]
+    np.testing.assert_array_equal(pixels, light)
 
 
 def test_kinds_are_told_by_content(tmp_path):
     light = _light(3, 5).astype(np.float32)
     write_exr(tmp_path / "a.hdr", light, half=False)
     np.testing.assert_array_equal(read_light(tmp_path / "a.hdr")[0], light)
-    (tmp_path / "a.exr").write_bytes(make_dds(6, 5, 3, light.tobytes()))
+    (tmp_path / "a.exr").write_bytes(make_ktx2(106, 5, 3, [light.tobytes()]))
     np.testing.assert_array_equal(read_light(tmp_path / "a.exr")[0], light)
     for content, found in (
         (b"", "other content"),
         (b"\x89PNG\r\n\x1a\n", "a PNG, whose encoding of light is unknown"),
-        (b"\xabKTX 20\xbb\r\n\x1a\n", "a KTX file"),
+        (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
     ):
         (tmp_path / "a.exr").write_bytes(content)
         message = error_of(read_light, tmp_path / "a.exr")
-        expected = "expected a lightmap, EXR, Radiance (.hdr) or DDS, found "
+        expected = "expected a lightmap, EXR, Radiance (.hdr), KTX2 or DDS, found "
         assert message == f"{tmp_path / 'a.exr'}: {expected}{found}"
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
+        (FORMAT, 83, "BC6H or ASTC SFLOAT, found 83 (R16G16_SFLOAT)"),
+        (FORMAT, 9999, "found 9999"),
+        (FORMAT, 97, "byteLength of level 0: expected 120, of 5 x 3 R16G16B16A16_SFLOAT, found 90"),
+        (WIDTH, 0, "expected at least one texel, found 0 x 3"),
+        (HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
+        (HEIGHT, 2**31, "65536 along a side, found 5 x 2147483648"),
+        (WIDTH, 2**16, "byteLength of level 0: expected 1179648"),
+        (DEPTH, 2, "pixelDepth: expected 0 (no volume), found 2"),
+        (LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
+        (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
+        (SCHEME, 1, "supercompressionScheme: expected none (0), zstd (2) or zlib (3), found 1"),
+        (SCHEME, 2, "cannot unpack zstd"),
+        (SCHEME, 3, "level 0: Error -3 while decompressing"),
+        (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
+        (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
+        (PAIRS_BYTES, 2**31, "the key/value data: the file is cut short"),
+        (104 + 14, 2, "expected linear light (transfer 1), found 2"),
+    ],
+)
+def test_a_wrong_field_of_ktx2_is_named(tmp_path, at, value, words):
+    content = bytearray(make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs={"KTXwriter": "a test"}))
+    content[at : at + 4] = struct.pack("<I", value) if at < 104 else bytes([value]) + content[at + 1 : at + 4]
+    (tmp_path / "a.ktx2").write_bytes(content)
+    message = error_of(read_light, tmp_path / "a.ktx2")
+    assert message.startswith(f"{tmp_path / 'a.ktx2'}: ") and words in message
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        ({"KTXorientation": "rdi"}, "KTXorientation: expected rd, ru, ld or lu, found b'rdi'"),
+        ({"KTXswizzle": "bgra"}, "KTXswizzle: expected rgba, found b'bgra'"),
+    ],
+)
+def test_other_orders_are_refused(tmp_path, pairs, words):
+    content = make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs={"KTXorientation": "rd", "KTXswizzle": "rgb1"})
+    np.testing.assert_array_equal(_read(tmp_path / "a", content)[0], _light(3, 5))
+    (tmp_path / "a.ktx2").write_bytes(make_ktx2(90, 5, 3, [_light(3, 5).tobytes()], pairs=pairs))
+    assert words in error_of(read_light, tmp_path / "a.ktx2")
 
 
 @pytest.mark.parametrize(
@@ -182,11 +262,24 @@ def test_a_wrong_field_of_dds_is_named(tmp_path, at, value, words):
     assert message.startswith(f"{tmp_path / 'a.dds'}: ") and words in message
 
 
-def test_a_shorter_file_is_refused(tmp_path):
-    path, whole = tmp_path / "a", make_dds(10, 5, 3, _light(3, 5, 4).tobytes())
+@pytest.mark.parametrize("scheme", [0, 2, 3, None])
+def test_a_shorter_file_is_refused(tmp_path, scheme):
+    data, path = _light(3, 5, 4).tobytes(), tmp_path / "a"
+    whole = make_dds(10, 5, 3, data) if scheme is None else make_ktx2(97, 5, 3, [data], scheme)
     for length in range(0, len(whole), 3):
         path.write_bytes(whole[:length])
         assert error_of(read_light, path).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("scheme", [2, 3])
+def test_supercompressed_data_of_another_size_is_refused(tmp_path, scheme):
+    path = tmp_path / "a.ktx2"
+    for size in (89, 91, 1 << 20):
+        content = bytearray(make_ktx2(90, 5, 3, [bytes(size)], scheme))
+        struct.pack_into("<Q", content, LEVEL_SIZE, 90)
+        path.write_bytes(content)
+        message = error_of(read_light, path)
+        assert "cannot unpack" in message or "level 0: expected 90 bytes once unpacked" in message
 
 
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import OpenEXR
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
-from builders.textures import make_dds
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from benchmarks import Row, write_json
@@ -20,7 +20,7 @@ from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.coarse import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
 from wlm.smoke.scene import Scene
 
@@ -76,7 +76,12 @@ def _textures(folder: Path) -> None:
     (folder / "plain.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
     words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
     blocks = words.tobytes()[: 9 * 16]
+    half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]
     for name, content in {
+        "packed-zstd.ktx2": make_ktx2(122, *size, [words[0].tobytes()], 2, {"KTXwriter": "wlm"}),
+        "bc6h-zlib.ktx2": make_ktx2(143, *size, [blocks], 3, {"KTXorientation": "ru", "KTXswizzle": "rgba"}),
+        "half-mips.ktx2": make_ktx2(97, *size, half),
+        "astc.ktx2": make_ktx2(1000066000, *size, [blocks]),
         "shared.dds": make_dds(67, *size, words[0].tobytes()),
         "bc6h.dds": make_dds(96, *size, blocks),
         "float-legacy.dds": make_dds(0, *size, _pixels(4).tobytes(), b"\x74\0\0\0"),

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 
 from wlm.formats.exr import write_exr
@@ -143,6 +144,15 @@ def _wide_dds() -> bytes:
     return content
 
 
+def _ktx2(side: int, texels: bytes, stored: int | None = None) -> Write:
+    """A square of 11-11-10 under zstd, of other texels than its header states."""
+    content = bytearray(corpus("packed-zstd.ktx2")()[0])
+    packed = imagecodecs.zstd_encode(texels)
+    struct.pack_into("<2I", content, 20, side, side)
+    struct.pack_into("<3Q", content, 80, len(content), stored or len(packed), 4 * side * side)
+    return _sparse(content + packed, len(content) + (stored or len(packed)))
+
+
 def _zip_bomb(name: str, header: str, size: int, **others: np.ndarray) -> Write:
     """A `.npz` with a member of `size` zeros behind a header: a deflated megabyte of them, again and again."""
 
@@ -251,6 +261,9 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
         ["volume-nvdb"],
         lambda path: path.write_bytes(gzip.decompress((_FILES / "bbox-700.nvdb.gz").read_bytes())),
     ),
+    "wide.ktx2": (["ktx2"], _ktx2(16384, b"\0" * 16)),
+    "more.ktx2": (["ktx2"], _ktx2(64, bytes(64 << 20))),
+    "sparse.ktx2": (["ktx2"], _ktx2(4096, b"", 1 << 40)),
     "wide.hdr": (["radiance"], _text("#?RADIANCE\n\n-Y 16384 +X 16384\n" + "abcd\1\1\1\x7f\1\1\1\x7f" * 16384)),
     "header.hdr": (["radiance"], _sparse(b"#?RADIANCE\n")),
     "wide.dds": (["dds"], _sparse(_wide_dds())),
@@ -276,6 +289,7 @@ HOSTILE: dict[str, tuple[Sequence[str], Write]] = {
             (".safetensors", "smoke-network"),
             (".exr", "exr"),
             (".hdr", "radiance"),
+            (".ktx2", "ktx2"),
             (".dds", "dds"),
             (".gltf", "gltf"),
             (".obj", "obj"),

@@ -34,7 +34,7 @@ from wlm.inspection import inspect
 from wlm.inspection.finding import UNREADABLE
 from wlm.probe.data import load_positions
 from wlm.smoke.data import load_frames, read_shaded
-from wlm.smoke.flipbook.textures import read_flipbook
+from wlm.smoke.flipbook.book import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
@@ -42,7 +42,7 @@ from . import models
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
 from .mutate import corrupt, vary_json, vary_numbers, vary_text
 from .reader import Reader, check_finite, corpus
-from .textures import vary_dds, vary_radiance
+from .textures import vary_dds, vary_ktx2, vary_radiance
 
 _PROFILES = Path(__file__).resolve().parents[2] / "configs"
 
@@ -341,6 +341,13 @@ _ALL = (
     *models.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
+    Reader(
+        "ktx2",
+        "a.ktx2",
+        corpus("packed-zstd.ktx2", "bc6h-zlib.ktx2", "half-mips.ktx2", "astc.ktx2"),
+        vary_ktx2,
+        _light_file,
+    ),
     Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
     Reader(

@@ -1,7 +1,10 @@
 """Changes inside pictures of light: headers, run-length codes, and what lies under zstd and zlib."""
 
 import struct
+import zlib
 from random import Random
+
+import imagecodecs
 
 from .mutate import corrupt, vary_numbers, vary_text
 
@@ -41,6 +44,40 @@ def vary_radiance(draw: Random, data: bytes) -> bytes:
             result[at : at + len(piece)] = piece
         body = corrupt(draw, bytes(result)) if kind == 3 else bytes(result)
     return head + b"\n\n" + size + b"\n" + body
+
+
+_KTX2_WORDS = [(at, 4) for at in range(12, 64, 4)] + [(at, 8) for at in range(64, 104, 8)] + [(116, 4)]
+_FORMATS = (0, 37, 90, 97, 106, 109, 122, 123, 143, 144, 145, 1000066000, 1000066013)
+_SCHEMES = {0: bytes, 2: imagecodecs.zstd_encode, 3: zlib.compress}
+_UNPACK = {0: bytes, 2: imagecodecs.zstd_decode, 3: zlib.decompress}
+
+
+def vary_ktx2(draw: Random, data: bytes) -> bytes:
+    """Changes words of the header, or the texels, which are packed again, some to another length than is stated."""
+    kind = draw.randrange(4)
+    if kind == 0:
+        return vary_numbers(draw, data, _KTX2_WORDS)
+    result = bytearray(data)
+    if kind == 1:
+        # Bytes of texels stay, so that sizes that fit them get further.
+        struct.pack_into("<I", result, 12, draw.choice(_FORMATS))
+        sides = draw.choice(((1, 120), (120, 1), (10, 12), (5, 24), (65536, 65536), (16384, 16384), (60, 2), (0, 0)))
+        struct.pack_into("<2I", result, 20, *sides)
+        return bytes(result)
+    start, stored, size = struct.unpack_from("<3Q", data, 80)
+    scheme = struct.unpack_from("<I", data, 44)[0]
+    texels = corrupt(draw, _UNPACK[scheme](data[start : start + stored]))
+    if kind == 2:
+        texels = texels[:size].ljust(size, b"\xff")
+    elif draw.random() < 0.3:
+        texels = bytes(draw.choice((size, 1 << 20, 1 << 26)))
+    scheme = draw.choice((scheme, *_SCHEMES))
+    packed = _SCHEMES[scheme](texels)
+    struct.pack_into("<I", result, 44, scheme)
+    struct.pack_into("<2Q", result, 80, len(result), len(packed))
+    if draw.random() < 0.2:
+        struct.pack_into("<Q", result, 96, len(texels))
+    return bytes(result) + packed
 
 
 _DDS_WORDS = [(at, 4) for at in (4, 8, 12, 16, 20, 24, 28, 76, 80, 84, 88, 108, 112, 128, 132, 136, 140, 144)]

@@ -19,7 +19,7 @@ SPLITS = [None, 1]
 def _run(position: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str, **options) -> Raster:
     space = "uv" if position.shape[1] == 2 else "clip"
     triangle = array(np.reshape(triangle, (-1, 3)).astype(np.int32), int, device)
-    drawing = Rasterizer(triangle, height, width, space=space, coverage=True, **options)
+    drawing = Rasterizer(triangle, height, width, space=space, coverage=True, derivative=True, **options)
     return drawing.run(array(position.astype(np.float32), float, device))
 
 
@@ -76,8 +76,23 @@ def test_against_reference(device: str, kind: str, size: tuple[int, int], split:
     np.testing.assert_allclose(got.barycentric.numpy()[hit], share[hit][:, :2], atol=1e-6)
     np.testing.assert_allclose(got.depth.numpy()[hit], depth[hit], rtol=1e-5, atol=1e-6)
     missed = sure & (visible < 0)
-    for values in (got.barycentric, got.depth):
+    for values in (got.barycentric, got.depth, got.derivative):
         assert not values.numpy()[missed].any()
+
+
+@pytest.mark.parametrize("kind", ["perspective", "behind", "uv"])
+def test_derivative(device: str, kind: str):
+    """Derivatives of the barycentrics per pixel, against autograd of the reference."""
+    size = (33, 50)
+    position, triangle = _scene(kind)
+    got = _run(position, triangle, *size, device)
+    visible = got.triangle.numpy()
+    hit = visible >= 0
+    pixels = plain.pixel_centres(*size)[torch.tensor(hit)].requires_grad_()
+    b = plain.corner_weights(exact(position), torch.tensor(triangle)[visible[hit]], pixels, *size)
+    share = b / b.sum(-1, keepdim=True)
+    slopes = [torch.autograd.grad(share[:, i].sum(), pixels, retain_graph=True)[0] for i in range(2)]
+    np.testing.assert_allclose(got.derivative.numpy()[hit], torch.cat(slopes, 1), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("split", SPLITS)
@@ -351,7 +366,7 @@ def test_splitting_changes_nothing(device: str):
     want = _run(position, triangle, 70, 90, device, split=10**9)
     for split in (0, 1, 64, 1000):
         got = _run(position, triangle, 70, 90, device, split=split)
-        for name in ("triangle", "barycentric", "depth", "coverage"):
+        for name in ("triangle", "barycentric", "depth", "derivative", "coverage"):
             np.testing.assert_array_equal(getattr(got, name).numpy(), getattr(want, name).numpy(), name)
 
 

@@ -10,7 +10,7 @@ import pytest
 from builders.checks import error_of
 from builders.small_sets import load_sheet as load
 from builders.small_sets import sheet_from_arrays as from_arrays
-from builders.textures import make_dds
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.formats.exr import write_exr
@@ -359,7 +359,7 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .dds), found neither" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found neither" in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -380,7 +380,7 @@ def test_plain_folder_may_mix_formats(tmp_path):
     write_exr(tmp_path / "m_1h.exr", np.concatenate([frames[0], alpha], -1))
     (tmp_path / "m_2h.hdr").write_bytes(imagecodecs.rgbe_encode(frames[1], header=True))
     texels = np.concatenate([frames[2], alpha], -1, dtype=np.float16)
-    (tmp_path / "m_3h.dds").write_bytes(make_dds(10, WIDTH, HEIGHT, texels.tobytes()))
+    (tmp_path / "m_3h.ktx2").write_bytes(make_ktx2(97, WIDTH, HEIGHT, [texels.tobytes()], scheme=2))
     (tmp_path / "m_4h.DDS").write_bytes(make_dds(6, WIDTH, HEIGHT, frames[3].astype("<f4").tobytes()))
     lightmaps = load(tmp_path)
     expected = frames.copy()

@@ -380,7 +380,7 @@ def test_twins_take_the_same_arguments(name: str):
     """A reader can put one in the place of the other; culling and what else is drawn are the kernels' alone."""
     own = inspect.signature(getattr(ops, name)).parameters
     twin = inspect.signature(getattr(plain, name)).parameters
-    extra = {"cull", "coverage"} if name.startswith("rasterize") else set()
+    extra = {"cull", "derivative", "coverage"} if name.startswith("rasterize") else set()
     assert [p for p in own if p not in extra] == [*twin]
     assert all(own[p].default == twin[p].default for p in twin)
 

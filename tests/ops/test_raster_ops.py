@@ -54,7 +54,7 @@ def test_uv_space(device: str):
     clip, triangle, uv = _mesh(device)
     uv.requires_grad_()
     attribute = clip.requires_grad_()
-    raster = ops.rasterize_uv(uv, triangle, *SIZE, coverage=True)
+    raster = ops.rasterize_uv(uv, triangle, *SIZE, derivative=True, coverage=True)
     assert raster.coverage.dtype == torch.int32 and raster.coverage.max() == 1
     assert torch.equal(raster.coverage > 0, raster.triangle >= 0) and not raster.depth.any()
     # Interpolating the layout itself gives each texel's centre.
@@ -74,11 +74,11 @@ def test_only_what_is_asked_for(device: str):
     """Outputs that weren't asked for are None; those without a gradient say so."""
     clip, triangle, _ = _mesh(device)
     raster = ops.rasterize(clip.requires_grad_(), triangle, *SIZE)
-    assert raster.coverage is None
+    assert raster.derivative is None and raster.coverage is None
     assert raster.barycentric.requires_grad and not raster.depth.requires_grad
     assert raster.triangle.dtype == torch.int32 and raster.barycentric.shape == (*SIZE, 2)
-    full = ops.rasterize(clip, triangle.int(), *SIZE, coverage=True, cull=True)
-    assert full.coverage.shape == SIZE and torch.equal(full.triangle, raster.triangle)
+    full = ops.rasterize(clip, triangle.int(), *SIZE, derivative=True, coverage=True, cull=True)
+    assert full.derivative.shape == (*SIZE, 4) and torch.equal(full.triangle, raster.triangle)
     turned = ops.rasterize(clip, triangle.flip(1), *SIZE, cull=True)
     assert (turned.triangle == -1).all()
 

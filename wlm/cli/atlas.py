@@ -46,7 +46,7 @@ _Lights = Annotated[
     Path | None,
     typer.Argument(
         metavar="LIGHTMAPS",
-        help="Lightmap (EXR, HDR, DDS, PNG), a folder of them, a .lmbake, or a .json that lists them; default "
+        help="Lightmap (EXR, HDR, KTX2, DDS, PNG), a folder of them, a .lmbake, or a .json that lists them; default "
         "those that the materials name.",
     ),
 ]

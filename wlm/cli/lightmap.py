@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .dds), or folders of Unity's states."
+        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity's states."
     ),
 ]
 _Times = Annotated[

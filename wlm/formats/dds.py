@@ -6,7 +6,6 @@ Direct3D 9's float formats.
 """
 
 import os
-import re
 import struct
 
 import numpy as np
@@ -21,20 +20,39 @@ DXGI_FORMATS = {
     "R32G32B32A32_FLOAT": 2,
     "R16G16B16A16_FLOAT": 10,
     "R16G16B16A16_UINT": 12,
+    "R10G10B10A2_UNORM": 24,
     "R11G11B10_FLOAT": 26,
     "R8G8B8A8_UNORM": 28,
+    "R16G16_FLOAT": 34,
     "R16G16_UNORM": 35,
     "R16G16_UINT": 36,
     "R8G8_UNORM": 49,
     "R8_UNORM": 61,
     "R9G9B9E5_SHAREDEXP": 67,
     "BC6H_UF16": 95,
+    "BC6H_SF16": 96,
     "BC7_UNORM": 98,
+    "BC7_UNORM_SRGB": 99,
 }
 """Formats that can be written, with their DXGI numbers. BC formats have 16 bytes per block of 4 x 4 texels. The others
-store the channels of a texel in order, little-endian."""
+store the channels of a texel in order, little-endian, and R10G10B10A2 in one word with red in the lowest bits."""
 
 _BLOCK_BYTES = 16
+# Bytes of a texel, for the formats without blocks.
+_TEXEL_BYTES = {
+    "R32G32B32A32_FLOAT": 16,
+    "R16G16B16A16_UINT": 8,
+    "R16G16B16A16_FLOAT": 8,
+    "R10G10B10A2_UNORM": 4,
+    "R11G11B10_FLOAT": 4,
+    "R8G8B8A8_UNORM": 4,
+    "R16G16_FLOAT": 4,
+    "R16G16_UNORM": 4,
+    "R16G16_UINT": 4,
+    "R8G8_UNORM": 2,
+    "R8_UNORM": 1,
+    "R9G9B9E5_SHAREDEXP": 4,
+}
 MOST_SIDE = 16384
 """Largest side of a 2D texture in Direct3D 11 and 12, in texels."""
 _MAX_DEPTH = 2048
@@ -122,8 +140,8 @@ def write_dds(
     if depth > 1 and not volume:
         raise ValueError(f"depth: expected 1 for a 2D texture, got {depth}")
     size_flag, size = _LINEAR_SIZE, slice_bytes
-    if texel := _texel_bytes(fmt):
-        size_flag, size = _PITCH, width * texel
+    if fmt in _TEXEL_BYTES:
+        size_flag, size = _PITCH, width * _TEXEL_BYTES[fmt]
     header = _HEADER.pack(
         MAGIC,
         _HEADER_SIZE,
@@ -147,13 +165,10 @@ def write_dds(
     atomic_write(path, [header, blocks])
 
 
-def _texel_bytes(fmt: str) -> int:
-    """Returns the bytes of a texel from the bits that the name of its format states; 0 for a format of blocks."""
-    return sum(map(int, re.findall(r"[RGBAE](\d+)", fmt.partition("_")[0]))) // 8 if fmt.startswith("R") else 0
-
-
 def _slice_bytes(fmt: str, width: int, height: int) -> int:
-    return width * height * _texel_bytes(fmt) or -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
+    if fmt in _TEXEL_BYTES:
+        return width * height * _TEXEL_BYTES[fmt]
+    return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
 
 
 def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:

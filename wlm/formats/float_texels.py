@@ -5,6 +5,7 @@ packages decode blocks.
 """
 
 import os
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.hdr_blocks import decode_bc6h
+from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, decode_bc6h, need
 from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
@@ -21,6 +22,7 @@ EXTRA = "atlas"
 
 _BAND = 1 << 20  # texels decoded at once, which bounds the temporary memory
 _HALF_BYTES = 2
+_ASTC_LOCK = threading.Lock()  # a context decodes one picture at a time
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,18 @@ def decode_texels(
     return pixels
 
 
+def unpack_zstd(path: str | os.PathLike[str], data: bytes, size: int) -> bytes:
+    """Decompresses zstd to at most `size` bytes.
+
+    Raises:
+        WlmError: The data is damaged or larger, or the package is missing.
+    """
+    try:
+        return need("imagecodecs", EXTRA).zstd_decode(data, out=size)
+    except (WlmError, RuntimeError, ValueError) as error:
+        raise WlmError(f"{path}: cannot unpack zstd: {error}") from error
+
+
 def _plain(data: memoryview, rows: int, columns: int, *, dtype: str) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(rows, columns, -1)
 
@@ -118,6 +132,13 @@ def _bc6h(data: memoryview, rows: int, columns: int, *, signed: bool) -> np.ndar
     return decode_bc6h(bytes(data), rows, columns, EXTRA, signed)
 
 
+def _astc(data: memoryview, rows: int, columns: int, *, block: tuple[int, int]) -> np.ndarray:
+    codec = astc(block, ASTC_MEDIUM, EXTRA)
+    with _ASTC_LOCK:
+        return codec.decode(bytes(data), rows, columns)
+
+
+HALF_RGB = Layout(3, 6, partial(_plain, dtype="<f2"))
 HALF_RGBA = Layout(4, 8, partial(_plain, dtype="<f2"))
 FLOAT_RGB = Layout(3, 12, partial(_plain, dtype="<f4"))
 FLOAT_RGBA = Layout(4, 16, partial(_plain, dtype="<f4"))
@@ -125,3 +146,4 @@ PACKED = Layout(3, 4, _packed)
 SHARED = Layout(3, 4, _shared)
 BC6H_UNSIGNED = Layout(3, 16, partial(_bc6h, signed=False), (4, 4))
 BC6H_SIGNED = Layout(3, 16, partial(_bc6h, signed=True), (4, 4))
+ASTC = {block: Layout(3, 16, partial(_astc, block=block), block) for block in ASTC_BLOCKS}

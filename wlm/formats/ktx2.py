@@ -1,30 +1,84 @@
-"""Writing of KTX2 files without supercompression: 2D textures of ASTC blocks, and 3D textures of half floats.
+"""KTX2 files: writing of 2D textures (with mips) and 3D textures without supercompression, and reading of light.
 
-Sources: KTX file format specification 2.0; for the data format descriptor, Khronos Data Format specification 1.3, basic
-descriptor block.
+Only the largest mip of a 2D texture of light is read; arrays, cubes, volumes and formats of low range or of fewer than
+three channels are refused. Sources: KTX file format specification 2.0; for the data format descriptor, Khronos Data
+Format specification 1.3, basic descriptor block.
 """
 
+import math
 import os
 import struct
+from typing import BinaryIO
 
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats import float_texels as texels
 from wlm.formats.atomic import atomic_write
+from wlm.formats.deflate import inflate
+from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
+from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.reading import open_file
 
-VK_FORMATS = {"R16G16B16A16_SFLOAT": 97, "ASTC_4x4_SFLOAT_BLOCK": 1000066000}
-"""Formats that can be written, with their Vulkan numbers."""
+VK_FORMATS = {
+    "R16G16_UNORM": 77,
+    "R16G16_UINT": 81,
+    "R16G16_SFLOAT": 83,
+    "R16G16B16_SFLOAT": 90,
+    "R16G16B16A16_SFLOAT": 97,
+    "R32G32_SFLOAT": 103,
+    "E5B9G9R9_UFLOAT_PACK32": 123,
+    "BC6H_UFLOAT_BLOCK": 143,
+    "ASTC_4x4_SFLOAT_BLOCK": 1000066000,
+}
+"""Formats that can be written, with their Vulkan numbers: 16 or 32 bits per channel, RGB9E5, or blocks of 16 bytes."""
 
-_MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
+MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
 # length of the descriptor, of the key/value data and of the supercompression data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
 _LEVEL = struct.Struct("<3Q")  # a level's offset, length and length without supercompression
-_ASTC = "ASTC_4x4_SFLOAT_BLOCK"
-_BLOCK_BYTES, _TEXEL_BYTES, _CHANNEL_BITS = 16, 8, 16
+_BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
 _MAX_DEPTH = 2048  # slices, likewise
-_RGBSDA_MODEL, _ASTC_MODEL = 1, 162
+_CHANNELS = {
+    "R16G16_UNORM": 2,
+    "R16G16_UINT": 2,
+    "R16G16_SFLOAT": 2,
+    "R16G16B16_SFLOAT": 3,
+    "R16G16B16A16_SFLOAT": 4,
+    "R32G32_SFLOAT": 2,
+}
+_RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
-_SIGNED_FLOAT = 0xC0  # a sample's qualifiers
+_FLOAT, _SIGNED, _EXPONENT = 0x80, 0x40, 0x20  # a sample's qualifiers
+_SHARED = "E5B9G9R9_UFLOAT_PACK32"
+# The mantissa of 1 at the middle exponent, the middle exponent and the largest exponent (section 5.21).
+_SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
+
+# The header and the first entry of the level index, which describes the largest level.
+_READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
+_PAIRS_BYTES = 1 << 20  # limit of the key/value data
+_DESCRIPTOR_BYTES = 20  # the descriptor up to its transfer function
+_TRANSFERS = (0, 1)  # unspecified, linear
+
+_LAYOUTS: dict[int, tuple[str, Layout]] = {
+    90: ("R16G16B16_SFLOAT", texels.HALF_RGB),
+    97: ("R16G16B16A16_SFLOAT", texels.HALF_RGBA),
+    106: ("R32G32B32_SFLOAT", texels.FLOAT_RGB),
+    109: ("R32G32B32A32_SFLOAT", texels.FLOAT_RGBA),
+    122: ("B10G11R11_UFLOAT_PACK32", texels.PACKED),
+    123: ("E5B9G9R9_UFLOAT_PACK32", texels.SHARED),
+    143: ("BC6H_UFLOAT_BLOCK", texels.BC6H_UNSIGNED),
+    144: ("BC6H_SFLOAT_BLOCK", texels.BC6H_SIGNED),
+    **{
+        1000066000 + i: (f"ASTC_{block[0]}x{block[1]}_SFLOAT_BLOCK", texels.ASTC[block])
+        for i, block in enumerate(ASTC_BLOCKS)
+    },
+}
+_EXPECTED = "16 or 32-bit SFLOAT of RGB or RGBA, B10G11R11, E5B9G9R9, BC6H or ASTC SFLOAT"
+_NONE, _ZSTD, _ZLIB = 0, 2, 3
 
 
 def write_ktx2(
@@ -34,8 +88,8 @@ def write_ktx2(
 
     Args:
         path: The file to write; its folder must exist.
-        data: Rows from the top: RGBA texels of half floats, little-endian, or ceil(width / 4) * ceil(height / 4) blocks
-            of 16 bytes.
+        data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
+            blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
         width: Texels, 1 to 16384.
         height: Texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
@@ -54,7 +108,7 @@ def write_ktx2(
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
         raise ValueError(f"expected sides of 1 to {_MAX_SIDE} texels, got {width}x{height}")
-    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt == _ASTC):
+    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
         raise ValueError(f"depth: expected 0 to {_MAX_DEPTH} slices of texels, got {depth} of {fmt}")
     most = 0 if depth else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
@@ -67,8 +121,8 @@ def write_ktx2(
     pairs = _pair("KTXorientation", "rdi" if depth else "rd") + _pair("KTXwriter", "wlm")
     begin = _HEADER.size + _LEVEL.size * len(sizes)
     end = begin + len(descriptor) + len(pairs)
-    # A level starts at a multiple of the bytes of a texel or block; the smallest level comes first.
-    step = _BLOCK_BYTES if fmt == _ASTC else _TEXEL_BYTES
+    # A level starts at a multiple of both 4 and the bytes of a texel or block; the smallest level comes first.
+    step = math.lcm(4, _texel_bytes(fmt))
     index, pieces, place = [], [], end
     for level in reversed(range(len(sizes))):
         first = sum(sizes[:level])
@@ -77,9 +131,9 @@ def write_ktx2(
         pieces += [gap, data[first : first + sizes[level]]]
         place += len(gap) + sizes[level]
     header = _HEADER.pack(
-        _MAGIC,
+        MAGIC,
         VK_FORMATS[fmt],
-        1 if fmt == _ASTC else _CHANNEL_BITS // 8,
+        4 if fmt == _SHARED else _channel_bytes(fmt) if fmt in _CHANNELS else 1,
         width,
         height,
         *(depth, 0, 1, 1 + mips, 0),
@@ -92,10 +146,20 @@ def write_ktx2(
     return atomic_write(path, [header, *index, descriptor, pairs, *pieces])
 
 
+def _texel_bytes(fmt: str) -> int:
+    if fmt == _SHARED:
+        return 4
+    return _channel_bytes(fmt) * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
+
+
+def _channel_bytes(fmt: str) -> int:
+    return 4 if fmt.startswith("R32") else 2
+
+
 def _size(fmt: str, width: int, height: int) -> int:
-    if fmt == _ASTC:
-        return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
-    return width * height * _TEXEL_BYTES
+    if fmt in _CHANNELS or fmt == _SHARED:
+        return width * height * _texel_bytes(fmt)
+    return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
 
 
 def _pair(key: str, value: str) -> bytes:
@@ -106,15 +170,145 @@ def _pair(key: str, value: str) -> bytes:
 
 def _descriptor(fmt: str) -> bytes:
     """Returns the data format descriptor: its total length and one basic descriptor block."""
-    if fmt == _ASTC:
-        model, side, plane = _ASTC_MODEL, 3, _BLOCK_BYTES  # sides are stored less one
-        samples = [(0, 8 * _BLOCK_BYTES, 0)]
+    if fmt == _SHARED:
+        # The exponent is listed once for each channel.
+        shared = []
+        for i, channel in enumerate(_CHANNEL_IDS[:3]):
+            shared.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
+            shared.append(struct.pack("<H2B4x2I", 27, 4, channel | _EXPONENT, _SHARED_MIDDLE, _SHARED_MOST))
+        return _basic_block(_RGBSDA, 0, 4, shared)
+    if fmt in _CHANNELS:
+        model, side = _RGBSDA, 0
+        bits = 8 * _channel_bytes(fmt)
+        samples = [(bits * i, bits, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
     else:
-        model, side, plane = _RGBSDA_MODEL, 0, _TEXEL_BYTES
-        samples = [(_CHANNEL_BITS * i, _CHANNEL_BITS, channel) for i, channel in enumerate(_CHANNEL_IDS)]
-    # Offset, bits, channel; the codes of -1 and of 1.
-    packed = [struct.pack("<H2B4x2f", at, bits - 1, channel | _SIGNED_FLOAT, -1, 1) for at, bits, channel in samples]
+        model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
+        samples = [(0, 8 * _BLOCK_BYTES, 0)]
+    if fmt.endswith(("_UNORM", "_UINT")):  # the codes of 0 and of 1
+        unity = 0xFFFF if fmt.endswith("_UNORM") else 1
+        qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", unity)
+    else:  # the codes of -1 or 0 and of 1, as 32-bit floats
+        unsigned = "UFLOAT" in fmt
+        qualifiers = _FLOAT if unsigned else _FLOAT | _SIGNED
+        lowest, highest = struct.pack("<f", 0.0 if unsigned else -1.0), struct.pack("<f", 1.0)
+    packed = [
+        struct.pack("<H2B4x", offset, bits - 1, channel | qualifiers) + lowest + highest
+        for offset, bits, channel in samples
+    ]
+    return _basic_block(model, side, _texel_bytes(fmt), packed)
+
+
+def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) -> bytes:
     size = 24 + 16 * len(samples)
     # Vendor and type; version and size; model, primaries, transfer and flags; block sides; bytes of a plane.
-    head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, plane)
-    return struct.pack("<I", 4 + size) + struct.pack("<I 2H 4B 4B B7x", *head) + b"".join(packed)
+    head = (0, _VERSION, size, model, _BT709, _LINEAR, 0, side, side, 0, 0, texel_bytes)
+    block = struct.pack("<I 2H 4B 4B B7x", *head) + b"".join(samples)
+    return struct.pack("<I", 4 + size) + block
+
+
+def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads the largest level of a KTX2 file of light, plain or compressed by zstd or zlib.
+
+    The first row of the result is the top one, whatever `KTXorientation` states.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pixels, float32 [H, W, 3 or 4], and the channel names. The alpha of ASTC is ignored.
+
+    Raises:
+        WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
+            cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
+    """
+    with open_file(path, "the KTX2 file") as file:
+        held = os.fstat(file.fileno()).st_size
+        head = file.read(_READ_HEADER.size)
+        if not head.startswith(MAGIC):
+            raise WlmError(f"{path}: expected a KTX2 file, found other content")
+        if len(head) < _READ_HEADER.size:
+            raise WlmError(f"{path}: the file is cut short: expected {_READ_HEADER.size} bytes, found {len(head)}")
+        fields = _READ_HEADER.unpack(head)
+        number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
+        descriptor, pairs = fields[10:12], fields[12:14]
+        start, stored, size = fields[16:19]
+        if number not in _LAYOUTS:
+            name = next((name for name, written in VK_FORMATS.items() if written == number), None)
+            found = f"{number} ({name})" if name else number
+            raise WlmError(f"{path}: vkFormat: expected {_EXPECTED}, found {found}")
+        name, layout = _LAYOUTS[number]
+        for field, found, fits, expected in (
+            ("pixelHeight", height, height > 0, "at least 1 (2D)"),
+            ("pixelDepth", depth, depth <= 1, "0 (no volume)"),
+            ("layerCount", layers, layers <= 1, "0 (no array)"),
+            ("faceCount", faces, faces == 1, "1 (no cube)"),
+            ("supercompressionScheme", scheme, scheme in (_NONE, _ZSTD, _ZLIB), "none (0), zstd (2) or zlib (3)"),
+        ):
+            if not fits:
+                raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+        check_picture(path, held, width, height, layout.unpacked)
+        expected = layout.bytes_of(width, height)
+        for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
+            if found != expected:
+                raise WlmError(
+                    f"{path}: {field} of level 0: expected {expected}, of {width} x {height} {name}, found {found}"
+                )
+        if stored > 2 * expected + 1024:  # no compressor expands data further
+            raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
+        _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
+        words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
+        right, down = _orientation(path, words, layout.channels)
+        data = _part(path, file, held, start, stored, "level 0", stored)
+    if scheme == _ZSTD:
+        data = unpack_zstd(path, data, expected)
+    elif scheme == _ZLIB:
+        try:
+            data = inflate(data, expected, f"{path}: level 0", f"{expected} bytes once unpacked")
+        except ValueError as error:
+            raise WlmError(str(error)) from error
+    if len(data) != expected:
+        raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
+    pixels = decode_texels(path, layout, data, width, height)
+    return np.ascontiguousarray(pixels[:: 1 if down else -1, :: 1 if right else -1]), layout.names
+
+
+def _part(
+    path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
+) -> bytes:
+    """Reads a part of the file, at most its first `most` bytes."""
+    if start + size > held:
+        raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
+    file.seek(start)
+    data = file.read(min(size, most))
+    if len(data) != min(size, most):
+        raise WlmError(f"{path}: {what}: expected {min(size, most)} bytes, found another number: does it change?")
+    return data
+
+
+def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
+    """Checks that the transfer function in the data format descriptor is linear."""
+    if len(data) < _DESCRIPTOR_BYTES:
+        raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
+    transfer = data[14]
+    if transfer not in _TRANSFERS:
+        raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+
+
+def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
+    """Returns whether columns go right and rows go down, the defaults, and checks the order of the channels."""
+    found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        key, _, value = data[at + 4 : at + 4 + size].partition(b"\0")
+        if not 0 < size <= len(data) - at - 4:
+            raise WlmError(f"{path}: the key/value data is damaged, or longer than {_PAIRS_BYTES} bytes")
+        if key in found:
+            found[key] = value.rstrip(b"\0")
+        at += 4 + size + -size % 4
+    orientation, swizzle = found.values()
+    if orientation not in (b"rd", b"ru", b"ld", b"lu"):
+        raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]!r}")
+    if swizzle[:channels] != b"rgba"[:channels]:
+        raise WlmError(f"{path}: KTXswizzle: expected rgba, found {swizzle[:20]!r}")
+    return orientation[:1] == b"r", orientation[1:] == b"d"

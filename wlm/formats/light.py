@@ -1,31 +1,32 @@
-"""Reading of pictures of light from bakers and engines: EXR, Radiance and DDS, recognised by their content."""
+"""Reading of pictures of light from bakers and engines: EXR, Radiance, KTX2 and DDS, recognised by their content."""
 
 import os
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import dds, radiance
+from wlm.formats import dds, ktx2, radiance
 from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.exr import read_exr
 from wlm.formats.reading import open_file
 
-SUFFIXES = (".exr", ".hdr", ".dds")
+SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds")
 """Suffixes by which pictures of light are found in a folder."""
 
-EXPECTED = "EXR, Radiance (.hdr) or DDS"
+EXPECTED = "EXR, Radiance (.hdr), KTX2 or DDS"
 """Names of the formats, for messages."""
 
 _READERS = {
     EXR_MAGIC: read_exr,
     radiance.MAGIC: radiance.read_radiance,
+    ktx2.MAGIC: ktx2.read_ktx2,
     dds.MAGIC: dds.read_dds,
 }
 # Formats that users mistake for light, with the message.
 _OTHERS = {
     b"\x89PNG": "a PNG, whose encoding of light is unknown",
     b"\xff\xd8\xff": "a JPEG, whose encoding of light is unknown",
-    b"\xabKTX": "a KTX file",
+    b"\xabKTX 11": "a KTX file of version 1",
     b"II*\0": "a TIFF",
     b"MM\0*": "a TIFF",
 }

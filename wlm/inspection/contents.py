@@ -41,7 +41,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
         if (path / SCENE_FILE).is_file():
             return "volume", paths
         frames = six_way_files(path)
-        return ("six-way", frames) if frames else ("set", paths)
+        return ("six-way", list(frames.values())) if frames else ("set", paths)
     kind = kind_of(path)
     if kind == "model":
         return system_of(path), paths

@@ -189,14 +189,14 @@ def load(
 ) -> LightmapSet:
     """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or folders from Unity.
 
-    A lightmap is an EXR, Radiance (`.hdr`) or DDS file of light (`wlm.formats.light`); a set may mix them.
+    A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
 
     `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and may have
     `name`, `period_hours`, `mask` (the name of a PNG, or "alpha"; without it all texels are valid) and `mesh` (the name
     of a glTF or OBJ file, which only `evaluate` reads). Other keys are ignored. Names of files are relative to it. With
     `layers` and `atlases` it describes several layers of several atlases (docs/formats.md).
 
-    The files of a plain folder that end in `.exr`, `.hdr` or `.dds` are read in natural order of their names
+    The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are read in natural order of their names
     ("2" before "10"). Without `times`, the hours are read from the names if every name ends like `_18_55h`, `_18.55h`,
     `_18h` or `_18.55`; the digits after the second separator are decimals, not minutes. A `mask.png` among them is the
     mask unless `mask` says otherwise.

@@ -24,9 +24,9 @@ SET_FILE = "set.json"
 _NAME_TIME = re.compile(r"_([0-9]+)(?:[_.]([0-9]+))?h$|_([0-9]+\.[0-9]+)$", re.IGNORECASE)
 
 # Names that Unity gives: Lightmap-0_comp_light.exr, Lightmap-0_comp_dir.png, Lightmap-0_comp_shadowmask.png.
-_UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.dds)", re.IGNORECASE)
+_UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.ktx2|\.dds)", re.IGNORECASE)
 _UNITY_ENCODING = {"light": "radiance", "dir": "unit", "shadowmask": "unit"}
-_UNITY_SUFFIXES = (".exr", ".hdr", ".dds", ".png")  # the first format that all states have is read
+_UNITY_SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".png")  # the first format that all states have is read
 
 _MASK_WORDS = ("all", "alpha")
 

@@ -182,7 +182,7 @@ def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster
     b = corner_weights(clip, triangle[visible.clamp(min=0)], pixels, height, width)
     hit = visible >= 0
     barycentric = torch.where(hit[..., None], (b / b.sum(-1, keepdim=True))[..., :2], 0.0)
-    return Raster(visible, barycentric, torch.where(hit, depth, 0.0), None)
+    return Raster(visible, barycentric, torch.where(hit, depth, 0.0), None, None)
 
 
 def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raster:

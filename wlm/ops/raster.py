@@ -27,6 +27,8 @@ class Raster:
         barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the visible point;
             corner 2 has the rest. It and all attributes below are 0 in uncovered pixels. It has a gradient.
         depth: float [H, W], z / w; 0 everywhere in UV space. It has no gradient.
+        derivative: float [H, W, 4], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right
+            and y down; None if not requested. It has no gradient.
         coverage: int32 [H, W], number of triangles that cover the pixel's centre, including hidden ones; None if not
             requested.
     """
@@ -34,6 +36,7 @@ class Raster:
     triangle: torch.Tensor
     barycentric: torch.Tensor
     depth: torch.Tensor
+    derivative: torch.Tensor | None
     coverage: torch.Tensor | None
 
 
@@ -44,6 +47,7 @@ def rasterize(
     width: int,
     *,
     cull: bool = False,
+    derivative: bool = False,
     coverage: bool = False,
 ) -> Raster:
     """Draws triangles given in clip space; the one of least z / w in front of the viewer (w > 0) is visible.
@@ -57,14 +61,14 @@ def rasterize(
         triangle: int32 or int64 [F, 3], rows of `clip`, with either winding.
         height, width: H and W in pixels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise on the screen.
-        coverage: Whether to compute that field of `Raster`.
+        derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
         ValueError: A tensor's shape, type, device or size doesn't fit, or a triangle has a corner that isn't in
             `clip`. The check of corners waits for the GPU; while a CUDA graph is captured it is skipped, and such
             triangles aren't drawn.
     """
-    return _rasterize(clip, triangle, height, width, "clip", cull, coverage)
+    return _rasterize(clip, triangle, height, width, "clip", cull, derivative, coverage)
 
 
 def rasterize_uv(
@@ -74,6 +78,7 @@ def rasterize_uv(
     width: int,
     *,
     cull: bool = False,
+    derivative: bool = False,
     coverage: bool = False,
 ) -> Raster:
     """Draws triangles into the texels of a texture; the first of several overlapping triangles is visible.
@@ -84,12 +89,12 @@ def rasterize_uv(
         triangle: int32 or int64 [F, 3], rows of `uv`.
         height, width: H and W in texels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise where u points right and v up.
-        coverage: Whether to compute that field of `Raster`.
+        derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
         ValueError: As for `rasterize`.
     """
-    return _rasterize(uv, triangle, height, width, "uv", cull, coverage)
+    return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
 
 
 def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster) -> torch.Tensor:
@@ -141,10 +146,10 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
     return texels.reshape(*uv.shape[:-1], image.shape[2])
 
 
-def _rasterize(position, triangle, height, width, space, cull, coverage) -> Raster:
+def _rasterize(position, triangle, height, width, space, cull, derivative, coverage) -> Raster:
     check("uv" if space == "uv" else "clip", position, (None, 2 if space == "uv" else 4))
     triangle = _checked_triangles(triangle, position)
-    options = {"space": space, "cull": cull, "coverage": coverage}
+    options = {"space": space, "cull": cull, "derivative": derivative, "coverage": coverage}
     return Raster(*_Rasterize.apply(position, triangle, height, width, options))
 
 

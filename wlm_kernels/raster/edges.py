@@ -271,15 +271,16 @@ def box_of(k: Corners, frame: Frame) -> Box:
 
 
 @wp.func
-def edges_at(k: Corners, frame: Frame, row: int, column: int) -> wp.vec3d:
-    """Returns the edge functions at a covered pixel, made positive."""
+def edges_at(k: Corners, frame: Frame, row: int, column: int):
+    """Returns the edge functions at a covered pixel, made positive, and their derivatives by X and Y."""
     e = functions(k, frame, _ONE)
     x = wp.float64(frame.x + 2 * column)
     y = wp.float64(frame.y + frame.y_step * row)
     f = x * e.x + (y * e.y + e.c)
     # The pixel is covered, so all have one sign.
     sign = wp.where(f[0] + f[1] + f[2] < _ZERO, -_ONE, _ONE)
-    return wp.vec3d(wp.max(sign * f[0], _ZERO), wp.max(sign * f[1], _ZERO), wp.max(sign * f[2], _ZERO))
+    f = wp.vec3d(wp.max(sign * f[0], _ZERO), wp.max(sign * f[1], _ZERO), wp.max(sign * f[2], _ZERO))
+    return f, sign * e.x, sign * e.y
 
 
 @wp.func

@@ -226,6 +226,7 @@ def _resolve(
     visible: wp.array2d[int],
     barycentric: wp.array2d[wp.vec2],
     depth: wp.array2d[float],
+    derivative: wp.array2d[wp.vec4],
 ):
     """One pixel per thread."""
     row, column = wp.tid()
@@ -234,14 +235,17 @@ def _resolve(
         visible[row, column] = -1
         barycentric[row, column] = wp.vec2()
         depth[row, column] = 0.0
+        if derivative.shape[0] > 0:
+            derivative[row, column] = wp.vec4()
         return
     t = int(key & names)
     k = corners_of(position, triangle, t)
-    f = edges_at(k, frame, row, column)
+    f, f_x, f_y = edges_at(k, frame, row, column)
     total = total_of(f)
     # Where all edge functions underflow, any point of the triangle is as right.
     u = _ONE / wp.float64(3.0)
     v = u
+    scale = _ZERO
     if total > _ZERO:
         scale = _ONE / total
         u = f[0] * scale
@@ -250,6 +254,15 @@ def _resolve(
     visible[row, column] = t
     barycentric[row, column] = wp.vec2(float(u), float(v))
     depth[row, column] = float(wp.dot(share, k.z) / wp.dot(share, wp.vec3d(k.a[2], k.b[2], k.c[2])))
+    if derivative.shape[0] > 0:
+        step_x = _TWO * scale
+        step_y = wp.float64(frame.y_step) * scale
+        derivative[row, column] = wp.vec4(
+            float(step_x * (f_x[0] - u * total_of(f_x))),
+            float(step_y * (f_y[0] - u * total_of(f_y))),
+            float(step_x * (f_x[1] - v * total_of(f_x))),
+            float(step_y * (f_y[1] - v * total_of(f_y))),
+        )
 
 
 @dataclass(frozen=True)
@@ -261,12 +274,15 @@ class Raster:
         barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has the rest.
             0 where there is no triangle, as all below.
         depth: float [H, W], z / w.
+        derivative: vec4 [H, W], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right and y
+            down; None: not computed.
         coverage: int [H, W], number of triangles that cover the pixel's centre, hidden ones too; None: not computed.
     """
 
     triangle: Any
     barycentric: Any
     depth: Any
+    derivative: Any | None
     coverage: Any | None
 
 
@@ -280,7 +296,7 @@ class Rasterizer:
         height, width: Size of the image, 1 to `MOST_PIXELS`.
         space: "clip" or "uv", see the module.
         cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
-        coverage: Whether to compute that of `Raster`.
+        derivative, coverage: Whether to compute these of `Raster`.
         split: Maximum pixels in the box of a triangle drawn by one thread; None: 64 on CUDA, no limit on the CPU.
         empty: Allocates a buffer, `empty(shape, dtype=...)` on the triangles' device; default Warp's.
 
@@ -299,6 +315,7 @@ class Rasterizer:
         *,
         space: str = "clip",
         cull: bool = False,
+        derivative: bool = False,
         coverage: bool = False,
         split: int | None = None,
         empty: Callable[..., Any] | None = None,
@@ -326,11 +343,13 @@ class Rasterizer:
         self._queued = empty((1,), dtype=wp.int64)
         self._queue = empty((count,), dtype=int)
         self._starts = empty((count,), dtype=wp.int64)
+        self._slopes = empty(size if derivative else (0, 0), dtype=wp.vec4)
         self._coverage = empty(size, dtype=int) if coverage else none
         self.raster = Raster(
             empty(size, dtype=int),
             empty(size, dtype=wp.vec2),
             empty(size, dtype=float),
+            self._slopes if derivative else None,
             self._coverage if coverage else None,
         )
 
@@ -361,6 +380,6 @@ class Rasterizer:
         inputs = [*shared, *rule, self._unit, self._sharers, *work]
         wp.launch(_draw_tiles, self._sharers, inputs=inputs, outputs=pixels, device=device)
         r = self.raster
-        outputs = [r.triangle, r.barycentric, r.depth]
+        outputs = [r.triangle, r.barycentric, r.depth, self._slopes]
         wp.launch(_resolve, self._keys.shape, inputs=[*shared, self._names, self._keys], outputs=outputs, device=device)
         return r
