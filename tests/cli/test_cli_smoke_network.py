@@ -170,7 +170,7 @@ def test_evaluate(network, volume, tmp_path):
     names = ["density x 0.5", "density x 1", "density x 2", str(volume)]
     assert [part["name"] for part in report["sets"]] == names and report["resolution"] == 20 and report["cells"] == 16
     for part in report["sets"]:
-        assert list(part["methods"]) == ["network"] and part["half_loss"] is None
+        assert list(part["methods"]) == ["network", "coarse march"] and part["half_loss"] is None
         for method in part["methods"].values():
             assert method["lowest"] <= method["psnr"] <= method["highest"] and len(method["planes"]) == 8
             assert f"{method['psnr']:.2f}" in text and f"{method['planes']['top']:.2f}" in text

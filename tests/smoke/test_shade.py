@@ -125,7 +125,7 @@ def test_shadow_falls_behind_only(device: str):
     """Smoke between the light and the obstacle is lit; a greater bias spares what is close behind."""
     camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
     box = _box((-1, -1, -0.1), (1, 1, 0.1), device)
-    for depth, bias, expected in ((8.0, None, 1.0), (12.0, None, 0.0), (12.0, 3.0, 1.0)):
+    for depth, bias, expected in ((8.0, -1.0, 1.0), (12.0, -1.0, 0.0), (12.0, 3.0, 1.0)):
         depths = torch.full((9, 9), depth, device=device)
         result = shadow_of(depths, camera, (0, 0, 1), *box, bias=bias)
         assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0

@@ -29,6 +29,7 @@ from wlm.errors import WlmError
 from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
 from wlm.lightmap.decode import SheetDecoder
+from wlm.probe.sphere import irradiance
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
@@ -182,15 +183,19 @@ def volume(folder) -> Subject:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = made.read(points, normals)
     head, pages, pool = (np.fromfile(folder / f"{name}.bin", kind) for name, kind in KINDS_OF_BUFFERS)
-    expected = np.column_stack([ahead.weight, ahead.values[:, [0, 5, 26]] * ahead.weight[:, None]])
+    shown = [irradiance(each.reshape(9, 3), n[None])[0, 1] for each, n in zip(ahead.values, normals, strict=True)]
+    light = np.column_stack([ahead.values[:, [0, 26]], np.array(shown) / np.pi])
+    expected = np.column_stack([ahead.weight, light * ahead.weight[:, None]])
     main = (
         POINTS
         + """uniform sampler2D u_normals;
 vec4 shown(ivec2 pixel)
 {
     float values[27];
-    float weight = wlm_volume_read(texelFetch(u_points, pixel, 0).xyz, texelFetch(u_normals, pixel, 0).xyz, values);
-    return vec4(weight, weight * values[0], weight * values[5], weight * values[26]);
+    vec3 p = texelFetch(u_points, pixel, 0).xyz;
+    vec3 n = texelFetch(u_normals, pixel, 0).xyz;
+    float weight = wlm_volume_read(p, n, values);
+    return vec4(weight, weight * values[0], weight * values[26], weight * wlm_volume_diffuse(p, n).g);
 }
 """
     )
