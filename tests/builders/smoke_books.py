@@ -46,7 +46,7 @@ MOVED = (0.125, -0.125)
 
 
 def shown(frames: list[SixWay], book: Book, time: float) -> np.ndarray:
-    """Returns the picture of a billboard at a time in frames under the light and the sky: light and opacity, [H, W, 4]."""
+    """Returns a billboard at a time in frames under the light and the sky: light and opacity, [H, W, 4]."""
     first = min(int(time), len(frames) - 1)
     one, other = frames[first], frames[min(first + 1, len(frames) - 1)]
     moved = torch.zeros((2, *book.size))

@@ -42,7 +42,7 @@ def unit_grid(n: int) -> list[np.ndarray]:
 
 
 def facing(volume: DensityVolume, way: tuple = (0.0, 0.0, 1.0), size: int = 24, **options) -> Camera:
-    """Makes a square camera in front of a volume; the image's edge is 1.1 times the volume's longest edge by default."""
+    """Makes a square camera in front of a volume; the image is 1.1 times the volume's longest edge by default."""
     edge = max(volume.shape) * volume.voxel
     position = volume.centre + 3.3 * edge * np.array(way) / np.linalg.norm(way)
     return Camera.look_at(position, volume.centre, **({"extent": 1.1 * edge, "height": size, "width": size} | options))

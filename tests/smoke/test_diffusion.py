@@ -1,4 +1,4 @@
-"""Light by diffusion: its equation, point lights and fire against path tracing, and the transition outside the smoke."""
+"""Light by diffusion: its equation, point lights and fire against path tracing, and lights outside the smoke."""
 
 import math
 from collections.abc import Sequence
