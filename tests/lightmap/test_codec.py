@@ -8,7 +8,8 @@ from builders.checks import assert_same
 from builders.synthetic import random_model, random_sheet
 
 import wlm
-from wlm.lightmap.codec import PACKED
+from wlm.formats.artifact import read_artifact
+from wlm.lightmap.codec import PACKED, part_bytes
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import Profile
@@ -17,13 +18,17 @@ from wlm.lightmap.sheet import LIGHT
 ARRAYS = [field.name for field in dataclasses.fields(SheetModel) if field.type is np.ndarray]
 
 
-@pytest.mark.parametrize("kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (0, 3), (4, 4), (4, 3, 1, 4)])
-@pytest.mark.parametrize("period", [24.0, None])
-def test_what_is_written_comes_back(tmp_path, kinds, period):
-    model = random_model(kinds, period=period, metric_weight=0.25, time_axis="paper")
+@pytest.mark.parametrize("kinds", [(3, 2, 1, 0), (3, 3), (2, 2), (1, 1), (0, 0), (4, 3, 1, 4), (4, 0, 0, 0)])
+@pytest.mark.parametrize(("period", "share"), [(24.0, None), (None, 0.4), (24.0, 0.01), (None, 0.0)])
+def test_what_is_written_comes_back(tmp_path, kinds, period, share):
+    """The share is that of the map's texels that are valid; None leaves the mask out."""
+    shape = (-(-len(kinds) // 2) * 128 - 20, 247)
+    mask = None if share is None else np.random.default_rng(0).random(shape) < share
+    model = random_model(kinds, mask=mask, period=period, metric_weight=0.25, time_axis="paper")
     size = model.save(tmp_path / "a.wlm")
-    assert size == (tmp_path / "a.wlm").stat().st_size == model.file_bytes()
+    assert size == (tmp_path / "a.wlm").stat().st_size == model.file_bytes() == sum(part_bytes(model, size).values())
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
+    assert ("0.tiles" in read_artifact(tmp_path / "a.wlm").parts) == (max(kinds) >= 2) or share == 0.0
 
 
 def test_the_arrays_are_all_tested():

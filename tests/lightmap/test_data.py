@@ -153,13 +153,6 @@ def test_what_a_frame_lacks_comes_from_the_nearest_in_time(period, taken):
     assert len(lightmaps.warnings) == 1 and lightmaps.source != from_arrays(lightmaps.frames, times).source
 
 
-def test_a_mask_of_each_frame_that_is_the_same_is_one_mask():
-    mask = np.random.default_rng(0).random((4, 5)) < 0.5
-    frames = np.ones((2, 4, 5, 3))
-    lightmaps = from_arrays(frames, (0.0, 1.0), np.stack([mask, mask]))
-    assert lightmaps.covered is None and lightmaps.source == from_arrays(frames, (0.0, 1.0), mask).source
-
-
 def test_mask_from_alpha_without_alpha_names_the_file(tmp_path):
     message = error_of(load, _write_set(tmp_path, _frames(), mask="alpha"))
     assert "a.exr" in message and "channel A" in message
@@ -242,12 +235,6 @@ def test_repair_takes_neighbours_as_they_are_after_clamping():
     np.testing.assert_array_equal(lightmaps.frames[0, 0, 1], (0.0, 65_504.0, 1.0))
 
 
-def test_all_zero_and_one_time_and_one_texel_are_fine():
-    assert from_arrays(np.zeros((2, 3, 4, 3)), [0, 1]).warnings == ()
-    lightmaps = from_arrays(np.full((1, 1, 1, 3), 2.0), [7.0], period=24)
-    assert lightmaps.frames.shape == (1, 1, 1, 3) and lightmaps.period == 24.0
-
-
 def test_unsorted_times_are_sorted_with_their_frames(tmp_path):
     frames = _frames()
     entries = [{"time_hours": t, "file": f} for t, f in zip((12, 3, 20), FILES, strict=True)]
@@ -255,14 +242,6 @@ def test_unsorted_times_are_sorted_with_their_frames(tmp_path):
     np.testing.assert_array_equal(lightmaps.times, [3, 12, 20])
     np.testing.assert_array_equal(lightmaps.frames, frames[[1, 0, 2]])
     assert len(lightmaps.warnings) == 1 and "sorted" in lightmaps.warnings[0]
-
-
-def test_warnings_after_sorting_name_the_right_file(tmp_path):
-    frames = _frames()
-    frames[0, 0, 0, 0] = -1.0
-    entries = [{"time_hours": t, "file": f} for t, f in zip((12, 3, 20), FILES, strict=True)]
-    lightmaps = load(_write_set(tmp_path, frames, lightmaps=entries))
-    assert lightmaps.warnings[1].startswith("a.exr: 1 texel negative")
 
 
 def test_equal_times_name_both_files(tmp_path):

@@ -1,23 +1,19 @@
 """Tiles stored as frames: when they are chosen, what they decode to, and what their bytes may be."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from builders.checks import assert_same, error_of
-from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+from builders.checks import error_of
+from builders.small_sets import moving_light, static_light, tiny_profile
 from builders.synthetic import any_blocks, random_model, random_sheet
-from typer.testing import CliRunner
 
 import wlm
 from benchmarks.rivals.lightmap import encode_set
-from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.lightmap.codec import part_bytes
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.frames import choose_frames, needed_blocks, round_half
@@ -25,7 +21,6 @@ from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.evaluation import count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, open_checkpoint
-from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import FrameDecoder
 from wlm.lightmap.sheet import LIGHT
@@ -33,7 +28,6 @@ from wlm.lightmap.tiles import TileKind, classify, split
 from wlm.metrics import evaluate_frame, summarise
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
-FILES = Path(__file__).resolve().parents[1] / "files"
 KINDS = (4, 3, 1, 4)
 TIMES = (7.5, 10.0, 23.0)
 
@@ -63,15 +57,6 @@ def test_decoders_agree_with_the_float64_path(interpolation, device):
         FrameDecoder(random_sheet((3, 0)), device)
 
 
-def test_gaps_are_filled_as_everywhere(device):
-    mask = np.zeros((236, 247), bool)
-    mask[20:60, 30:128] = mask[100:180, 60:90] = True
-    model = random_sheet((4, 4, 4, 3), mask=mask)
-    decoder = SheetDecoder(model, device)
-    frame, gaps = decoder.frame(9.0), Gaps.of(mask)
-    assert np.array_equal(frame[tuple(gaps.target.T)], frame[tuple(gaps.source.T)])
-
-
 def test_the_blocks_that_a_read_reaches():
     mask = np.zeros((250, 260), bool)
     mask[125, 130] = mask[249, 0] = True
@@ -89,14 +74,6 @@ def test_half_floats_are_rounded_outwards():
     values = np.random.default_rng(0).lognormal(0.0, 2.0, 1000).astype(np.float32)
     low, high = round_half(values, -np.inf), round_half(values, np.inf)
     assert (low <= values).all() and (high >= values).all() and (np.nextafter(low, high) == high).mean() > 0.99
-
-
-def test_what_is_written_comes_back(tmp_path):
-    mask = np.random.default_rng(0).random((236, 247)) < 0.01
-    for model in (random_model(KINDS), random_model(KINDS, mask=mask), random_model((4, 0, 0, 0), mask=mask & False)):
-        size = model.save(tmp_path / "a.wlm")
-        assert_same(wlm.load(tmp_path / "a.wlm"), model)
-        assert sum(part_bytes(model, size).values()) == size
 
 
 def _changed(tmp_path, **tensors) -> str:
@@ -202,19 +179,6 @@ def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, t
     random_model((4, 0)).decoder().frame(3.0)  # reading needs no encoder
 
 
-def test_the_command_says_that_the_encoder_is_missing(monkeypatch, tmp_path):
-    write_set(tmp_path / "set", moving_light(24, 40, hours=(6.0,)))
-    profile = tiny_profile(frames="auto", steps=10).model_dump(mode="json")
-    (tmp_path / "tiny.yaml").write_text(json.dumps(profile))
-    command = ["compress", str(tmp_path / "set"), "--profile", str(tmp_path / "tiny.yaml")]
-    for missing, kind in ((False, "frames"), (True, "static")):
-        if missing:
-            monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
-        done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "a.wlm")])
-        assert done.exit_code == 0 and ("needs the extra: pip install 'wlm[frames]'" in done.output) == missing
-        assert count_kinds(wlm.load(tmp_path / "a.wlm").sheets[LIGHT])[kind] == 1
-
-
 def test_any_block_may_lie_beside_any(device):
     """Texels of a map of blocks whose neighbours are of other modes are where they belong."""
     model = random_sheet((4,), columns=1, times=(0.0,), period=None)
@@ -224,10 +188,3 @@ def test_any_block_may_lie_beside_any(device):
         one = np.broadcast_to(frames[:, :, y // 4, x // 4][:, :, None, None], frames.shape)
         alone = SheetDecoder(dataclasses.replace(model, frames=np.ascontiguousarray(one)), device).tiles([0], 0.0)[0]
         assert np.array_equal(alone[y % 4, x % 4], light[y, x])
-
-
-def test_a_kept_file_decodes_as_when_it_was_written(device):
-    """Two hours of one tile with gaps, blocks of all modes."""
-    model = wlm.load(FILES / "lightmap-frames.wlm")
-    with np.load(FILES / "lightmap-frames.npz") as stored:
-        np.testing.assert_allclose(model.decoder(device).frame(8.25), stored["frame"], rtol=1e-5)

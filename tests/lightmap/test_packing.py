@@ -14,7 +14,7 @@ import wlm
 from wlm.formats import zstd
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.bc7 import decode_image
-from wlm.lightmap.codec import part_bytes, tile_sizes
+from wlm.lightmap.codec import tile_sizes
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.encodings.maps import Reads, clear_unread
@@ -29,20 +29,6 @@ def _file_of(sheet) -> LightmapModel:
 def reads_of(used: np.ndarray, sheet) -> Reads:
     p = sheet.profile
     return Reads.of(used, sheet.axis, p.uvt_resolution, p.uvt_slices, p.plane_columns, p.plane_rows)
-
-
-def _mask(seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).random((236, 247)) < 0.4
-
-
-@pytest.mark.parametrize("mask", [None, _mask(), np.zeros((236, 247), bool)], ids=["whole", "gaps", "nothing"])
-@pytest.mark.parametrize("kinds", [(3, 2, 1, 0), (3, 3, 2, 2), (0, 0, 0, 2), (1, 0, 1, 0)], ids=str)
-def test_nothing_is_lost(tmp_path, mask, kinds):
-    model = random_model(kinds, mask=mask)
-    size = model.save(tmp_path / "a.wlm")
-    assert_same(wlm.load(tmp_path / "a.wlm"), model)
-    assert sum(part_bytes(model, size).values()) == size
-    assert ("0.tiles" in read_artifact(tmp_path / "a.wlm").parts) == (max(kinds) >= 2)
 
 
 @pytest.mark.parametrize("part", ["uv", "uvt"])

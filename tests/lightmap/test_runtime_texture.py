@@ -6,7 +6,6 @@ import warp as wp
 from builders.synthetic import random_model, random_sheet
 from typer.testing import CliRunner
 
-from wlm import interop
 from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.formats.dds import read_dds, write_dds
@@ -94,18 +93,6 @@ def test_mips_leave_out_tiles_that_the_file_lacks(device):
     stored[:128, 128:] = False
     # The mean is rounded at each level.
     np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[stored].mean(0), rtol=0.03)
-
-
-def test_a_captured_map_repeats(device):
-    decoder = MapDecoder(random_sheet(KINDS), device)
-    decoder.decode()
-    expected = [level.numpy() for level in decoder.levels]
-    graph = interop.StepGraph(decoder.decode, device, warmup=1)
-    for level in decoder.levels:
-        level.zero_()
-    graph()
-    for level, words in zip(decoder.levels, expected, strict=True):
-        np.testing.assert_array_equal(level.numpy(), words)
 
 
 def test_the_command_writes_the_texture(tmp_path):

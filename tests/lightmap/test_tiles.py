@@ -77,13 +77,6 @@ def test_split_encodes_gamma(lightmaps):
     np.testing.assert_allclose(encoded.colour[0][:, valid], plain.colour[0][:, valid] ** (1 / GAMMA), rtol=1e-5)
 
 
-def test_split_takes_tiles_in_the_order_given(lightmaps):
-    tiles, all_tiles = split(lightmaps, GAMMA, [4, 0]), split(lightmaps, GAMMA)
-    np.testing.assert_array_equal(tiles.index, [4, 0])
-    np.testing.assert_array_equal(tiles.colour, all_tiles.colour[[4, 0]])
-    np.testing.assert_array_equal(tiles.mask, all_tiles.mask[[4, 0]])
-
-
 def test_gaps_hold_the_nearest_valid_texel_of_the_tile():
     frames = np.zeros((1, TILE, 2 * TILE, 3), np.float32)
     mask = np.zeros((TILE, 2 * TILE), bool)
@@ -108,11 +101,6 @@ def test_map_end_is_edge_padded_and_not_valid(lightmaps):
     assert (inside > 0).all()
 
 
-def test_one_texel_fills_its_tile():
-    tiles = split(from_arrays(np.full((2, 1, 1, 3), 0.25), [0, 1]), 2.0)
-    assert tiles.mask.sum() == 1 and (tiles.colour == 0.5).all()
-
-
 def test_split_refuses(lightmaps):
     for tiles, text in (([6], "outside the grid"), ([-1], "outside the grid"), ([1, 1], "twice"), ([], "none")):
         with pytest.raises(WlmError, match=text):
@@ -129,12 +117,6 @@ def test_channel_means_count_valid_texels_only(lightmaps):
     np.testing.assert_array_equal(means[1], 0.0)
 
 
-def test_channel_means_are_summed_in_double():
-    colour = np.full((1, 1, TILE, TILE, 3), 0.1, np.float32)
-    means = channel_means(colour, np.ones((1, TILE, TILE), bool))
-    np.testing.assert_allclose(means, np.float64(np.float32(0.1)), rtol=1e-13)
-
-
 def test_static_pattern_recovers_a_product():
     random = np.random.default_rng(2)
     pattern = random.uniform(0.2, 2.0, (1, TILE, TILE, 3))
@@ -145,16 +127,6 @@ def test_static_pattern_recovers_a_product():
     recovered = static_pattern(colour, means)
     np.testing.assert_allclose(recovered[..., :2], pattern[..., :2], rtol=1e-5)
     assert (recovered[..., 2] == 0).all()
-
-
-def test_empty_tile_ignores_its_colour():
-    random = np.random.default_rng(3)
-    linear = random.random((2, TILE, TILE, 3))
-    assert _kind(linear, np.zeros((TILE, TILE), bool)) is TileKind.EMPTY
-
-
-def test_all_zero_tile_is_constant():
-    assert _kind(np.zeros((3, 1, 1, 3))) is TileKind.CONSTANT
 
 
 @pytest.mark.parametrize("value", [1e-6, 6e-5, 0.01, 0.3, 1.0, 1.999, 900.0, 60_000.0])
@@ -224,8 +196,3 @@ def test_dark_time_within_a_half_float_step_does_not_make_a_tile_dynamic():
 def test_grey_time_of_no_range_but_another_light_is_dynamic():
     linear = np.concatenate([_pattern(), np.full((1, TILE, TILE, 3), 0.5)])
     assert _kind(linear, budget=1.0) is TileKind.DYNAMIC
-
-
-def test_classify_takes_a_batch_in_order(lightmaps):
-    kinds = classify(split(lightmaps, GAMMA), GAMMA)
-    assert kinds.tolist() == [3, 0, 3, 3, 3, 3] and kinds.dtype == np.int64

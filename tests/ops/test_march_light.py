@@ -5,14 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-import warp as wp
-from kernels.compare import array, close
-from reference.single_light import march_lit
+from kernels.compare import close
 
 from wlm import ops
-from wlm_kernels.smoke import marches
-from wlm_kernels.smoke.march import Medium, make_view
-from wlm_kernels.smoke.settings import March
 
 AHEAD = torch.tensor([0.0, 0.0, 1.0])
 
@@ -66,33 +61,6 @@ def _cloud(seed: int = 3) -> np.ndarray:
     x = np.stack(np.meshgrid(*[np.linspace(-1, 1, n) for n in (14, 12, 16)], indexing="ij"), -1)
     blobs = [np.exp(-6.0 * ((x - c) ** 2).sum(-1)) for c in random.uniform(-0.5, 0.5, (4, 3))]
     return (0.25 * sum(blobs)).astype(np.float32)
-
-
-def test_against_the_smoke_systems_marches(device: str):
-    """A march to the light from every sample, and the transparency of the guiding map."""
-    density = _cloud()
-    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
-    right, up, forward = turn * np.linalg.det(turn)
-    middle = np.array(density.shape) / 2
-    view = make_view(middle - 20.0 * forward, right, up, forward, 1.0, 20, 18)
-    toward = np.array([0.5, 0.7, -0.51]) / np.linalg.norm([0.5, 0.7, -0.51])
-    lit = wp.zeros((18, 20), dtype=float, device=device)
-    medium = Medium(array(density, float, device), 1.0)
-    march_lit(medium, view, toward, March(0.5, g=0.3), lit)
-
-    u, v = np.meshgrid(np.arange(20) + 0.5 - 10.0, 9.0 - np.arange(18) - 0.5)
-    origin = middle - 20.0 * forward + u[..., None] * right + v[..., None] * up
-    rays = [torch.tensor(r.astype(np.float32), device=device) for r in (origin, np.broadcast_to(forward, origin.shape))]
-    light = torch.tensor(toward[None].astype(np.float32), device=device)
-    colour = torch.ones(1, 3, device=device)
-    grid = torch.tensor(density, device=device)
-    radiance, transmittance = ops.march(grid, *rays, toward=light, colour=colour, step=0.5, g=0.3)
-    assert lit.numpy().max() > 0.1
-    # What the lattice of optical depths, a voxel wide, leaves.
-    close(radiance[..., 0], lit, 0.012)
-    maps = wp.zeros((3, 18, 20), dtype=float, device=device)
-    marches.guide(medium, view, March(0.5, jitter=0.0, cutoff=0.0), maps)
-    close(transmittance, maps.numpy()[1], 1e-5)
 
 
 def test_rays_that_miss(device: str):

@@ -198,24 +198,3 @@ def test_against_ray_casts(device: str, view: tuple[float, float, float]):
     got = raster.depth.cpu().numpy()[same]
     w = depths.reshape(hit.shape)[same]
     np.testing.assert_allclose(got, ((far + near) * w - 2 * far * near) / ((far - near) * w), atol=2e-6)
-
-
-def test_texels_from_a_picture(device: str):
-    """A texture is found again by descent on a picture of it."""
-    clip, triangle, uv = _mesh(device)
-    target = torch.nn.functional.interpolate(
-        torch.rand(1, 3, 3, 3, generator=torch.Generator().manual_seed(1)), size=(8, 8)
-    )
-    target = target[0].permute(1, 2, 0).to(device)
-    at = ops.interpolate(uv, triangle, ops.rasterize(clip, triangle, *SIZE))
-    want = ops.texture(target, at)
-    image = torch.full_like(target, 0.5, requires_grad=True)
-    optimizer = torch.optim.Adam([image], lr=0.05)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss = (ops.texture(image, at) - want).square().mean()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 1e-3 * losses[0]

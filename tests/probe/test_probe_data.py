@@ -115,14 +115,6 @@ def test_an_exact_name_goes_before_one_with_sh(tmp_path):
     assert load(path, key="noon").key == "noon"
 
 
-def test_missing_arrays(tmp_path):
-    path = tmp_path / "a.npz"
-    np.savez(path, sh=_values(N, 3))
-    assert "position is missing; found sh" in error_of(load, path)
-    np.savez(path, position=_position())
-    assert "found nothing" in error_of(load, path)
-
-
 def test_both_forms_of_json(tmp_path):
     values = _values(N, 4, 3)
     lists = {"position": _position().tolist(), "sh": values.tolist(), "author": "me"}
@@ -395,12 +387,6 @@ def test_malformed_json_names_the_field(tmp_path, content, expected):
     assert message.startswith(f"{path}: ") and expected in message
 
 
-def test_json_with_nan(tmp_path):
-    content = {"position": [[0, 0, 0], [1, 1, 1]], "sh": [[1, 2], [float("nan"), 3]]}
-    loaded = load(_write_json(tmp_path / "a.json", content))
-    assert loaded.live.tolist() == [True, False] and len(loaded.warnings) == 1
-
-
 def test_positions_of_any_file(tmp_path, monkeypatch):
     points = _position().tolist()
     lists = {"a.json": points, "b.json": {"position": points}, "c.txt": {"probes": [{"position": x} for x in points]}}
@@ -504,13 +490,6 @@ def test_writing_is_refused_without_touching_the_file(tmp_path):
         with pytest.raises(ValueError, match="expected"):
             save_probes(path, position, values)
     assert path.read_bytes() == b"precious" and [p.name for p in tmp_path.iterdir()] == ["a.npz"]
-
-
-def test_arrays_are_copied():
-    position, values = _position(), _values(N, 27)
-    loaded = from_arrays(position, values)
-    position[:], values[:] = 0.0, 0.0
-    _same(loaded, from_arrays(_position(), _values(N, 27)))
 
 
 @pytest.mark.parametrize("key", ["12.00", "21.00"])

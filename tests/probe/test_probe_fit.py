@@ -47,30 +47,6 @@ def test_from_file_to_light_by_the_public_names(tmp_path):
     assert light.shape == (5, 27) and np.isfinite(light).all()
     model.save(tmp_path / "street.wlm")
     np.testing.assert_array_equal(wlm.load(tmp_path / "street.wlm").decoder("cpu").decode(points), light)
-    with pytest.raises(WlmError, match="unknown key 'step'; did you mean 'steps'"):
-        wlm.probe.compress(probes, "small", step=20)
-    assert all(getattr(wlm.probe, name) is not None for name in wlm.probe.__all__)
-
-
-def test_one_seed_gives_one_result():
-    probes = synthetic(130, dead=9)
-    first, second = compress(probes, SMALL, seed=3), compress(probes, SMALL, seed=3)
-    assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(second), strict=True))
-    other = compress(probes, SMALL, seed=4)
-    assert not np.array_equal(first.content.net, other.content.net)
-
-
-@pytest.mark.parametrize("stop", [20, 52, 58])  # in each of the stages, which begin at 0, 50 and 55
-def test_a_stopped_fit_goes_on_exactly(tmp_path, stop):
-    probes = synthetic(130)
-    whole = compress(probes, SMALL)
-    trainer = Trainer(*_input(probes), SMALL, 0, "cpu")
-    trainer.run(stop)
-    checkpoint = open_checkpoint(tmp_path / "a.wlm", probes, SMALL)
-    checkpoint.save_running(0, trainer.state())
-    trainer.close()
-    again = compress(probes, SMALL, checkpoint=open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True))
-    assert all(np.array_equal(a, b) for a, b in zip(arrays(whole), arrays(again), strict=True))
 
 
 def test_an_interrupt_is_kept(tmp_path):

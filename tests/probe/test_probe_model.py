@@ -104,16 +104,6 @@ def test_the_profiles_that_are_there():
     assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)
 
 
-def test_a_profile_from_a_file(tmp_path):
-    (tmp_path / "mine.yaml").write_text("name: mine\nlatent: 8\n")
-    assert Profile.load(str(tmp_path / "mine.yaml")).latent == 8
-    (tmp_path / "mine.yaml").write_text("name: mine\nlatents: 8\n")
-    with pytest.raises(WlmError, match="mine.yaml: unknown key 'latents'; did you mean 'latent'"):
-        Profile.load(str(tmp_path / "mine.yaml"))
-    with pytest.raises(WlmError, match="profile 'tiny' of probe: expected one of"):
-        Profile.load("tiny")
-
-
 @pytest.mark.parametrize(
     "settings",
     [

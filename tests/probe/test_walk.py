@@ -10,7 +10,7 @@ from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
-from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, settle, walk
+from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, walk
 
 
 def _hills(count: int = 900) -> np.ndarray:
@@ -109,19 +109,6 @@ def test_figures_are_those_of_the_readings(device: str):
     errors["far_psnr"] = volume.read(position[far]).values - original[far]
     for name, error in errors.items():
         assert last[name] == pytest.approx(20.0 * np.log10(peak / rms(error)))
-
-
-def test_finer_blocks_err_less():
-    """The error falls with the side of the blocks."""
-    position = _hills(3000)
-    errors = []
-    for block in (1.0, 4.0, 16.0):
-        volume = _volume(position, block=block, ratios=(1,), side=int(64 / block), budget=1024)
-        settle(volume, _line(1, 0.0)[0])
-        figures = walk(volume, _line(1, 0.0), _light(position), samples=500)
-        assert figures["coverage"]["min"] > 0.99
-        errors.append(figures["rmse"]["mean"])
-    assert errors[0] < 0.5 * errors[1] < 0.25 * errors[2]
 
 
 def test_points_that_nothing_covers_count_as_black():

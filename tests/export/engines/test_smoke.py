@@ -65,14 +65,6 @@ def test_a_folder_has_what_its_index_names(engine, moving, frames, tmp_path):
     assert "wlm export wrote" in finding.what
 
 
-def test_one_engines_files_take_the_place_of_anothers(frames, tmp_path):
-    export_smoke(random_book(frames, moving=True), tmp_path / "out", "godot")
-    (tmp_path / "out" / "mine.txt").write_text("x")
-    for engine in (*ENGINES, None):
-        paths = export_smoke(random_book(frames), tmp_path / "out", engine)
-        assert set(os.listdir(tmp_path / "out")) == {path.name for path in paths} | {"mine.txt"}
-
-
 def test_what_cannot_be_exported(frames, tmp_path, monkeypatch):
     book, out = random_book(frames), tmp_path / "deep" / "out"
     assert "engine: expected one of three" in error_of(export_smoke, book, out, "cry")

@@ -146,15 +146,6 @@ def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
     assert make_page([tmp_path / "live.wlm"]).manifest["probe"]["count"] == 50
 
 
-def test_a_tampered_file_makes_no_page(tmp_path):
-    content = bytearray((FILES / "lightmap.wlm").read_bytes())
-    content[-1] ^= 1
-    (tmp_path / "bad.wlm").write_bytes(content)
-    with pytest.raises(WlmError, match="damaged"):
-        write_page(tmp_path / "page.html", [tmp_path / "bad.wlm"])
-    assert not (tmp_path / "page.html").exists()
-
-
 def test_frames_of_smoke_are_of_one_size(tmp_path):
     for name, size in (("a", 8), ("b", 4)):
         camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)
