@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from builders.atlas_meshes import charts, sheet, write_files
+from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, MIXED
 
 import wlm
@@ -72,16 +72,6 @@ def test_against_float64(device: str, name: str):
     assert decoder.read(torch.empty((0, 2), device=device)).shape == (0, 3)
 
 
-def test_two_references_agree():
-    """The float64 decode of the package, and that of the tests."""
-    from reference import tiles as reference
-
-    model = models(sheet)["tiles"]
-    uv = np.random.default_rng(3).random((300, 2))
-    expected = reference.decode(uv, *model.sheets[0].size, model.profile.tile, model.lut, model.texels[0])
-    np.testing.assert_allclose(decode64(model, uv), expected, atol=1e-12)
-
-
 def test_a_sampler_takes_the_meshs_own_uvs(device: str):
     """A model with new UVs interpolates them by triangle and weights; one without reads at the mesh's."""
     mesh = sheet()
@@ -121,25 +111,6 @@ def test_the_lightmap_in_its_own_layout(device: str):
     exact = models(charts)["plain with uv"]
     # A texel with its centre in no triangle has its neighbour's light.
     assert np.abs(Decoder(exact, device).lightmap() - mesh.sheets[0].lightmap)[mesh.sheets[0].mask].mean() < 0.02
-
-
-def test_the_front_door(tmp_path, monkeypatch):
-    """The snippet of the README, as it stands there."""
-    glb, exr = write_files(tmp_path, sheet())
-    glb.rename(tmp_path / "room.glb"), exr.rename(tmp_path / "room.exr")
-    monkeypatch.chdir(tmp_path)
-    uv = torch.rand(100, 2)
-
-    mesh = wlm.atlas.load("room.glb", "room.exr")
-    model = wlm.atlas.compress(mesh, "standard")
-    light = model.decoder("cpu").read(uv)  # [N, 2] -> [N, 3]
-
-    assert light.shape == (100, 3)
-    model.save("room.wlm")
-    assert torch.equal(wlm.load("room.wlm").decoder("cpu").read(uv), light)
-    assert wlm.atlas.evaluate(model, mesh, views=2, resolution=64).psnr > 30.0
-    assert "colour" in model.bundle().textures and "mesh.glb" in model.bundle().files
-    assert all(getattr(wlm.atlas, name) is not None for name in wlm.atlas.__all__)
 
 
 def test_another_mesh_is_refused():

@@ -258,12 +258,6 @@ def test_what_is_refused():
         _one(mesh, _reader(mesh), device="gpu")
 
 
-def test_progress():
-    reports, mesh = [], lit_cube(1)
-    compare(mesh, {"it": _reader(mesh)}, views=3, resolution=16, progress=reports.append)
-    assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("evaluate", 3, 3)
-
-
 def test_threads_are_given_back():
     mesh, before, inside = lit_cube(1), torch.get_num_threads(), []
 

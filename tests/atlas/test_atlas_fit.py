@@ -309,16 +309,6 @@ def test_the_packed_texture_has_room(colour: str):
     assert packed > 25
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_one_seed_gives_one_file(name: str, tmp_path):
-    files = []
-    for i, seed in enumerate((3, 3, 4)):
-        model = compress(charts(), name, seed=seed, **FEW, budget=0.3)
-        assert model.save(tmp_path / f"{i}.wlm") and model.report["seconds"]
-        files.append((tmp_path / f"{i}.wlm").read_bytes())
-    assert files[0] == files[1] != files[2]
-
-
 def test_tiles_in_a_large_texture_of_blocks(monkeypatch):
     """As in a small one: only what its entries count in differs."""
     mesh = sheet(height=90, width=70)

@@ -177,16 +177,6 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
     assert not tune(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
 
 
-@pytest.mark.parametrize("space", ["views", "uv"])
-def test_one_seed_one_result(space: str):
-    mesh, profile = _box(), _profile(space=space, steps=6)
-    uv, start = _start(mesh, profile)
-    first, again, second = (tune(mesh, uv, start, profile, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first.colour, again.colour)
-    np.testing.assert_array_equal(first.lut, again.lut)
-    assert (first.colour != second.colour).any()
-
-
 def test_rates_that_fall():
     """The first step is as long as at full rate, the last one as short as it is to be; less noise is left."""
     mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)

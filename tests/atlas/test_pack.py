@@ -193,15 +193,6 @@ def test_folded_and_doubled():
     assert max(len(charts) for charts in _read_by(packed).values()) == 1
 
 
-def test_a_mesh_of_one_look_needs_little():
-    """All triangles in one group: the atlas is that of one."""
-    mesh = _mesh(sum((_quad(1 + 12 * (i % 5), 1 + 12 * (i // 5), 9, 9) for i in range(15)), []))
-    packed = pack(mesh, grouped([0] * 30), 1.0)
-    assert packed.width * packed.height <= 14 * 14
-    full = pack(mesh, None, 1.0)
-    assert full.width * full.height >= 15 * 9 * 9
-
-
 def test_regenerated_colours():
     """A lightmap that is linear in x and y is the same under the new UVs, up to the charts' borders and beyond."""
     y, x = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5, indexing="ij")

@@ -1,17 +1,24 @@
-"""A model's file: what is saved comes back, in the bytes that it needs."""
+"""Files of lightmaps and packed tiles: what is saved comes back, unread texels cost little, and damage is one line."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from builders.checks import assert_same
+import torch
+from builders import small_sets
+from builders.checks import assert_same, error_of
 from builders.synthetic import random_model, random_sheet
+from reference.levels import put_on_levels
 
 import wlm
-from wlm.formats.artifact import read_artifact
-from wlm.lightmap.codec import PACKED, part_bytes
-from wlm.lightmap.encodings.maps import tile_bytes
-from wlm.lightmap.model import SheetModel
+from wlm.formats import zstd
+from wlm.formats.artifact import read_artifact, write_artifact
+from wlm.formats.bc7 import decode_image
+from wlm.lightmap.codec import PACKED, part_bytes, tile_sizes
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings import encoding_of
+from wlm.lightmap.encodings.maps import Reads, clear_unread, tile_bytes
+from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.sheet import LIGHT
 
@@ -59,3 +66,182 @@ def test_the_size_is_the_arithmetic_of_table_3(tmp_path, kind):
     sheet = random_sheet((kind, kind), **sizes)
     networks = (sheet.net if kind == 3 else sheet.net_static).nbytes // 2
     assert tile_bytes(profile, kind == 3) - networks == (34 if kind == 3 else 16) * 1024
+
+
+def _file_of(sheet) -> LightmapModel:
+    return LightmapModel("random", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
+
+
+def reads_of(used: np.ndarray, sheet) -> Reads:
+    p = sheet.profile
+    return Reads.of(used, sheet.axis, p.uvt_resolution, p.uvt_slices, p.plane_columns, p.plane_rows)
+
+
+@pytest.mark.parametrize("part", ["uv", "uvt"])
+def test_any_block_of_mode_6_comes_back(tmp_path, part):
+    sheet = random_sheet((3, 0))
+    words = np.random.default_rng(1).integers(0, 2**64, (*getattr(sheet, part).shape[:-1], 2), np.uint64)
+    words[..., 0] = words[..., 0] & ~np.uint64(127) | np.uint64(64)
+    model = _file_of(dataclasses.replace(sheet, **{part: words.view(np.uint8)}))
+    model.save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), model)
+    words[..., 0] |= np.uint64(1)
+    other = _file_of(dataclasses.replace(sheet, **{part: words.view(np.uint8)}))
+    assert "BC7 mode 6" in error_of(other.save, tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
+def test_what_is_not_read_costs_nothing(tmp_path):
+    used = np.zeros((128, 128), bool)
+    used[:108, :50] = True
+    # Two times read two slices of four and three rows of six each, and so of the planes.
+    model = random_sheet((3, 0), times=(6.0, 18.0), mask=used[:108].copy(), columns=1, uvt_resolution=32, uvt_slices=4)
+    model = dataclasses.replace(model, mask=np.pad(used, ((0, 128), (0, 0)))[:236, :119])
+    reads = reads_of(used, model)
+    parts = {name: getattr(model, name)[0] for name in ("uv", "uvt", "ut", "vt")}
+    cleared = clear_unread(parts, used, reads)
+    texels, expected = decode_image(cleared["uv"]), decode_image(model.uv[0])
+    assert np.array_equal(texels[used], expected[used])
+    # Columns 50 and 51 share blocks with valid texels, later ones have none of their own.
+    assert not cleared["uv"][:, 13:, 1:].any() and not cleared["uvt"][:, :, 4:, 1:].any()
+    again = clear_unread(cleared, used, reads)
+    assert all(np.array_equal(again[name], values) for name, values in cleared.items())
+    less = dataclasses.replace(model, **{name: values[None] for name, values in cleared.items()})
+    _file_of(less).save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), _file_of(less))
+    assert tile_sizes(less)[0] < 0.5 * tile_sizes(model)[0]
+    for time in (6.0, 7.5, 18.0):
+        light, same = SheetDecoder(less).frame(time), SheetDecoder(model).frame(time)
+        assert np.array_equal(light[model.mask], same[model.mask]) and light[model.mask].any()
+
+
+@pytest.mark.parametrize(("count", "period", "rows"), [(6, 24.0, 12), (7, 24.0, 14), (7, None, 14), (13, 24.0, 14)])
+def test_what_is_not_read_changes_no_light(count, period, rows):
+    used = np.zeros((128, 128), bool)
+    used[20:31, 70:75] = True
+    mask = np.pad(used, ((0, 128), (0, 0)))[:236, :119]
+    times = tuple(np.linspace(0.0, 23.0, 7))
+    model = random_sheet((3, 0), columns=1, times=times, period=period, uvt_slices=count, plane_rows=2 * count)
+    model = dataclasses.replace(model, mask=mask)
+    reads = reads_of(used, model)
+    assert reads.rows.sum() == rows and reads.columns.sum() < 16 and reads.texels.sum() < 10
+    other = {name: getattr(model, name) ^ np.uint8(255) for name in ("ut", "vt")}
+    for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
+        read = reads.rows[:, None] & columns
+        other[name][0][read] = getattr(model, name)[0][read]
+    other["uvt"] = np.roll(model.uvt, 1, 1)
+    other["uvt"][0, reads.slices] = model.uvt[0, reads.slices]
+    one, two = (SheetDecoder(each) for each in (model, dataclasses.replace(model, **other)))
+    assert all(np.array_equal(one.frame(time)[mask], two.frame(time)[mask]) for time in (*times, 11.0))
+
+
+def _changed(tmp_path, **tensors) -> str:
+    """What reading a file says whose parts were replaced."""
+    model = random_model((3, 2, 1, 0))
+    model.save(tmp_path / "a.wlm")
+    artifact = read_artifact(tmp_path / "a.wlm")
+    parts = dict(artifact.tensors)
+    for name, change in tensors.items():
+        value = parts.pop(f"0.{name}")
+        if change is not None:
+            parts[f"0.{name}"] = change(value.copy())
+    write_artifact(tmp_path / "b.wlm", "lightmap", artifact.settings, parts, artifact.source)
+    return error_of(wlm.load, tmp_path / "b.wlm")
+
+
+def test_damage_is_one_line(tmp_path):
+    def more(sizes):
+        return sizes + np.array([1, 0], np.uint32)
+
+    def moved(sizes):
+        return sizes + np.array([2**32 - 9, 9], np.uint32)
+
+    assert "part tile_sizes: expected those of 2 tiles" in _changed(tmp_path, tile_sizes=more)
+    assert "part tile_sizes: expected those of 2 tiles" in _changed(tmp_path, tile_sizes=lambda sizes: sizes[:1])
+    assert "part tile_sizes is uint32 (1, 2), expected uint32 (any)" in _changed(
+        tmp_path, tile_sizes=lambda sizes: sizes[None]
+    )
+    assert "part tiles: tile 0: " in _changed(tmp_path, tile_sizes=moved)
+    assert "part tiles: tile 0: " in _changed(tmp_path, tiles=lambda tiles: tiles ^ 255)
+    assert "part tiles is missing" in _changed(tmp_path, tiles=None)
+
+
+@pytest.mark.parametrize("size", [10, 1 << 24])
+def test_a_frame_of_another_length_is_one_line(tmp_path, size):
+    line = _changed(tmp_path, **_first_frame(bytes(size)))
+    assert "part tiles: tile 0: expected" in line
+
+
+def test_endpoints_beyond_7_bits_are_one_line(tmp_path):
+    sheet = random_model((3, 2, 1, 0)).sheets[LIGHT]
+    content = bytearray(b"".join(encoding_of(3).pack(sheet, 0)))
+    content[1] = 128
+    assert "part tiles: tile 0: expected endpoints of 7 bits" in _changed(tmp_path, **_first_frame(bytes(content)))
+
+
+def _first_frame(content: bytes) -> dict:
+    """Changes of the parts after which the first tile's frame has this content."""
+    frame = np.frombuffer(zstd.compress(content), np.uint8)
+    first = tile_sizes(random_model((3, 2, 1, 0)).sheets[LIGHT])[0]
+    return {
+        "tiles": lambda tiles: np.concatenate([frame, tiles[first:]]),
+        "tile_sizes": lambda sizes: np.concatenate([[len(frame)], sizes[1:]]).astype(np.uint32),
+    }
+
+
+def test_each_tile_is_read_alone(tmp_path):
+    """Its bytes begin at the sum of the sizes before it, and are a zstd frame of its own."""
+    model = random_model((3, 2, 4, 0))
+    model.save(tmp_path / "a.wlm")
+    tensors, (sheet,) = read_artifact(tmp_path / "a.wlm").tensors, model.sheets.values()
+    sizes = tensors["0.tile_sizes"].tolist()
+    start = sum(sizes[:2])
+    frame = tensors["0.tiles"][start : start + sizes[2]].tobytes()
+    data = zstd.decompress(frame, encoding_of(4).packed_size(sheet, 2), "tile 2")
+    assert data == b"".join(encoding_of(4).pack(sheet, 2))
+    assert tile_sizes(sheet).tolist() == [*sizes, 0]
+
+
+def _on_levels(model):
+    """The model with networks on 8-bit levels."""
+    profile, nets = model.profile, {}
+    for name, temporal in (("net", True), ("net_static", False)):
+        inputs, width = profile.inputs(temporal), profile.hidden
+        values = torch.from_numpy(getattr(model, name).astype(np.float32))
+        split = (inputs + width + 2) * width
+        parts = values[:, :split].reshape(-1, inputs + width + 2, width), values[:, split:].reshape(-1, width + 1, 3)
+        nets[name] = (
+            torch.cat([part.flatten(1) for part in put_on_levels(*parts, inputs)], 1).numpy().astype(np.float16)
+        )
+    return dataclasses.replace(model, profile=profile.override({"net_bits": 8}), **nets)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-6, 1e4, 0.0])
+def test_networks_of_bytes_come_back(tmp_path, factor):
+    model = random_sheet((3, 2, 3, 2), hidden=17)
+    nets = {name: (getattr(model, name) * np.float16(factor)).astype(np.float16) for name in ("net", "net_static")}
+    other = _on_levels(dataclasses.replace(model, **nets))
+    size = _file_of(other).save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), _file_of(other))
+    if factor == 1.0:
+        assert _file_of(model).file_bytes() - size > 0.3 * (model.net.nbytes + model.net_static.nbytes)
+        apart = np.abs(other.net.astype(float) - model.net).max() / np.abs(model.net).max()
+        assert 0 < apart < 0.5 / 127 + 1e-3
+
+
+def test_networks_off_their_levels_are_one_line(tmp_path):
+    sheet = random_sheet((3, 0))
+    wrong = dataclasses.replace(sheet, profile=sheet.profile.override({"net_bits": 8}))
+    assert "net: expected weights on 8-bit levels" in error_of(_file_of(wrong).save, tmp_path / "a.wlm")
+
+
+def test_a_fit_on_levels_is_what_its_file_decodes_to(tmp_path):
+    profile = small_sets.tiny_profile(net_bits=8, steps=60)
+    lightmaps = small_sets.moving_light()
+    model = wlm.lightmap.compress(lightmaps, profile)
+    model.save(tmp_path / "a.wlm")
+    assert_same(wlm.load(tmp_path / "a.wlm"), model)
+    plain = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(steps=60))
+    scores = [wlm.lightmap.evaluate(each, lightmaps, metrics=["psnr"]).psnr for each in (model, plain)]
+    assert abs(scores[0] - scores[1]) < 2.0
+    assert not np.array_equal(model.sheets[LIGHT].net, plain.sheets[LIGHT].net)

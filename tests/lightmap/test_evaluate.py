@@ -1,6 +1,7 @@
-"""Scores: those of the protocol, over the tiles that a model has."""
+"""Scores: those of the protocol, over the tiles that a model has, and of a short fit of the demo set."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.codec import part_bytes
-from wlm.lightmap.data import from_arrays
+from wlm.lightmap.data import from_arrays, load
 from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light
 from wlm.lightmap.fit import compress
 from wlm.lightmap.sheet import LIGHT
@@ -163,3 +164,22 @@ def test_each_hour_is_scored_on_its_own_texels():
         for i, hour in enumerate(HOURS)
     ]
     np.testing.assert_allclose(report.light.psnr_by_time, np.ravel(expected), rtol=1e-6)
+
+
+DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
+
+
+@pytest.fixture(scope="module")
+def demo_report():
+    day = load(DEMO)
+    return evaluate(compress(day, "M", steps=800, samples=1024), day, metrics=("psnr", "seen"), views=0)
+
+
+@pytest.mark.parametrize(("name", "least"), [("psnr", 41.0), ("seen", 42.0), ("ring", 37.0), ("between", 42.5)])
+def test_light_is_as_right_as_it_was(demo_report, name, least):
+    """At texels, filtered, beside charts, and half-way between hours, dB; seeds differ by 0.2."""
+    assert getattr(demo_report, name) >= least
+
+
+def test_the_file_is_as_small_as_it_was(demo_report):
+    assert demo_report.bpp <= 0.62

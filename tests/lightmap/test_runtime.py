@@ -1,15 +1,24 @@
-"""The runtime decoders against the decoder on the host's side and the float64 path."""
+"""The runtime decoders and the texture of the whole map, against the decoder on the host and the float64 path."""
 
 import numpy as np
 import pytest
-from builders.synthetic import random_sheet
+import warp as wp
+from builders.synthetic import random_model, random_sheet
+from typer.testing import CliRunner
 
 from wlm import interop
+from wlm.cli.app import app
 from wlm.errors import WlmError
+from wlm.formats.dds import read_dds, write_dds
+from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.exact import colour_tile64
 from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder
+from wlm.lightmap.runtime_texture import MapDecoder
 from wlm.lightmap.tiles import TileKind
+from wlm.texels import near_gaps
+from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel
+from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack_kernel
 
 KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic ones
 
@@ -89,3 +98,99 @@ def test_what_is_refused():
         StripDecoder(random_sheet((3, 0)), gelu="relu")
     with pytest.raises(WlmError, match="finite"):
         StripDecoder(random_sheet((3, 0))).set_time(float("inf"))
+
+
+MAP_KINDS = (3, 4, 2, 1, 4, 3)
+
+
+@wp.kernel
+def _both_ways(light: wp.array1d[wp.vec3], words: wp.array1d[wp.uint32], back: wp.array1d[wp.vec3]):
+    i = wp.tid()
+    words[i] = pack_kernel(light[i])
+    back[i] = unpack_kernel(words[i])
+
+
+def test_texels_are_packed_as_on_the_host(device):
+    random = np.random.default_rng(0)
+    light = random.random((4000, 3)) * 2.0 ** random.integers(-26, 17, (4000, 1))
+    powers = 2.0 ** np.arange(-25, 17)
+    edges = np.concatenate([powers, np.nextafter(powers, 0), powers * (1 - 1 / 1024)])[:, None] * [1.0, 0.5, 0.0]
+    light = np.concatenate([light, edges, [[0, 0, 0], [LARGEST, 1e9, 0], [-1, 0.5, 0]]]).astype(np.float32)
+    words, back = (
+        wp.empty(len(light), dtype=wp.uint32, device=device),
+        wp.empty(len(light), dtype=wp.vec3, device=device),
+    )
+    wp.launch(_both_ways, len(light), [wp.array(light, dtype=wp.vec3, device=device), words, back], device=device)
+    np.testing.assert_array_equal(back.numpy(), unpack_rgb9e5(words.numpy()))
+    # A half is rounded up here and to even there.
+    expected = unpack_rgb9e5(pack_rgb9e5(light))
+    step = np.maximum(light.max(1, keepdims=True), 2.0**-16).clip(max=LARGEST) / 256
+    assert (np.abs(back.numpy() - expected) <= step).all() and (back.numpy() == expected).mean() > 0.999
+
+
+@pytest.mark.parametrize("time", [7.5, 9.0])
+def test_the_map_is_that_of_the_host(time, device):
+    mask = np.zeros((236, 375), bool)
+    mask[20:60, 30:128] = mask[100:180, 60:90] = mask[40:200, 126:150] = mask[130:200, 200:340] = True
+    model = random_sheet(MAP_KINDS, mask=mask, hidden=16, columns=3)
+    decoder = MapDecoder(model, device)
+    decoder.set_time(time)
+    decoder.decode()
+    expected = SheetDecoder(model, device).frame(time)
+    step = expected.max(2, keepdims=True) / 256
+    # Half a step of each of both times and of their mixture.
+    assert (np.abs(decoder.numpy() - expected) <= (1.5 if time == 9.0 else 0.5) * step + 1e-6).all()
+
+
+def test_mips_hold_charts_alone(device):
+    mask = np.zeros((236, 247), bool)
+    mask[:64, 5:70] = mask[117:, 90:] = mask[235, 0] = True
+    model = random_sheet((3, 3, 1, 3), mask=mask, hidden=16)
+    decoder = MapDecoder(model, device)
+    decoder.decode()
+    assert [level.shape for level in decoder.levels] == [(236 >> i, 247 >> i) for i in range(8)]
+    light, weight = decoder.numpy().astype(np.float64), mask.astype(float)
+    for level in range(1, 8):
+        rows, columns = (np.minimum(np.arange(size) // 2, max(size // 2, 1) - 1) for size in weight.shape)
+        shape = decoder.levels[level].shape
+        total, summed = np.zeros(shape), np.zeros((*shape, 3))
+        np.add.at(total, (rows[:, None], columns[None]), weight)
+        np.add.at(summed, (rows[:, None], columns[None]), weight[..., None] * light)
+        mean = summed / np.maximum(total, 1)[..., None]
+        light, weight = decoder.numpy(level).astype(np.float64), total
+        inside = total > 0
+        assert (np.abs(light - mean)[inside] <= mean[inside].max(1, keepdims=True) / 500 + 1e-7).all()
+        target, source = near_gaps(inside)
+        np.testing.assert_array_equal(light[tuple(target.T)], light[tuple(source.T)])
+        inside[tuple(target.T)] = True
+        assert (light[~inside] == 0).all()
+    assert len(MapDecoder(model, device, mips=0).levels) == 1
+    with pytest.raises(WlmError, match="mips: expected 0 to 7 for a map of 247x236, got 8"):
+        MapDecoder(model, device, mips=8)
+
+
+def test_mips_leave_out_tiles_that_the_file_lacks(device):
+    decoder = MapDecoder(random_sheet((3, 0, 1, 3), hidden=16), device)
+    decoder.decode()
+    light, whole = decoder.numpy().astype(np.float64), len(decoder.levels) - 1
+    stored = np.ones(light.shape[:2], bool)
+    stored[:128, 128:] = False
+    # The mean is rounded at each level.
+    np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[stored].mean(0), rtol=0.03)
+
+
+def test_the_command_writes_the_texture(tmp_path):
+    model = random_model(MAP_KINDS, hidden=16)
+    model.save(tmp_path / "a.wlm")
+    files = ["-o", str(tmp_path / "a.exr"), "--texture", str(tmp_path / "a.dds")]
+    assert CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
+    (sheet,) = model.sheets.values()
+    decoder = MapDecoder(sheet)
+    decoder.set_time(9.0)
+    decoder.decode()
+    image, _ = read_dds(tmp_path / "a.dds")
+    np.testing.assert_array_equal(image, decoder.numpy())
+    size = sum(level.size for level in decoder.levels) * 4
+    assert (tmp_path / "a.dds").stat().st_size == 148 + size
+    with pytest.raises(ValueError, match="mips: expected 0 to 3, got 4"):
+        write_dds(tmp_path / "b.dds", b"", 8, 8, fmt="R9G9B9E5_SHAREDEXP", mips=4)

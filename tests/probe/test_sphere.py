@@ -1,9 +1,13 @@
-"""SH evaluation against quadrature, SciPy's complex harmonics and light whose irradiance is known."""
+"""Spherical harmonics against quadrature, SciPy and known light, and the conventions of the engines."""
+
+import math
 
 import numpy as np
 import pytest
 from scipy.special import eval_legendre, sph_harm_y
 
+from wlm.errors import WlmError
+from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
 from wlm.probe.sphere import (
     basis,
     coefficient_bands,
@@ -148,3 +152,207 @@ def test_wrong_use_is_refused():
         basis(np.ones(3), 4)
     with pytest.raises(ValueError, match=r"\[..., C, 3\]"):
         irradiance(np.zeros(27), unit(1))
+
+
+LIMITED = ("unreal", "unity")
+
+
+def directions(count=64, seed=3):
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def sphere():
+    """Directions and solid angles that integrate polynomials up to degree 11 over the sphere exactly."""
+    z, weight = np.polynomial.legendre.leggauss(6)
+    turn = np.arange(12) * (2.0 * np.pi / 12)
+    z, phi = (a.ravel() for a in np.meshgrid(z, turn, indexing="ij"))
+    r = np.sqrt(1.0 - z**2)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], 1), np.repeat(weight, 12) * (2.0 * np.pi / 12)
+
+
+def cosine_hemisphere(normal):
+    """Directions above a normal and weights that integrate L(w) max(0, n w) for polynomials L up to degree 5."""
+    node, weight = np.polynomial.legendre.leggauss(8)
+    cosine, weight = (node + 1.0) / 2.0, weight / 2.0
+    turn = np.arange(12) * (2.0 * np.pi / 12)
+    mu, phi = (a.ravel() for a in np.meshgrid(cosine, turn, indexing="ij"))
+    side = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    r = np.sqrt(1.0 - mu**2)[:, None]
+    way = mu[:, None] * normal + r * (np.cos(phi)[:, None] * side + np.sin(phi)[:, None] * np.cross(normal, side))
+    return way, np.repeat(cosine * weight, 12) * (2.0 * np.pi / 12)
+
+
+def light(d):
+    """Radiance of a made-up surrounding, a polynomial of degree 2: [M, 3]."""
+    x, y, z = d.T
+    red = 1.0 + 0.3 * x - 0.5 * y + 0.7 * z + 0.2 * x * y - 0.3 * y * z + 0.4 * z * z + 0.15 * x * z - 0.25 * x * x
+    return np.stack([red, 2.0 - 0.9 * y + 0.5 * x * z, 0.7 + 0.6 * z * z - 0.4 * x * y], 1)
+
+
+def canonical_basis(d):
+    """The canonical basis, from its polynomials up to factors, made orthonormal numerically."""
+
+    def polynomials(d):
+        x, y, z = d.T
+        return np.stack([x**0, y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], 1)
+
+    around, solid = sphere()
+    return polynomials(d) / np.sqrt(solid @ polynomials(around) ** 2)
+
+
+def canonical_coefficients():
+    """The light's projection onto the canonical basis, float64 [1, 9, 3] (gaussian-probe-compression, eq. 1)."""
+    d, solid = sphere()
+    return np.einsum("m,mc,mk->ck", solid, canonical_basis(d), light(d))[None]
+
+
+def irradiance_over_pi(normals):
+    """What a white diffuse surface reflects, by quadrature: [M, 3]."""
+    return np.stack([weight @ light(way) for way, weight in map(cosine_hemisphere, normals)]) / np.pi
+
+
+def threejs_get_at(c, d):
+    x, y, z = d.T[..., None]
+    return (
+        0.282095 * c[0]
+        + 0.488603 * (y * c[1] + z * c[2] + x * c[3])
+        + 1.092548 * (x * y * c[4] + y * z * c[5] + x * z * c[7])
+        + 0.315392 * (3.0 * z * z - 1.0) * c[6]
+        + 0.546274 * (x * x - y * y) * c[8]
+    )
+
+
+def godot_shader(c, n):
+    """What the ambient light of a surface gets from its lightmap probes."""
+    x, y, z = n.T[..., None]
+    return (
+        0.886227 * c[0]
+        + 1.023327 * (c[1] * y + c[2] * z + c[3] * x)
+        + 0.858086 * (c[4] * x * y + c[5] * y * z + c[7] * x * z)
+        + 0.247708 * c[6] * (3.0 * z * z - 1.0)
+        + 0.429043 * c[8] * (x * x - y * y)
+    )
+
+
+def unreal_basis(d):
+    x, y, z = d.T
+    columns = [
+        0.282095 + 0.0 * x,
+        -0.488603 * y,
+        0.488603 * z,
+        -0.488603 * x,
+        1.092548 * x * y,
+        -1.092548 * y * z,
+        0.315392 * (3.0 * z * z - 1.0),
+        -1.092548 * x * z,
+        0.546274 * (x * x - y * y),
+    ]
+    return np.stack(columns, 1)
+
+
+def unity_shade_sh9(c, n):
+    """Two dot products and a last term, from the constants that Unity uploads for a probe."""
+    x, y, z = n.T[..., None]
+    linear = c[3] * x + c[1] * y + c[2] * z + (c[0] - c[6])
+    quadratic = c[4] * x * y + c[5] * y * z + 3.0 * c[6] * z * z + c[7] * z * x
+    return linear + quadratic + c[8] * (x * x - y * y)
+
+
+def test_threejs_is_canonical_and_yields_radiance():
+    d = directions()
+    coefficients = from_canonical(canonical_coefficients(), "threejs")[0]
+    np.testing.assert_allclose(threejs_get_at(coefficients, d), light(d), atol=1e-5)
+
+
+def test_godot_shader_yields_irradiance_over_pi():
+    n = directions(20)
+    coefficients = from_canonical(canonical_coefficients(), "godot")[0]
+    np.testing.assert_allclose(godot_shader(coefficients, n), irradiance_over_pi(n), atol=1e-5)
+
+
+def test_godot_bake_becomes_canonical():
+    # The baker's estimate with evenly spread rays: 4 / rays times the sum of light times basis.
+    d, solid = sphere()
+    share = solid / solid.sum()
+    baked = 4.0 * np.einsum("m,mc,mk->ck", share, canonical_basis(d), light(d))[None]
+    np.testing.assert_allclose(to_canonical(baked, "godot"), canonical_coefficients(), atol=1e-12)
+
+
+def test_unreal_basis_yields_radiance_and_diffuse_transfer():
+    d = directions()
+    coefficients = from_canonical(canonical_coefficients(), "unreal")[0]
+    np.testing.assert_allclose(unreal_basis(d) @ coefficients, light(d), atol=1e-5)
+    transfer = np.repeat([np.pi, 2.0 * np.pi / 3.0, np.pi / 4.0], [1, 3, 5])
+    np.testing.assert_allclose((unreal_basis(d) * transfer) @ coefficients / np.pi, irradiance_over_pi(d), atol=1e-5)
+
+
+def test_unity_evaluation_yields_irradiance_over_pi():
+    n = directions()
+    coefficients = from_canonical(canonical_coefficients(), "unity")[0]
+    np.testing.assert_allclose(unity_shade_sh9(coefficients, n), irradiance_over_pi(n), atol=1e-12)
+
+
+def test_unity_lights():
+    # AddAmbientLight adds the colour to the first number alone.
+    ambient = np.zeros((1, 9, 3))
+    ambient[0, 0] = 0.2, 0.5, 0.9
+    d = directions(20)
+    np.testing.assert_allclose(canonical_basis(d) @ to_canonical(ambient, "unity")[0], np.tile(ambient[0, 0], (20, 1)))
+    # AddDirectionalLight: a far light of 16 pi / 17 shows its own colour on a surface that faces it, and its numbers
+    # are colour * 16 pi / 17 * basis * (1 / 2 sqrt(pi), sqrt(3) / 3 sqrt(pi), sqrt(15) / 8 sqrt(pi), ...).
+    colour, power, root = np.array([1.0, 0.6, 0.3]), 16.0 * math.pi / 17.0, math.sqrt(math.pi)
+    towards = directions(5, seed=8)
+    for way in towards:
+        shone = (power * canonical_basis(way[None])[0][:, None] * colour)[None]
+        stored = from_canonical(shone, "unity")
+        np.testing.assert_allclose(unity_shade_sh9(stored[0], way[None])[0], colour)
+        factor = [0.5, *[math.sqrt(3.0) / 3.0] * 3, *[math.sqrt(15.0) / 8.0] * 2, math.sqrt(5.0) / 16.0]
+        factor = np.array([*factor, math.sqrt(15.0) / 8.0, math.sqrt(15.0) / 16.0]) / root
+        expected = unreal_basis(way[None])[0] * np.array([1, -1, 1, -1, 1, -1, 1, -1, 1]) * factor
+        np.testing.assert_allclose(stored[0], power * expected[:, None] * colour, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize("coefficients", [1, 4, 9])
+def test_round_trip(name, coefficients):
+    values = np.random.default_rng(1).normal(size=(50, coefficients, 3)).astype(np.float32)
+    for first, second in ((to_canonical, from_canonical), (from_canonical, to_canonical)):
+        back = second(first(values, name), name)
+        assert back.dtype == np.float64
+        np.testing.assert_allclose(back, values, rtol=4e-16)
+        np.testing.assert_array_equal(back.astype(np.float32), values)
+    if name != CANONICAL:
+        assert not np.array_equal(from_canonical(values, name), values) or (name, coefficients) == ("unreal", 1)
+
+
+def test_values_are_left_alone_and_nan_stays_nan():
+    values = np.ones((2, 4, 3))
+    values[1, 2, 0] = np.nan
+    for name in CONVENTIONS:
+        converted = to_canonical(values, name)
+        assert np.isnan(converted).sum() == 1 and np.isnan(converted[1, 2, 0])
+    converted[:] = 0.0
+    assert values[0, 0, 0] == 1.0
+
+
+@pytest.mark.parametrize("name", ["threejs", "godot"])
+def test_higher_bands_where_a_convention_has_a_rule_for_them(name):
+    values = np.ones((1, 25, 3))
+    np.testing.assert_allclose(from_canonical(values, name), 1.0 if name == "threejs" else 1.0 / np.pi)
+
+
+def test_errors():
+    for name in LIMITED:
+        with pytest.raises(WlmError, match=rf"convention {name}: knows L0 to L2, got L3 \(16 coefficients\)"):
+            to_canonical(np.ones((1, 16, 3)), name)
+    for name in CONVENTIONS:
+        for count in (2, 8):
+            with pytest.raises(WlmError, match=f"convention {name}: expected 1, 4, 9 ... coefficients .* got {count}"):
+                from_canonical(np.ones((1, count, 3)), name)
+    with pytest.raises(WlmError, match="convention: expected threejs, godot, unreal, unity, got 'frostbite'"):
+        to_canonical(np.ones((1, 9, 3)), "frostbite")
+    for shape in ((9, 3), (1, 3, 9), (1, 9, 4)):
+        with pytest.raises(ValueError, match=r"\[N, C, 3\]"):
+            to_canonical(np.ones(shape), CANONICAL)
