@@ -58,9 +58,10 @@ def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
     return _run(march_lit, (), scene, device, toward, March(**march))
 
 
-@pytest.mark.parametrize("kind", TYPES)
-@pytest.mark.parametrize("perspective", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("turned", "perspective", "kind"),
+    [(False, False, "float"), (True, False, "half"), (False, True, "half"), (True, True, "float")],
+)
 def test_guide_against_reference(device: str, turned: bool, perspective: bool, kind: str):
     """Algorithm 1 with a march from each sample, at a step that is no divisor of anything."""
     scene = _scene(turned, perspective)
@@ -68,23 +69,6 @@ def test_guide_against_reference(device: str, turned: bool, perspective: bool, k
     expected = reference.guide(scene, 2.37, 0.3, 0.1)
     for plane in range(3):
         close(result[plane], expected[plane], LOOSE, f"plane {plane}")
-
-
-def test_shared_lights(device: str):
-    """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
-    scene = _scene(True)
-    medium = Medium(array(scene.density, float, device), scene.extinction)
-    nodes = marches.guide_nodes(medium, scene.up, 2.5)
-    close(nodes.numpy(), reference.nodes(scene, 2.5), LOOSE, "nodes")
-    marched, coarse, fine = (
-        _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
-        for step, shared in ((0.1, False), (2.0, True), (0.1, True))
-    )
-    error = [np.sqrt(np.square(result - marched).mean() / np.square(marched).mean()) for result in (coarse, fine)]
-    # Of noise from voxel to voxel, the worst that a lattice can meet.
-    assert error[1] < 0.012 < error[0] < 0.2
-    nodes = marches.guide_nodes(medium, scene.up, 0.01)
-    assert nodes.shape == (11, 14, 12)
 
 
 def test_jitter(device: str):
@@ -112,9 +96,9 @@ def test_cutoff(device: str):
         np.testing.assert_array_equal(cut[2], whole[2])
 
 
-@pytest.mark.parametrize("kind", TYPES)
-@pytest.mark.parametrize("inside", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("turned", "inside", "kind"), [(False, False, "half"), (True, False, "float"), (True, True, "half")]
+)
 def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind: str, monkeypatch):
     """With the same samples, in slabs of a few planes; from inside the smoke too, and smoke that glows."""
     scene = _scene(turned, inside=inside)
@@ -125,15 +109,6 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
     for plane in range(8):
         assert expected[plane].max() > 0.01
         close(result[plane], expected[plane], LOOSE, f"plane {plane}")
-
-
-def test_image_smaller_than_the_smoke(device: str):
-    """Smoke outside the image still casts its shadow: a window of the map is the map of the window."""
-    scene = _scene(True)
-    scene.height = scene.width = 16
-    whole = _six(scene, device, step=0.8)
-    scene.height, scene.width = 4, 6
-    close(_six(scene, device, step=0.8), whole[:, 6:10, 5:11], LOOSE, "window")
 
 
 def test_six_way_against_single_lights(device: str):

@@ -64,7 +64,7 @@ def test_what_lies_in_the_gaps_changes_nothing():
     zeros, garbage = frames.copy(), frames.copy()
     zeros[:, ~mask] = 0.0
     garbage[:, ~mask] = np.nan
-    a, b = (encode(given, mask, steps=300) for given in (zeros, garbage))
+    a, b = (encode(given, mask, steps=150) for given in (zeros, garbage))
     np.testing.assert_array_equal(a.decoded, b.decoded)
     # The ring that a filtered read reaches is like the texels beside it; beyond it nothing is stored.
     np.testing.assert_allclose(a.decoded[:, 7, 12:33], frames[:, 6, 12:33], atol=0.25 * frames.max())
@@ -84,15 +84,6 @@ def test_a_network_for_each_region(monkeypatch):
     alone = encode(frames[:, :, :20], steps=20)
     # The first half is fitted as it would be alone, but for the ranges of the tile.
     assert abs(psnr(frames[:, :, :20], halves.decoded[:, :, :20]) - psnr(frames[:, :, :20], alone.decoded)) < 2.0
-
-
-def test_ranges_are_of_tiles():
-    """A dark tile beside a bright one is as good, relative to its own light."""
-    frames = moving_light(16, 256, hours=(0.0, 12.0)).light.frames.copy()
-    frames[:, :, 128:] *= 1e-3
-    decoded = encode(frames, steps=300).decoded
-    bright, dark = psnr(frames[:, :, :128], decoded[:, :, :128]), psnr(frames[:, :, 128:], decoded[:, :, 128:])
-    assert abs(bright - dark) < 4.0 and dark > 20.0
 
 
 def test_it_is_a_method_that_takes_a_device(monkeypatch):

@@ -188,13 +188,6 @@ def test_closest_subspace_is_found():
     assert total == pytest.approx(error.min(1).sum())
 
 
-def test_comparison_in_chunks_changes_nothing(monkeypatch):
-    values = _probes()[1].astype(np.float64)
-    whole = probe_pca.by_signal(values, 6, 2, 0)
-    monkeypatch.setattr(probe_pca, "_CHUNK", 100)
-    np.testing.assert_array_equal(probe_pca.by_signal(values, 6, 2, 0).label, whole.label)
-
-
 @pytest.mark.parametrize("grid", [1, 4])
 def test_moving_basis_never_gets_worse_and_beats_pca(grid):
     position, values = _probes()
@@ -216,16 +209,6 @@ def test_moving_basis_never_gets_worse_and_beats_pca(grid):
             assert found < _error(values, global_pca(position, values, k).decoded)
     none = moving_basis(position, values, 3, grid, 0).decoded
     assert _error(values, none) == pytest.approx(_error(values, global_pca(position, values, 3).decoded), rel=1e-3)
-
-
-def test_moving_basis_fits_a_basis_that_moves():
-    random = np.random.default_rng(5)
-    position = random.uniform(size=(300, 3))
-    ends = random.normal(size=(2, 12))
-    turning = ends[0] + position[:, :1] * (ends[1] - ends[0])
-    values = (random.normal(size=(300, 1)) * turning).astype(np.float32)
-    plain = _error(values, global_pca(position, values, 1).decoded)
-    assert _error(values, moving_basis(position, values, 1, 1, 60).decoded) < 2e-3 * plain
 
 
 @pytest.mark.parametrize("bits", [None, 8])
@@ -354,14 +337,14 @@ def test_unreal_refuses():
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_at_bytes_keeps_the_size_and_uses_it(name):
-    position, values = _probes(count=300)
-    budgets = [int(share * values.nbytes) for share in (0.09, 0.28, 0.5)]
+    position, values = _probes(count=150)
+    budgets = [int(share * values.nbytes) for share in (0.15, 0.28, 0.5)]
     results = [at_bytes(name, position, values, budget) for budget in budgets]
     for result, budget in zip(results, budgets, strict=True):
         assert result.name == name and result.bytes <= budget
     errors = [_error(values, result.decoded) for result in results]
     assert errors[0] > errors[1] >= errors[2]
-    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 300 probes"):
+    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 150 probes"):
         at_bytes(name, position, values, 20)
 
 
@@ -372,7 +355,7 @@ def test_at_bytes_finds_the_best_of_all_settings():
         result
         for bits in (8, None)
         for k in range(1, 13)
-        for clusters in range(1, 60, 4)
+        for clusters in range(1, 40, 6)
         if (result := clustered_pca(position, values, k, clusters, bits=bits)).bytes <= budget
     ]
     best = min(_error(values, result.decoded) for result in tried)
@@ -380,14 +363,6 @@ def test_at_bytes_finds_the_best_of_all_settings():
     assert _error(values, found.decoded) <= best * 1.1
     half = at_bytes("clustered_pca", position, values, budget, (None,))
     assert "half floats" in half.option and _error(values, half.decoded) >= _error(values, found.decoded)
-
-
-def test_at_bytes_finishes_the_moving_basis():
-    position, values = _probes(count=300)
-    found = at_bytes("moving_basis", position, values, int(0.3 * values.nbytes), (None,))
-    components, grid = (int(word.strip("K=,")) for word in found.option.split()[0:3:2])
-    again = moving_basis(position, values, components, grid)
-    np.testing.assert_array_equal(found.decoded, again.decoded)
 
 
 def test_at_bytes_with_little_and_wrong_input():

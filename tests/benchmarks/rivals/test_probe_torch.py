@@ -96,18 +96,6 @@ def test_loss_falls_and_seeds_repeat():
     assert losses(3) == first and losses(4) != first
 
 
-def test_run_counts_steps_and_seconds(device):
-    x, values = room(40)
-    fit = dense(x, values, device=device)
-    fit.run(3)
-    once = fit.seconds
-    assert fit.steps_done == 3 and once > 0.0
-    fit.run(2)
-    assert fit.steps_done == 5 and fit.seconds > once
-    fit.run(0)
-    assert fit.steps_done == 5
-
-
 def test_one_probe_and_probes_at_one_place():
     for x, values, count in (
         (np.full((1, 3), 0.5), np.ones((1, 1)), 1),
