@@ -1,7 +1,7 @@
 """Gaussians as GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
 
-The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the numbers of the Gaussians are the fit's
-own codes: they take as many bytes and decode to exactly the trained numbers.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the numbers of the Gaussians are the
+fit's own codes: they take as many bytes and decode to exactly the trained numbers.
 """
 
 import numpy as np

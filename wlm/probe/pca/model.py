@@ -4,8 +4,8 @@
 
 The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe. The
 directions b_k are the right singular vectors of all probes' numbers; with as many directions as numbers they are the
-unit vectors, which take no memory (Sloan et al., Clustered Principal Components for Precomputed Radiance Transfer, 2003,
-with one cluster).
+unit vectors, which take no memory. This is the method of Sloan et al., Clustered Principal Components for Precomputed
+Radiance Transfer, 2003, with one cluster.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Components(Content):
 
     @property
     def count(self) -> int:
-        """K."""
+        """Number of components, K."""
         return self.code.shape[1] - 1
 
     @property

@@ -174,11 +174,10 @@ def loop_frames(position: np.ndarray, step: float) -> int:
 
 
 def camera_path(position: np.ndarray, frames: int, *, up: int = 1) -> np.ndarray:
-    """Returns a closed loop through a scene: an ellipse in the probes' box that follows the ground at eye height,
-    an 80th of the longest side of the box.
+    """Returns a closed loop through a scene: an ellipse in the probes' box that follows the ground at eye height.
 
-    The ground at a point is the median height of the 16 probes nearest to it in plan, averaged over an eighth of the
-    loop, so that the viewer does not jump onto a roof.
+    The eye height is an 80th of the longest side of the box. The ground at a point is the median height of the 16
+    probes nearest to it in plan, averaged over an eighth of the loop, so that the viewer does not jump onto a roof.
 
     Args:
         position: [N, 3], of the live probes.
