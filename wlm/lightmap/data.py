@@ -425,12 +425,7 @@ class _Reader:
         self._made = 0  # bytes of the sheets that memory was allocated for
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
-        """Reads a layer of an atlas at all times.
-
-        Args:
-            atlas, layer: The atlas and the layer.
-            mask: "alpha" requires an alpha channel, None reads one if the first picture has it, "all" ignores it.
-        """
+        """Reads a layer of an atlas at all times."""
         sources = [state[atlas.name, layer.name] for state in self._listing.states]
         first = sources[0]
         pixels, names = _read(first, layer)
@@ -565,16 +560,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Applies the module's table to the frames of a sheet.
-
-        Args:
-            name: Name of the set.
-            sheet: The sheet.
-            frames: [T, H, W, 3] in the order of the times, repaired in place.
-            mask: [H, W], or [T, H, W] in the order of the times.
-            warnings: Lines that come first.
-            mesh: See `SheetFrames`.
-        """
+        """Applies the module's table to the frames of a sheet."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")

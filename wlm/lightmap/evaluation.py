@@ -290,9 +290,6 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
 
     Returns:
         Lines with the number of texels and the largest loss.
-
-    Raises:
-        WlmError: As for `evaluate`.
     """
     lines = []
     for sheet, own in model.sheets.items():
@@ -336,9 +333,6 @@ def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
         model: The sheet's model.
         mask: Valid texels of the input, bool [H, W].
         size: Bytes.
-
-    Raises:
-        WlmError: The model holds no tile.
     """
     return size * 8 / (_area(model, mask) * len(model.times))
 
@@ -368,9 +362,6 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
 
     Returns:
         bool [H, W], the valid texels of stored tiles: the texels that are scored.
-
-    Raises:
-        WlmError: As for `evaluate`.
     """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):

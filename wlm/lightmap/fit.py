@@ -299,11 +299,7 @@ class SheetFit:
         nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
 
     def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Stores the parts of a batch that are finished in a checkpoint; returns whether there are any.
-
-        Raises:
-            WlmError: The parts are wrong.
-        """
+        """Stores the parts of a batch that are finished in a checkpoint; returns whether there are any."""
         parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
         if parts is None:
             return False

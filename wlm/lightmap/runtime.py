@@ -56,9 +56,6 @@ class RuntimeDecoder:
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         raise NotImplementedError
 
@@ -227,9 +224,6 @@ def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -
 
     Args:
         model, device, shared: As for `StripDecoder`.
-
-    Raises:
-        WlmError: As for `StripDecoder`.
     """
     device = interop.check_device(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
@@ -243,9 +237,6 @@ def runtime_decoders(model: SheetModel, device: str = "cpu", shared: bool = Fals
 
     Args:
         model, device, shared: As for `StripDecoder`.
-
-    Raises:
-        WlmError: There is no such device.
     """
     decoders: list[RuntimeDecoder] = []
     if (model.kind == TileKind.DYNAMIC).any():

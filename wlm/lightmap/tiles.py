@@ -70,9 +70,6 @@ class TileGrid:
 
         Args:
             index: Number of the tile in [0, count).
-
-        Raises:
-            WlmError: The number is outside the grid.
         """
         if not 0 <= index < self.count:
             raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
@@ -80,11 +77,7 @@ class TileGrid:
         return row * TILE, column * TILE
 
     def window(self, index: int) -> tuple[slice, slice]:
-        """Returns the rows and the columns of the map that a tile covers.
-
-        Raises:
-            WlmError: The number is outside the grid.
-        """
+        """Returns the rows and the columns of the map that a tile covers."""
         y, x = self.origin(index)
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
 

@@ -408,11 +408,7 @@ class Trainer:
             )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps depend on.
-
-        Raises:
-            WlmError: As for `check`.
-        """
+        """Returns everything that later steps depend on."""
         self.check()
         result = {key: getattr(self, key) for key in _STATE} | self._moments
         for name, adam in self._adams.items():
@@ -492,9 +488,6 @@ class Fitter:
             seed: Seed of the fit.
             device: "cpu", "cuda" or "cuda:N".
             track: Whether to report the PSNR during the fit.
-
-        Raises:
-            WlmError: There is no such device.
         """
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
         self._trainer: Trainer | None = None
@@ -519,11 +512,7 @@ class Fitter:
         return Advance(self._trainer.step)
 
     def advance(self, seconds: float) -> Advance:
-        """Trains for some seconds, at least a few steps, or to the end of the batch.
-
-        Raises:
-            WlmError: The fit diverged.
-        """
+        """Trains for some seconds, at least a few steps, or to the end of the batch."""
         trainer = self._trainer
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
@@ -544,11 +533,7 @@ class Fitter:
         return Advance(step, *figures, parts)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps of the batch depend on.
-
-        Raises:
-            WlmError: The fit diverged.
-        """
+        """Returns everything that later steps of the batch depend on."""
         return self._trainer.state()
 
     def close(self) -> None:

@@ -157,11 +157,7 @@ class FrameTiles(DeviceTiles):
     """The frames of a sheet on a device."""
 
     def __init__(self, sheet: SheetModel, device: str) -> None:
-        """Uploads the frames.
-
-        Raises:
-            WlmError: The sheet has none.
-        """
+        """Uploads the frames."""
         super().__init__(sheet.numbers(TileKind.FRAMES))
         if not len(self.numbers):
             raise WlmError(f"{sheet.name}: expected at least one tile of frames, found none")

@@ -275,11 +275,7 @@ class MapTiles(DeviceTiles):
     """
 
     def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
-        """Uploads the tiles of a kind, DYNAMIC or STATIC.
-
-        Raises:
-            WlmError: The sheet has none.
-        """
+        """Uploads the tiles of a kind, DYNAMIC or STATIC."""
         profile, dynamic = sheet.profile, kind == TileKind.DYNAMIC
         rows = np.flatnonzero(sheet.kind[sheet.mapped] == kind)
         if not len(rows):
