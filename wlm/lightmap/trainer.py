@@ -85,16 +85,9 @@ class Trainer:
         device: str,
         track: bool = False,
     ):
-        """Uploads the targets and draws the initial parameters.
+        """Uploads the targets of STATIC or DYNAMIC tiles and draws the initial parameters.
 
-        Args:
-            profile: The settings.
-            axis: The time axis.
-            targets: The training data.
-            temporal_maps: Whether the tiles are DYNAMIC instead of STATIC.
-            seed: Seed of the initial parameters and of all samples.
-            device: As `interop.check_device` returns it.
-            track: Whether to sum the errors that `psnr` needs.
+        The seed is that of the parameters and of all samples; `track` sums the errors that `psnr` needs.
         """
         self._track = track
         self.axis, self.device, self.temporal = axis, device, temporal_maps
@@ -482,13 +475,7 @@ class Fitter:
     """Fits batches of tiles one after another, in this process or in another one (`wlm.workers`)."""
 
     def __init__(self, seed: int, device: str, track: bool) -> None:
-        """Takes the settings that all batches share.
-
-        Args:
-            seed: Seed of the fit.
-            device: "cpu", "cuda" or "cuda:N".
-            track: Whether to report the PSNR during the fit.
-        """
+        """Takes the seed, the device and whether to report the PSNR, which all batches share."""
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
         self._trainer: Trainer | None = None
 
