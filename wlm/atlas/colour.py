@@ -39,16 +39,8 @@ def quantise(
     weight: np.ndarray | torch.Tensor | None = None,
     device: str = "cpu",
 ) -> dict[str, np.ndarray]:
-    """Encodes T_p as it is stored.
-
-    Args:
-        texels: numbers [H, W, 3], linear, on any device.
-        colour: "half", "rgb9e5", "bc6h" or "astc".
-        weight: numbers [H, W], for "bc6h": the weight of each texel's squared error; None: equal weights.
-        device: Where BC6H is encoded.
-
-    Returns:
-        `texels` and, for a block format, `blocks` of `AtlasModel`.
+    """Encodes T_p, [H, W, 3] on any device, as it is stored: `texels` and, for a block format, `blocks` of
+    `AtlasModel`. BC6H uses the weights [H, W] of the texels' squared errors.
 
     Raises:
         WlmError: A package is missing; the line names the extra.
@@ -63,15 +55,8 @@ def quantise(
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
-    """Computes the samples that tiles decode to after they are stored.
-
-    Args:
-        samples: float32 [T, ny, nx, 3], finite, not negative; for blocks ny and nx are multiples of 4.
-        weight: float32 [T, ny, nx], weight of each sample's squared error.
-        colour: As for `quantise`.
-
-    Returns:
-        float32 [T, ny, nx, 3]. Half floats round by too little to matter.
+    """Computes the samples that tiles decode to after they are stored, float32 [T, ny, nx, 3], not negative; for blocks
+    ny and nx are multiples of 4. Half floats round by too little to matter.
 
     Raises:
         WlmError: A package is missing; the line names the extra.

@@ -13,21 +13,8 @@ above twice the 99.9th percentile counts as that: one bright texel must not make
 Errors are also measured as displayed on a screen: light is exposed so that nearly all of the original's charts are
 below white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
 
-The stated behaviours:
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-decoded exactly                       PSNR is `PSNR_CAP_DB`, 120 dB, in a view as in the mean;
-                                      1 - SSIM is 0; the seam ratio is NaN
-the reference is one grey, to within  the peak is 0, PSNR and SSIM are NaN, null in JSON: there is no
-a millionth                           range to measure against
-nothing covered in any view           the same, and the errors are NaN too
-no seam on any screen                 `seam_error` and `seam_ratio` are NaN
-an error at seams alone               `seam_ratio` is infinite, null in JSON
-FLIP of no covered view               NaN, null in JSON: FLIP uses only some of the views
-NaN or Inf in decoded colours         error that names the decoder
-====================================  ================================================================
+A figure without a meaning is NaN, null in JSON: PSNR and SSIM where the reference is one grey, to within a millionth,
+or nothing is covered, and seams where no border is in any view. An exact decoder has a PSNR of 120 dB (`PSNR_CAP_DB`).
 """
 
 import math
@@ -155,7 +142,6 @@ class Report(Score):
         geometry_bytes: Size of the triangles and masks in the file.
         gpu_bytes: Size of its textures and tables on a GPU.
         cr: Compression ratio of the textures (eq. 9).
-        cr_disk: Compression ratio of the file without triangles and masks.
     """
 
     method: str
@@ -164,7 +150,6 @@ class Report(Score):
     geometry_bytes: int
     gpu_bytes: int
     cr: float
-    cr_disk: float
 
 
 def evaluate(
@@ -205,7 +190,6 @@ def evaluate(
         geometry_bytes=geometry,
         gpu_bytes=-(-model.bits // 8),
         cr=model.compression_ratio,
-        cr_disk=model.disk_ratio(whole - geometry),
     )
 
 
@@ -291,13 +275,7 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes the labels for `compare` from the charts of a model's own UVs.
-
-    Args:
-        model: A model with `uv`.
-        scene: The scene that was compressed.
-        device: "cpu" or "cuda:N", where the points will be.
-    """
+    """Makes the labels for `compare` from the charts of a model's own UVs; the points will be on the device."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -316,6 +294,11 @@ def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
     return result
 
 
+def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
+    """Makes a decoder of the lightmaps themselves, read bilinearly."""
+    return _Reference(scene, check_device(device)).light
+
+
 class _Reference:
     """The original lightmaps, on the device unless they are too large."""
 
@@ -326,7 +309,7 @@ class _Reference:
             self._images = [image.to(device) for image in self._images]
         self._charts = [sheet.lightmaps[:, sheet.mask] for sheet in scene.sheets]
 
-    def light(self, points: Points, state: int) -> torch.Tensor:
+    def light(self, points: Points, state: int = 0) -> torch.Tensor:
         """Reads the lightmaps bilinearly at points, float32 [N, 3]."""
         if len(self._images) == 1:
             return raster.texture(self._image(0, state), points.uv)
@@ -497,16 +480,8 @@ def _texel_errors(
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Finds the pixels within 2 pixels of a border.
-
-    Args:
-        visible: int [h, w], triangles, -1 for none.
-        label: int [h, w], which differs on the two sides of a border.
-        place: int [F, 3], numbers of the corners' places in space.
-
-    Returns:
-        bool [h, w].
-    """
+    """Finds the pixels within 2 pixels of a border, bool [h, w]: of triangles, -1 for none, whose labels differ and
+    that share a place in space, int [F, 3]."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1
@@ -525,13 +500,8 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
 class _Similarity:
     """SSIM of one view's decoders, equal to `wlm.metrics.ssim` of the whole pictures.
 
-    That function compares two images on the host; this class computes the reference's part once for all decoders, on
-    their device, and only where the scene covers the picture.
-
-    Args:
-        hit: bool [h, w], the covered pixels, at least one.
-        target: float64 [N, 3], the reference there, row by row.
-        peak: The range.
+    That function compares two images on the host; this class computes the part of the reference, float64 [N, 3] at the
+    covered pixels [h, w], once for all decoders, on their device, and only where the scene covers the picture.
     """
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float) -> None:
@@ -557,11 +527,8 @@ class _Similarity:
         self._variance = square - self._mean.square()
 
     def mean(self, colour: torch.Tensor) -> float:
-        """Averages SSIM over covered pixels whose window is in the picture; NaN if there are none, or no range.
-
-        Args:
-            colour: float64 [N, 3], decoded.
-        """
+        """Averages SSIM of decoded colours [N, 3] over covered pixels whose window is in the picture; NaN if there are
+        none, or no range."""
         if not self._inside.numel():
             return math.nan
         picture = torch.where(self._hit, colour[self._source].permute(2, 0, 1), self._reference)
@@ -589,14 +556,7 @@ def _blur(image: torch.Tensor) -> torch.Tensor:
 
 
 class _Screen:
-    """The original in a view, as displayed on a screen.
-
-    Args:
-        factor: The exposure.
-        hit: bool [h, w], the covered pixels.
-        target: float [N, 3], the original's linear light there, row by row.
-        flip: Whether FLIP is computed too.
-    """
+    """The original in a view, as displayed on a screen with an exposure; FLIP is computed only if asked for."""
 
     def __init__(self, factor: float, hit: torch.Tensor, target: torch.Tensor, flip: bool) -> None:
         self._factor, self._shown = factor, self._coded(target, factor)
@@ -606,11 +566,7 @@ class _Screen:
         self._flip = flip
 
     def errors(self, light: torch.Tensor) -> tuple[float, float]:
-        """Computes the mean squared error of the covered pixels, and their FLIP or NaN.
-
-        Args:
-            light: float [N, 3], decoded.
-        """
+        """Computes the mean squared error of decoded light [N, 3] at the covered pixels, and their FLIP or NaN."""
         shown = self._coded(light, self._factor)
         mse = float(np.square(shown - self._shown).mean())
         if not self._flip:

@@ -19,7 +19,6 @@ from wlm.atlas import colour
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
-from wlm.atlas.mips import make_tail
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
@@ -29,8 +28,6 @@ from wlm.atlas.model import (
     Profile,
     SheetPlace,
     check_area,
-    tail_bits,
-    tail_codec,
 )
 from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.shared.fit import fit_shared
@@ -155,12 +152,10 @@ def _flushing(checkpoint: Checkpoint | None) -> Iterator[None]:
 
 
 def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
-    """Compresses one lightmap by tiles or by the cascade, compares it with a plain one, and adds mips."""
+    """Compresses one lightmap by tiles or by the cascade, and compares it with a plain one."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)
     if method == "tiles":
-        if profile.mips and tail_bits(*sheet.mask.shape) >= profile.budget * sheet.mask.size * SOURCE_BITS:
-            raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")
         model = fit_tiles(scene, grid, profile, seed, stages)
     else:
         model = fit_cascade(scene, group_triangles(sheet, profile, stages), profile, seed, stages)
@@ -172,9 +167,6 @@ def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, 
             model = with_fallback(scene, grid, model, profile, weight)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *sheet.mask.shape[::-1]))
-    if profile.mips:
-        with stages("mips"):
-            model = replace(model, tail=make_tail(sheet, tail_codec(model.colour), device))
     return model
 
 
@@ -194,18 +186,12 @@ def with_fallback(
 ) -> AtlasModel:
     """Returns the model, or a smaller lightmap with at most as many bits and no larger weighted error.
 
-    Args:
-        scene: A scene of one sheet and one state.
-        grid: The fine grid of its sheet.
-        model: The model, still without mips; None: the smaller lightmap has the budget's bits, and a texel, or a
-            block, at least.
-        profile: `budget`, `colour` and `mips`.
-        weight: float64 [2 H, 2 W], the weight of each cell; not used without a model.
+    The weights of cells are float64 [2 H, 2 W]. Without a model the smaller lightmap has the budget's bits, and a
+    texel, or a block, at least.
     """
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
-    mips = tail_bits(height, width) if profile.mips else 0
-    bits = profile.budget * sheet.mask.size * SOURCE_BITS - mips if model is None else model.bits
+    bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     size = fitting_size(height, width, bits, (block, block), COLOUR_BITS[format])

@@ -10,6 +10,7 @@ import torch
 
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import Report as AtlasReport
+from wlm.atlas.evaluation import original
 from wlm.atlas.model import AtlasModel
 from wlm.atlas.views import scene_views
 from wlm.lightmap.data import LightmapSet, SheetFrames
@@ -26,7 +27,7 @@ from wlm.smoke.evaluation import NETWORK, REFERENCE, Comparison, Example
 from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.planes import EMISSION_PLANE, PLANES, decode_lightmaps
 from wlm.smoke.shading import Light
-from wlm.view.atlas import draw, original
+from wlm.view.atlas import draw
 from wlm.view.display import Display, white_of
 from wlm.view.document import Document
 
@@ -147,7 +148,6 @@ def atlas_report(
         ("PSNR in views, tone mapped", _number(report.tone_psnr, ".2f", "dB")),
         ("FLIP", _number(report.flip, ".4f")),
         ("saved (eq. 9)", _number(100 * report.cr, ".2f", "%")),
-        ("saved on disk", _number(100 * report.cr_disk, ".2f", "%")),
         ("views that see the mesh", f"{report.views}"),
     ]
     warnings = [*scene.warnings, *([] if report.views else [unseen])]

@@ -152,12 +152,12 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 @wp.func
 def _alike(
     samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
-) -> int:
-    """Tests if Dist is below lambda in any order (eq. 3, 4): odd if it is, above 1 if samples had to be compared."""
+) -> bool:
+    """Tests if Dist is below lambda in any order (eq. 3, 4)."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
-        return 0
+        return False
     # Interpolation stays within a patch's range, so bounds from two ranges are valid for all samples and orders.
     most = int(0)
     least = int(0)
@@ -167,9 +167,9 @@ def _alike(
         most += wp.max(up, down)
         least += wp.max(0, wp.max(-up, -down))
     if most < rule.whole:
-        return 1
+        return True
     if least >= rule.whole:
-        return 0
+        return False
     large = x
     small = y
     if a.level < b.level:
@@ -186,14 +186,14 @@ def _alike(
     for order in range(6):
         bound = _along(above, order) / 3.0 + f.residual + g.residual
         if bound < rule.level - _MARGIN:
-            return 1
+            return True
         if bound < closest:
             closest = bound
             first = order
         if _along(below, order) < rule.level + _MARGIN:
             undecided += 1 << order
     if undecided == 0:
-        return 0
+        return False
     limit = rule.mixed[level]
     if a.level == b.level:
         limit = rule.same[level]
@@ -202,8 +202,8 @@ def _alike(
         order = (first + i) % 6
         if ((undecided >> order) & 1) == 1:
             if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
-                return 3
-    return 2
+                return True
+    return False
 
 
 @wp.kernel(enable_backward=False)
@@ -258,22 +258,16 @@ def _edges(
     offset: int,
     # out:
     edge: wp.array2d[wp.uint8],
-    compared: wp.array1d[wp.int64],
 ):
     """One patch per thread; each pair once, by the thread of the first."""
     a = offset + wp.tid()
     last = high[a] + rule.level + _MARGIN
-    count = wp.int64(0)
     for b in range(a + 1, low.shape[0]):
         if low[b] > last:
             break
-        alike = _alike(samples, patches, bounds, rule, a, b)
-        if alike > 1:
-            count += wp.int64(1)
-        if (alike & 1) == 1:
+        if _alike(samples, patches, bounds, rule, a, b):
             edge[a, b] = wp.uint8(1)
             edge[b, a] = wp.uint8(1)
-    compared[a] = count
 
 
 @wp.kernel(enable_backward=False)
@@ -303,7 +297,7 @@ def _join(
         if head_low[k] > high[a] + margin:
             break
         if rank[k] < best:
-            if (_alike(samples, patches, bounds, rule, heads[k], a) & 1) == 1:
+            if _alike(samples, patches, bounds, rule, heads[k], a):
                 best = rank[k]
     joined[i] = best
 
@@ -400,17 +394,16 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
     return out, out_bounds
 
 
-def find_edges(graph: Graph, begin: int, end: int, edge, compared) -> None:
+def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
     """Finds the edges between patches `begin` to `end` - 1 and any later one.
 
     Args:
         graph: The graph.
         begin, end: The range.
         edge: uint8 [M, M], 0; set to 1 in both places of an edge.
-        compared: int64 [M], written in the range: pairs that the bounds did not settle.
     """
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
-    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge, compared], device=edge.device)
+    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:

@@ -23,19 +23,18 @@ On CUDA gradients are added in any order: two fits with one seed differ in the l
 """
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.cascade.cluster import Clusters, Stats, cluster
+from wlm.atlas.cascade.cluster import Clusters, cluster
 from wlm.atlas.cascade.pack import pack, regenerate
 from wlm.atlas.colour import quantise
-from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedScene, Sheet
-from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace
+from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
@@ -69,16 +68,8 @@ class Textures:
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2).
-
-    Args:
-        sheet: The triangles and their lightmap.
-        profile: `threshold`, `colour_threshold` and `max_radiance`.
-        stages: Reports and times the stage.
-
-    Returns:
-        The groups; None if the threshold is 0, where no triangle shares texels.
-    """
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0, where no triangle
+    shares texels."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -101,8 +92,7 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
             progress=stages.progress,
         )
         if stages.checkpoint is not None:
-            parts = {field.name: getattr(clusters, field.name) for field in fields(Clusters)}
-            stages.checkpoint.add_finished(0, parts | {"stats": np.array(astuple(clusters.stats))})
+            stages.checkpoint.add_finished(0, vars(clusters))
         return clusters
 
 
@@ -172,15 +162,11 @@ def fit_cascade(
 
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
-    """Makes the textures that tuning starts from (section 3.3.3).
+    """Makes the textures that tuning starts from (section 3.3.3): T_p, each texel the mean of those that it covers, and
+    T_c.
 
-    Args:
-        lightmap: float32 [H_r, W_r, 3], the regenerated lightmap.
-        mask: bool [H_r, W_r], its texels that are used; the others are filled from them.
-        profile: `colour_scale` and `lut_scale`; a side is rounded, to at least one texel.
-
-    Returns:
-        T_p, each texel the mean of those it covers, and T_c; no T_c if `lut_scale` is 0.
+    The regenerated lightmap is float32 [H_r, W_r, 3], its used texels are bool [H_r, W_r]; the others are filled from
+    them.
     """
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
@@ -259,13 +245,12 @@ def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
         "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
         "distance": Part(np.float64, (count,), least=0.0),
         "excluded": Part(np.bool_, (count,)),
-        "stats": Part(np.int64, (2,), least=0),
     }
     if (kept := checkpoint.finished(0, table)) is None:
         return None
     if kept["group"].max() >= len(kept["representative"]):
         raise WlmError(f"{checkpoint.path}: finished batch 0: part group: expected one of the representatives' groups")
-    return Clusters(**{**kept, "stats": Stats(*map(int, kept["stats"]))})
+    return Clusters(**kept)
 
 
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:

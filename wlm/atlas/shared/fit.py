@@ -43,15 +43,8 @@ _BRIGHT = 1024.0  # a component's largest texel after scaling: RGB9E5 has as man
 def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
     """Compresses all lightmaps of a scene into one lookup texture and one or two colour textures.
 
-    Args:
-        scene: The scene.
-        profile: `budget`, `colour`, `tile`, `views` and `mips`.
-        seed: Seed of the random views and mixtures.
-        stages: Reports and times the stages.
-
-    Returns:
-        The model; its report has the numbers of tiles, samples and components of each sheet, and the error for each
-        number of components that was tried.
+    The model's report has the numbers of tiles, samples and components of each sheet, and the error for each number of
+    components that was tried.
 
     Raises:
         WlmError: The budget is less than the smallest model takes.
@@ -117,12 +110,8 @@ def _of_texels(weight: np.ndarray) -> np.ndarray:
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Solves for the samples of all components and composes the colour textures.
-
-    Returns:
-        `texels` and, if there is a second texture, `blocks` and `block_texels` of the model; and the factor by which
-        each component was multiplied, float64 [C, 3].
-    """
+    """Solves for the samples of all components and composes the colour textures. Returns arrays of the model by name,
+    and the factor by which each component was multiplied, float64 [C, 3]."""
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)

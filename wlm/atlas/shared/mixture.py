@@ -59,12 +59,8 @@ class Mixtures:
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Sums the products of the states' light over the points of each tile, float32 [T, 3, M, M].
-
-    Args:
-        light: float32 [T, M, 3, P].
-        weight: float32 [T, P].
-    """
+    """Sums the products of the states' light [T, M, 3, P], weighted [T, P], over the points of each tile, float32 [T,
+    3, M, M]."""
     part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
     return part @ part.transpose(2, 3)
 
@@ -72,13 +68,13 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 def find_mixtures(
     moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
 ) -> Mixtures:
-    """Finds the mixtures of some tiles.
+    """Finds the mixtures of some tiles, at most `count`; fewer where some would have no tile.
 
     Args:
         moment: float [T, 3, M, M], `moments`.
         texels: float [T, N, M, 3], texels of the same tiles, not negative.
         rank: K, 1 to M.
-        count: Number of mixtures, at least 1; fewer where some would have no tile.
+        count: Largest number of mixtures, at least 1.
         seed: Seed of the tiles from which they start.
         like: Number of components by which tiles are assigned to mixtures; None: K.
     """
@@ -111,13 +107,10 @@ def find_mixtures(
 
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
-    """Finds the first mixture that keeps about the most energy, int64 [T].
+    """Finds the first mixture that keeps about the most energy, int64 [T], of kept energies [T, G] and tiles' energies
+    [T].
 
     Rounding must not assign a tile to a mixture whose offsets were not computed for it.
-
-    Args:
-        kept: [T, G], the energy that each mixture keeps.
-        energy: [T], the energy of each tile.
     """
     return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 

@@ -21,10 +21,10 @@ from wlm.atlas.model import (
     ENTRY,
     FACTOR_BITS,
     LUT_BITS,
+    MIP_OCTAVES,
     SHEET_BITS,
     SHORT_ENTRY,
     SOURCE_BITS,
-    TAIL_OCTAVES,
     TEXELS,
     Profile,
     tile_counts,
@@ -32,10 +32,10 @@ from wlm.atlas.model import (
 from wlm.atlas.resize import box
 from wlm.atlas.shared.allocation import NO_ROOM, WIDTHS, Allocated, allocated
 from wlm.atlas.shared.balance import ViewShares, balance, tile_shares
-from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs, sizes_of
+from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import patches, weighted
-from wlm.atlas.tiles.layout import allocate, place
+from wlm.atlas.tiles.layout import allocate, place, sizes_of
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
@@ -46,14 +46,9 @@ _HOPELESS = 1.25  # ratio of sampled separate to shared error above which the re
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A sheet or a mip level of a sheet, to be cut into tiles.
-
-    Attributes:
-        name: The sheet's name.
-        frames: float32 [M, H, W, 3], without gaps.
-        weight: float64 [2 H, 2 W], the weight of each quarter of a texel.
-        smaller: The number of the next smaller level; 0: there is none.
-    """
+    """A sheet or a mip level of a sheet, to be cut into tiles. `frames` are float32 [M, H, W, 3] without gaps, `weight`
+    float64 [2 H, 2 W] has the weights of quarters of texels, and `smaller` is the number of the next smaller level; 0:
+    there is none."""
 
     name: str
     frames: np.ndarray
@@ -64,13 +59,8 @@ class Plane:
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
     """Lists the sheets and then, with mips, their levels: a quarter of a sheet's sides, rounded up, and halves of that.
 
-    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them.
-
-    Args:
-        scene: The scene.
-        weights: `scene_weights`.
-        mips: Whether there are levels.
-        device: "cpu" or "cuda:N".
+    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them, from
+    `scene_weights`.
     """
     pairs = zip(scene.sheets, weights, strict=True)
     planes = [Plane(sheet.name, sheet.lightmaps, weight) for sheet, weight in pairs]
@@ -91,7 +81,7 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
     light = torch.from_numpy(plane.frames).permute(1, 2, 0, 3).flatten(2).double()
     sums = torch.cat([light * share, share], 2).to(device)
     weight = torch.from_numpy(plane.weight).double()[..., None].to(device)
-    levels, side = [], (-(-height >> TAIL_OCTAVES), -(-width >> TAIL_OCTAVES))
+    levels, side = [], (-(-height >> MIP_OCTAVES), -(-width >> MIP_OCTAVES))
     while True:
         sums, weight = box(sums, *side), box(weight, *(2 * each for each in side))
         values = sums.cpu().numpy()
@@ -106,13 +96,7 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The places of sheets and levels in T_c.
-
-    Attributes:
-        grid: Rows and columns of tiles of each.
-        row, column: The first entry of each in T_c.
-        shape: Rows and columns of T_c.
-    """
+    """The places of sheets and levels in T_c: the grid of tiles and the first entry of each, and the shape of T_c."""
 
     grid: list[tuple[int, int]]
     row: list[int]
