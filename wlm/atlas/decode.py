@@ -98,12 +98,8 @@ class Decoder:
         return out
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
-        """Reads light of a model with one lightmap into an existing array; on CUDA the work is queued, not awaited.
-
-        Args:
-            uv: vec2 [N], N at least 1.
-            out: float32 [N, 3], written.
-        """
+        """Reads light of a model with one lightmap at vec2 [N], N at least 1, into float32 [N, 3]; on CUDA the work is
+        queued, not awaited."""
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
@@ -166,15 +162,8 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the texels of a sheet's mask, with the values of `lightmap`.
-
-        Args:
-            sheet: The sheet that was compressed.
-            number: The sheet's number.
-            state: As for `read`.
-
-        Returns:
-            float32 [K, 3], row by row, on the decoder's device.
+        """Decodes the texels of a sheet's mask, with the values of `lightmap`: float32 [K, 3], row by row, on the
+        decoder's device.
 
         Raises:
             WlmError: The sheet has another size than the model's.

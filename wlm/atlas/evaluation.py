@@ -205,8 +205,6 @@ def compare(
 ) -> dict[str, Score]:
     """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders together.
 
-    On the CPU torch uses one thread meanwhile: 50 views of 512² take some seconds, and FLIP as long again per decoder.
-
     Args:
         scene: The scene with its original lightmaps.
         decoders: By name; see `Sampler`.
@@ -214,10 +212,8 @@ def compare(
             or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For some decoders, numbers of their charts or tiles: their seams are where these change.
-            Seams of the others are the borders of the lightmaps' charts. Either way a border lies between neighbouring
-            pixels that show one triangle or two that share a corner in space, so that an outline in front of
-            another surface is no border.
+        labels: For some decoders, numbers of their charts or tiles: their seams are where these change. Seams of the
+            others are the borders of the lightmaps' charts. An outline in front of another surface is no border.
         progress: Called with the views done.
 
     Returns:
@@ -381,49 +377,31 @@ def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
 
 @dataclass
 class _Tally:
-    """The errors of a decoder, and sums over views and states."""
+    """The errors of a decoder: sums, and rows of view, state, MSE, SSIM, MSE on a screen and FLIP."""
 
     states: int
-    view: list[int] = field(default_factory=list)
-    state: list[int] = field(default_factory=list)
-    mse: list[float] = field(default_factory=list)
-    ssim: list[float] = field(default_factory=list)
-    tone_mse: list[float] = field(default_factory=list)
-    flip: list[float] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
     pixels: int = 0
     seam: float = 0.0
     seam_pixels: int = 0
     rest: float = 0.0
 
-    def add(
-        self,
-        view: int,
-        state: int,
-        error: torch.Tensor,
-        border: torch.Tensor,
-        ssim: float,
-        tone_mse: float,
-        flip: float,
-    ) -> None:
+    def add(self, view: int, state: int, error: torch.Tensor, border: torch.Tensor, *figures: float) -> None:
         absolute = error.abs().mean(dim=1)
-        self.view.append(view)
-        self.state.append(state)
-        self.mse.append(float(error.square().mean()))
-        self.ssim.append(ssim)
-        self.tone_mse.append(tone_mse)
-        self.flip.append(flip)
+        self.rows.append((view, state, float(error.square().mean()), *figures))
         self.pixels += len(error)
         self.seam += float(absolute[border].sum())
         self.rest += float(absolute[~border].sum())
         self.seam_pixels += int(border.sum())
 
     def score(self, facts: dict[str, Any], texel_mse: Sequence[float], inside: Sequence[bool]) -> Score:
+        views, of_state, mse, ssim, tone_mse, flip = zip(*self.rows, strict=True) if self.rows else [()] * 6
         peaks, states = facts["peaks"], range(self.states)
-        psnr = [psnr_from_mse(mse, peaks[state]) for mse, state in zip(self.mse, self.state, strict=True)]
-        pairs = list(zip(psnr, self.view, self.state, strict=True))
+        psnr = [psnr_from_mse(mse, peaks[state]) for mse, state in zip(mse, of_state, strict=True)]
+        pairs = list(zip(psnr, views, of_state, strict=True))
         known = [(value, view) for value, view, _ in pairs if not math.isnan(value)]
         seam, rest = _ratio(self.seam, self.seam_pixels), _ratio(self.rest, self.pixels - self.seam_pixels)
-        seen = set(self.view)
+        seen = set(views)
         return Score(
             **facts,
             peak=_mean(peaks),
@@ -436,13 +414,13 @@ class _Tally:
             inside_views=sum(inside[view] for view in seen),
             psnr_worst=min(known)[0] if known else math.nan,
             worst_view=min(known)[1] if known else -1,
-            one_minus_ssim=1.0 - _mean(self.ssim),
+            one_minus_ssim=1.0 - _mean(ssim),
             seam_error=seam,
             rest_error=rest,
             seam_ratio=math.inf if rest == 0.0 and seam > 0.0 else _ratio(seam, rest),
             texel_psnr=_mean([psnr_from_mse(mse, peak) for mse, peak in zip(texel_mse, peaks, strict=True)]),
-            tone_psnr=_mean([psnr_from_mse(mse, 1.0) for mse in self.tone_mse]),
-            flip=_mean(self.flip),
+            tone_psnr=_mean([psnr_from_mse(mse, 1.0) for mse in tone_mse]),
+            flip=_mean(flip),
         )
 
 

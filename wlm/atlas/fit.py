@@ -7,7 +7,6 @@ replaces the model where that has no larger error. Several lightmaps, of several
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -92,8 +91,13 @@ def compress(
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
     if method == "shared":
-        with one_thread(device), _flushing(checkpoint):
-            model = fit_shared(scene, profile, seed, stages)
+        try:
+            with one_thread(device):
+                model = fit_shared(scene, profile, seed, stages)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                checkpoint.flush()  # finished batches that are not written yet
+            raise
     else:
         model = _fit_one(scene, profile, method, seed, stages)
     for place in model.rows:
@@ -118,12 +122,9 @@ def open_checkpoint(
 ) -> Checkpoint:
     """Opens the checkpoint of a compression, the file `OUTPUT.partial`.
 
-    It stores slow results: errors of the tiles' sizes and components, groups of triangles and the state of a fit. The
-    other stages are repeated.
-
     Args:
         output: The file that the compression is for.
-        scene, profile, seed, settings: As for `compress`; the compression depends on them.
+        scene, profile, seed, settings: As for `compress`.
         device: Only its kind matters: a compression may resume on another GPU.
         resume: Whether to go on from the file, if there is one.
         every: Seconds between two saves of a running stage; 0: after every few steps.
@@ -138,17 +139,6 @@ def open_checkpoint(
         "device": "cpu" if device == "cpu" else "cuda",
     }
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, scene.source, resume=resume, every=every)
-
-
-@contextmanager
-def _flushing(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Writes finished batches that are not written yet if the block is interrupted."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if checkpoint is not None:
-            checkpoint.flush()
-        raise
 
 
 def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:

@@ -334,12 +334,8 @@ class AtlasModel(Model):
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that the lightmap's size is plausible for its textures: a file of a few bytes must not claim gigabytes.
-
-    Args:
-        size: Rows and columns of the lightmap.
-        texels: Number of texels of T_p.
-        entries: Number of entries of T_c.
+    """Checks that the lightmap's size is plausible for its numbers of texels and entries: a file of a few bytes must
+    not claim gigabytes.
 
     Raises:
         WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels in all,
@@ -403,16 +399,8 @@ def pack_entries(
 
 
 def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decodes `pack_entries`.
-
-    Args:
-        lut: uint16 [..., 2].
-        code: `first_block_code`.
-
-    Returns:
-        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2], which is equal along
-        both axes in a valid file.
-    """
+    """Decodes `pack_entries`: first texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2],
+    which is equal along both axes in a valid file."""
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
@@ -446,15 +434,8 @@ def pack_tiles(
 
 
 def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
-    """Decodes `pack_tiles`, or entries of two numbers, which have one component.
-
-    Args:
-        lut: uint16 [..., 2 or 4].
-        code: `first_block_code`.
-
-    Returns:
-        Arrays in the order of the arguments of `pack_tiles`: int64, except `blocks`, which is bool [...].
-    """
+    """Decodes `pack_tiles`, or entries of two numbers, which have one component, to the arguments of `pack_tiles` in
+    their order: int64, except `blocks`, which is bool [...]."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
@@ -466,16 +447,8 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
-    """Computes the place of a coarse component of a tile; these are stacked in columns beside the other components.
-
-    Args:
-        size: int [..., 2], texels of the other components along x and y.
-        whole: int [...], number of the other components.
-        number: int [...], number of the coarse component, from 0.
-
-    Returns:
-        int [..., 2], x and y of the first texel relative to that of the tile's first component.
-    """
+    """Computes the place of a coarse component of a tile, int [..., 2], relative to the tile's first texel; these are
+    stacked in columns beside the `whole` other components of a size."""
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
 

@@ -97,8 +97,5 @@ def _box(new: int, old: int) -> sparse.csr_matrix:
     """Makes the matrix [new, old] that averages `old` texels over the squares of `new` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
-    return _normalised(np.maximum(weight, 0.0))
-
-
-def _normalised(weight: np.ndarray) -> sparse.csr_matrix:
+    weight = np.maximum(weight, 0.0)
     return sparse.csr_matrix(weight / weight.sum(axis=1, keepdims=True))

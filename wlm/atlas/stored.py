@@ -73,14 +73,8 @@ def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
 
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
-    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one.
-
-    Args:
-        scene: The scene.
-        corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-
-    Returns:
-        The bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
+    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one, of the corners' new UVs
+    [F, 3, 2]; returns the bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
 
     Raises:
         ValueError: The shape is wrong, or a UV isn't finite.

@@ -303,13 +303,8 @@ def _join(
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """Makes the thresholds, with settings interpreted as the exact decimal fractions that they print as.
-
-    Args:
-        threshold: lambda (eq. 4); Dist must be less.
-        colour_threshold: lambda_h (section 3.2.1), the largest distance of two dominant colours.
-        device: Where the arrays go.
-    """
+    """Makes the thresholds lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest distance of two
+    dominant colours), interpreted as the exact decimal fractions that they print as."""
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
@@ -323,12 +318,7 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
 
 
 def bounds(samples, patches, levels: int):
-    """Computes `Bounds` [F, levels] of patches.
-
-    Args:
-        samples, patches: Results of `sample`.
-        levels: One more than the highest level of a patch.
-    """
+    """Computes `Bounds` [F, levels] of patches, for one level more than the highest of a patch."""
     out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
     wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
     return out
@@ -339,10 +329,7 @@ class Graph:
     """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
 
     Attributes:
-        samples: int, samples of all patches.
-        patches: Patch [M], by rising `low`.
-        bounds: Bounds [M, levels].
-        rule: Rule.
+        samples, patches, bounds, rule: The samples of all patches; and of the M nodes, by rising `low`.
         low, high: float [M], least and largest mean level on any lattice; the means of two patches that are alike on
             any lattice differ by less than lambda.
         means: float32 [M], `low` on the host.
@@ -363,11 +350,7 @@ class Graph:
 
 
 def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of some patches.
-
-    Returns:
-        The graph, and the number of each of its nodes among the patches, int64 [M].
-    """
+    """Makes the graph of some patches; also returns the number of each of its nodes among them, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
     wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
@@ -395,28 +378,14 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
-    """Finds the edges between patches `begin` to `end` - 1 and any later one.
-
-    Args:
-        graph: The graph.
-        begin, end: The range.
-        edge: uint8 [M, M], 0; set to 1 in both places of an edge.
-    """
+    """Finds the edges between patches `begin` to `end` - 1 and any later one: 1 in both places of uint8 [M, M], which
+    is 0."""
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
-    """Finds for some nodes the first of the heads that they are like.
-
-    Args:
-        graph: The graph.
-        nodes: int [N].
-        begin, end: The range of nodes to process.
-        heads: int [H], nodes, ascending.
-        head_low: float [H], their `low`.
-        rank: int [H], the order in which heads are compared.
-        joined: int [N], written in the range: the rank of the head, H for none.
-    """
+    """Writes for nodes `begin` to `end` - 1, int [N], the rank of the first head that they are like, H for none. Heads,
+    int [H], are ascending nodes, `head_low` their `low`, and `rank` the order in which they are compared."""
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

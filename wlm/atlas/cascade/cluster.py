@@ -80,15 +80,12 @@ def cluster(
         uv: [V, 2], of the lightmap, finite; v = 0 is the top of row 0. Outside [0, 1] the border's texels are read.
         triangle: int [F, 3], vertices.
         lightmap: [H, W, 3], linear RGB, finite.
-        threshold: lambda of eq. 4, a fraction of `max_radiance`: the largest mean difference of two patches' samples
-            and channels; above 0.
-        colour_threshold: lambda_h, the largest distance of two dominant colours (section 3.2.1); at least 0.
+        threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
         max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
         active: bool [F], which triangles take part; None for all.
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
-        progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
-            "cluster" while groups are formed; with more than `SAMPLE` triangles these alternate.
+        progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
 
     Raises:
         ValueError: The patches have more samples than 32 bits can count.

@@ -15,9 +15,7 @@ T_p starts as the regenerated lightmap downscaled by epsilon_p, T_c as the coord
 The paper leaves some points open. Here the loss is a sum and not a mean, which changes Adam's steps by its epsilon
 alone; radiance, and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned
 more coarsely than a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range
-of its 16 bits, where F is the identity. The paper's rates are constant; `Profile.final_rate` lets rates decay, so that
-less noise of the last steps is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to 1.3 dB better
-than the best constant rates, with 300 steps as with 2,000.
+of its 16 bits, where F is the identity. `Profile.final_rate` lets rates, which are constant in the paper, decay.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
@@ -105,14 +103,12 @@ def fit_cascade(
     *,
     repack: bool = True,
 ) -> AtlasModel:
-    """Compresses a lightmap whose triangles are grouped.
+    """Compresses a lightmap whose triangles are grouped; None: no triangle shares.
 
     Args:
         scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles; None: no triangle shares.
-        profile: The settings.
-        seed: Seed of the cameras or points.
-        stages: Reports and times the stages.
+        clusters: The groups of its triangles.
+        profile, seed, stages: As for `wlm.atlas.fit.compress`.
         repack: Whether charts are packed anew (section 3.3.1). Else the mesh keeps its UVs, the cascade begins as the
             lightmap itself, and neither `clusters` nor the profile's `scale` counts (section 4.5.2).
 
@@ -189,20 +185,8 @@ def tune(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
-    """Tunes a cascade so that the mesh looks as with its lightmap.
-
-    Args:
-        sheet: The triangles and their lightmap.
-        uv: float32 [F, 3, 2], the corners' UVs under which the cascade is read.
-        textures: Initial values.
-        profile: `space`, `steps`, `colour_rate`, `lut_rate`, `final_rate`, `resolution` and `gradient`.
-        seed: Seed of the cameras or points.
-        device: "cpu" or "cuda:N".
-        progress: Called about twice a second with the steps done.
-        checkpoint: Keeps the state of the steps, as batch 1.
-
-    Returns:
-        The tuned cascade.
+    """Tunes a cascade, read under the corners' UVs, float32 [F, 3, 2], so that the mesh looks as with its lightmap. The
+    checkpoint keeps the state of the steps as batch 1.
 
     Raises:
         WlmError: No such device, or the fit diverged.

@@ -22,7 +22,6 @@ from wlm.atlas.model import (
     TEXELS,
     AtlasModel,
     Profile,
-    SheetPlace,
     coarse_place,
     extent,
     pack_tiles,
@@ -62,10 +61,7 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
     with stages("solve"):
         textures, scale = _textures(tiles, tried, given)
     lut = np.ascontiguousarray(_lookup(tiles, layout, given)[..., : kept.numbers])
-    rows = [
-        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
-        for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
-    ]
+    rows = layout.places
     sheets = len(scene.sheets)
     counts, samples, many = (
         np.bincount(tiles.plane % stride, each, stride)[:sheets]
@@ -152,9 +148,9 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
 
 def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
     """Composes T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
-    columns = np.array([each[1] for each in layout.grid])[tiles.plane]
-    row = tiles.index // columns + np.array(layout.row)[tiles.plane]
-    column = tiles.index % columns + np.array(layout.column)[tiles.plane]
+    places = np.array([(each.row, each.column, each.columns) for each in layout.places])
+    first, left, columns = places[tiles.plane].T
+    row, column = first + tiles.index // columns, left + tiles.index % columns
     table = np.zeros((*layout.shape, 4), np.uint16)
     table[row, column] = pack_tiles(
         given.first, given.size, given.component, given.count, given.page, given.second, given.coarse

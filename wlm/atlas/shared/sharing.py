@@ -27,6 +27,7 @@ from wlm.atlas.model import (
     SOURCE_BITS,
     TEXELS,
     Profile,
+    SheetPlace,
     tile_counts,
 )
 from wlm.atlas.resize import box
@@ -96,12 +97,15 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The places of sheets and levels in T_c: the grid of tiles and the first entry of each, and the shape of T_c."""
+    """The places of sheets and levels in T_c, and its rows and columns."""
 
-    grid: list[tuple[int, int]]
-    row: list[int]
-    column: list[int]
+    places: list[SheetPlace]
     shape: tuple[int, int]
+
+    @property
+    def grids(self) -> list[tuple[int, int]]:
+        """Rows and columns of tiles of each."""
+        return [(place.rows, place.columns) for place in self.places]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +169,7 @@ def fitted(
     with stages("curves"):
         tried = candidates(tiles, sizes_of(profile), room, seed, stages, 0)
     with stages("balance"):
-        shown = tile_shares(scene, varies, tiles, layout.grid[:sheets], profile, seed, device)
+        shown = tile_shares(scene, varies, tiles, layout.grids[:sheets], profile, seed, device)
         weight = tiles.weight.double().sum(1).cpu().numpy()
         factor = balance(tried, weight, shown, room)
     with stages("allocate"):
@@ -286,7 +290,11 @@ def _laid_out(planes: list[Plane], tile: int) -> Layout:
         width = int((first[:, 0] + across[:, 0]).max())
         if best is None or width * height < best[0]:
             best = width * height, first, (height, width)
-    return Layout(grid, best[1][:, 1].tolist(), best[1][:, 0].tolist(), best[2])
+    places = [
+        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *counts, plane.smaller)
+        for plane, (column, row), counts in zip(planes, best[1].tolist(), grid, strict=True)
+    ]
+    return Layout(places, best[2])
 
 
 def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str) -> SceneTiles:
