@@ -37,25 +37,27 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import stream, to_warp
+from wlm.interop import stream, to_warp, torch_memory
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import Guide, guide
-from wlm.smoke.march.fine import bake, lit
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, obstacle_visibility
+from wlm.smoke.shading import Light, light_axes
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
-from wlm.view.smoke_run import AllOrders, SixWays
+from wlm.view.smoke_run import Lighting
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
+from wlm_kernels.smoke.shadow import visibility
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
@@ -565,7 +567,8 @@ def weight_rows(bench: SmokeBench) -> list[Row]:
     six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
     six = SixWay(six.lightmaps, None, camera=camera)
     lights = [tuple(map(float, toward)) for toward in _directions(_LIGHTS)]
-    exact = [lit(volume, camera, toward, step=_WEIGHT_STEP) for toward in lights]
+    march = March(_WEIGHT_STEP, jitter=0.0)
+    exact = list(light_smoke(volume, camera, [Light(toward) for toward in lights], march).planes)
     rows = []
     for rule in RULES:
         weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
@@ -613,20 +616,17 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
     corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
 
-    def shadows() -> list[Light]:
-        return [
-            Light(
-                light.toward,
-                light.irradiance,
-                obstacle_visibility(surface.depth, camera, light.toward, corners, triangles),
-            )
-            for light in lights
-        ]
+    seen = torch.ones_like(surface.depth)
 
-    shadowed = shadows()
+    def shadows() -> None:
+        with stream(device):
+            mesh, view = (to_warp(corners, wp.vec3), to_warp(triangles)), camera.in_world()
+            for light in lights:
+                maps = to_warp(surface.depth), to_warp(seen)
+                visibility(*mesh, light_axes(light.toward), view, *maps, empty=torch_memory(seen.device))
 
     def shading() -> torch.Tensor:
-        return six.shade(shadowed, background=scene.background)
+        return six.shade(lights, background=scene.background)
 
     calls = {
         "air alone": lambda: [air.lattice.step(scene.smoke.substeps) for _ in range(steps)],
@@ -674,7 +674,7 @@ def _drawn(
     drawing.move(time)
     lamp = PointLight(tuple(map(float, volume.centre)))
     hot = replace(volume, temperature=volume.density, emission=1.0)
-    six, every = SixWays(), AllOrders(scene.smoke.albedo)
+    six, every = Lighting(None), Lighting(scene.smoke.albedo)
     return {
         "six ways, drawn": lambda: drawing(six(volume, camera, lights)),
         "all orders, drawn": lambda: drawing(every(volume, camera, lights)),

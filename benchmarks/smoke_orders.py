@@ -63,7 +63,7 @@ from wlm.smoke.transport.learning import FAINT, draw_view, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
-from wlm.smoke.transport.tracing import trace
+from wlm.smoke.transport.tracing import Transport, trace
 
 METHOD, GRIDS, PHASES, INSIDE = "all orders", "gain by grid", "phase functions", "light in smoke"
 """The tables of the rows."""
@@ -297,7 +297,14 @@ def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
     """Traces all light at each of `ALBEDOS`, [H, W, 3]."""
     seed = 2 * shot.seed + salt
     made = trace(shot.volume, shot.camera, shot.lights, samples=samples, orders=_KEPT, seed=seed)
-    return {albedo: made.total if albedo == 1.0 else made.with_albedo((albedo,) * 3).total for albedo in ALBEDOS}
+    return {albedo: _at_albedo(made, albedo).sum((0, 1)) for albedo in ALBEDOS}
+
+
+def _at_albedo(made: Transport, albedo: float) -> torch.Tensor:
+    """Returns the planes at an albedo, below 1 without light that was scattered more than `_KEPT` times."""
+    powers = albedo ** torch.arange(_KEPT + 2, device=made.planes.device)
+    powers[-1] *= albedo == 1.0
+    return made.planes * powers[:, None, None, None]
 
 
 def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> list[torch.Tensor]:
@@ -446,7 +453,7 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
             for albedo in ALBEDOS:
                 diffused = inputs.by_diffusion(albedo)
                 mixed = model.light(inputs.at(albedo), (albedo,) * 3)[..., 0]
-                truth = (traced if albedo == 1.0 else traced.with_albedo((albedo,) * 3)).planes.sum(1)[..., 0]
+                truth = _at_albedo(traced, albedo).sum(1)[..., 0]
                 for one, other, wanted in zip(diffused, mixed, truth, strict=True):
                     yield psnr(one, wanted), psnr(other, wanted)
 

@@ -22,7 +22,8 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.lightmap import LightmapSet
-from wlm.view.pictures import before_after_error
+from wlm.view.display import white_of
+from wlm.view.pictures import contact_sheet, encode
 
 HERE = Path(__file__).resolve().parent
 ROOM, DATA = HERE / "cornell" / "room.yaml", HERE / "data" / "cornell"
@@ -73,12 +74,15 @@ def run(out: Path, data: Path, device: str) -> dict[str, float]:
     decoder = model.decoder(device)
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
     light = lightmaps.light
-    before_after_error(out / "cornell.png", light.frames, decoded, light.mask, light.times)
+    white = white_of(light.frames[:, light.mask])
+    rows = {"original": light.frames, "decoded": decoded, "error × 8": 8.0 * np.abs(decoded - light.frames)}
+    pictures = {name: [encode(frame, light.mask, white) for frame in frames] for name, frames in rows.items()}
+    contact_sheet(out / "cornell.png", pictures, [f"{hour:g} h" for hour in light.times])
     lap("draw")
     probes = wlm.probe.load(data / "probes.npz", key=KEY)
     path = out / "cornell_probes.wlm"
     probe_size = wlm.probe.compress(probes, device=device).save(path)
-    values = wlm.load(path).decoder(device, position=probes.position).decode_probes(probes.position)
+    values = wlm.load(path).decoder(device, position=probes.position).decode_probes()
     score = wlm.probe.score(values, probes, probe_size)
     lap("fit probes")
     atomic_write(out / "cornell_report.json", (json.dumps(report.to_json(), indent=1) + "\n").encode())

@@ -23,7 +23,8 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_exr, write_exr
 from wlm.interop import check_device
 from wlm.lightmap import LightmapSet, Report
-from wlm.view.pictures import before_after_error
+from wlm.view.display import white_of
+from wlm.view.pictures import contact_sheet, encode
 
 HERE = Path(__file__).resolve().parent
 STEPS, SAMPLES = 1500, 2048
@@ -59,7 +60,10 @@ def run(out: Path, device: str) -> dict[str, float]:
     lap("evaluate")
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
     light = lightmaps.light
-    before_after_error(out / "city.png", light.frames, decoded, light.mask, light.times)
+    white = white_of(light.frames[:, light.mask])
+    rows = {"original": light.frames, "decoded": decoded, "error × 8": 8.0 * np.abs(decoded - light.frames)}
+    pictures = {name: [encode(frame, light.mask, white) for frame in frames] for name, frames in rows.items()}
+    contact_sheet(out / "city.png", pictures, [f"{hour:g} h" for hour in light.times])
     lap("draw")
     _check(lightmaps, report, out)
     return {

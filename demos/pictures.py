@@ -1,4 +1,4 @@
-"""The pictures of README and docs: what `wlm view`, `wlm web` and `evaluate --html` show of what the demos leave.
+"""The pictures of README and docs: what `wlm view` and `wlm web` show of what the demos leave.
 
     make pictures
 

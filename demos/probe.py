@@ -19,7 +19,7 @@ from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.probe.volume.walk import camera_path, settle, summary, walk
+from wlm.probe.volume.walk import camera_path, settle, walk
 from wlm.view.opening import open_scene
 from wlm.view.window import Window
 
@@ -54,8 +54,8 @@ def run(out: Path, device: str) -> dict[str, float]:
     lap("fit")
     # From here on only the file is used, and the positions, which an engine has.
     model = wlm.load(path)
-    decoder = model.decoder(device)
-    decoded = decoder.decode_probes(probes.position)
+    decoder = model.decoder(device, position=probes.position)
+    decoded = decoder.decode_probes()
     wlm.probe.save_probes(out / "street_decoded.npz", probes.position, decoded)
     lap("decode")
     report = wlm.probe.score(decoded, probes, size)
@@ -64,7 +64,7 @@ def run(out: Path, device: str) -> dict[str, float]:
     volume = wlm.probe.Volume(probes.position, decoder.light(probes.position), live=live)
     path = camera_path(probes.position[live], FRAMES)
     settle(volume, path[0])
-    figures = summary(walk(volume, path, original=probes.values), report.peak)
+    figures = walk(volume, path, probes.values)
     lap("walk")
     content = {"report": report.to_json(), "walk": figures}
     atomic_write(out / "street_report.json", (json.dumps(content, indent=1) + "\n").encode())

@@ -1,8 +1,8 @@
-"""Simulates a jet of smoke past a sphere, at rest and moving, lights a plume from all round, and checks the results.
+"""Simulates a jet of smoke past a sphere, at rest and moving, lights a plume from eight sides, and checks the results.
 
-The scenes are `jet-sphere` and `jet-moving` on a quarter of their cells along each axis, cut in two and not in four,
-so that the demo ends soon. The plume is made of noise and stands for a volume from elsewhere. Each leaves a sequence of
-PNGs and a contact sheet, the plume a flip book too.
+The scenes are `jet-sphere` and `jet-moving` with a quarter of their cells along each axis and two voxels per cell, so
+that the demo takes less time. The plume is procedural, in place of a volume of another program. Each scene is written
+as a sequence of PNGs and a contact sheet, the plume also as a flip book.
 
     python demos/smoke.py
 """
@@ -24,28 +24,28 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume, save_volume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.smoke.camera import DIRECTIONS, Camera, axis_faults
+from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.data import load_frames, open_frames, write_six_way
-from wlm.smoke.flipbook.shots import FramesToBake
-from wlm.smoke.flipbook.textures import brightest_gain, read_flipbook, write_flipbook
+from wlm.smoke.flipbook.book import Shot, pack_book, read_flipbook, write_book
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import guide
-from wlm.smoke.march.fine import bake, lit
+from wlm.smoke.march.coarse import guide, with_surface
+from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, Grid, Scene, load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import simulate
 from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport import light_smoke
 from wlm.system import Progress
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
-from wlm.view.smoke import guide_pictures, picture, six_pictures
+from wlm.view.pictures import contact_sheet, to_bytes
+from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
-FRAMES, RATE = 8, 2.0  # four seconds, in which the jet crosses the box
+FRAMES, RATE = 8, 2.0  # in four seconds the jet crosses the box
 RESOLUTION = 96
 
-# Measured on the CPU; see `_check` for what each is.
+# Limits of the checks, from measurements on the CPU.
 MOST_STEP_ERROR = 0.03
 MOST_LIGHT = {"front": 0.501, "side": 1.001}
 LEAST_COVERAGE, MOST_COVERAGE = 0.1, 0.6
@@ -81,17 +81,17 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
         _check_solids(f"{name}, frame {number}", scene, volume, scene.time(number))
     lights = [settings.light() for settings in scene.lights]
     drawn, maps, coverage = [], [], []
-    for shot in FramesToBake(frames, scene.camera).shots():
-        _check_lightmaps(f"{name}, frame {shot.number}", shot.six)
-        options = {"background": scene.background, "obstacles": scene.obstacles, "time": shot.looks.time}
-        drawn.append(to_bytes(picture(shot.six, lights, **options)))
-        pictures = six_pictures(shot.six)
-        maps.append({key: pictures[key] for key in ("right", "top", "front")})
-        coverage.append(float((shot.six.transparency < 0.99).float().mean()))
-    error = bake(frames.load(FRAMES), shot.six.camera, step=1.0).error
+    for number, volume in frames.volumes():
+        six = bake(volume, frames.view(scene.camera, volume), step=1.0, estimate=number == FRAMES)
+        six = with_surface(six, volume, frames.looks(number))
+        _check_lightmaps(f"{name}, frame {number}", six)
+        options = {"background": scene.background, "obstacles": scene.obstacles, "time": scene.time(number)}
+        drawn.append(to_bytes(picture(six, lights, **options)))
+        maps.append({key: to_bytes(six[key]) for key in ("right", "top", "front")})
+        coverage.append(float((six.transparency < 0.99).float().mean()))
+    error = six.error
     if not error.rms <= MOST_STEP_ERROR:
         raise WlmError(f"demo: {name}: expected a step's error of at most {MOST_STEP_ERROR}, got {error.rms:.3g}")
-    write_sequence(out / f"{name}_frames", drawn)
     rows = {"lit": drawn} | {key: [each[key] for each in maps] for key in maps[0]}
     contact_sheet(out / f"{name}.png", rows, [f"{scene.time(number):g} s" for number in frames.numbers])
     if not all(later > earlier > 0 for earlier, later in itertools.pairwise(amounts)):
@@ -107,7 +107,7 @@ def jet(out: Path, name: str, device: str) -> dict[str, float]:
 
 
 def plume(out: Path, device: str) -> dict[str, float]:
-    """Makes a volume, lights it from all round with one bake, and packs the bakes of four sides into a flip book."""
+    """Makes a volume, lights it from eight sides with one bake, and packs the bakes of four views into a flip book."""
     clock = time.perf_counter()
     path = out / "plume.npz"
     save_volume(path, make_plume())
@@ -117,14 +117,14 @@ def plume(out: Path, device: str) -> dict[str, float]:
     _check_lightmaps("plume", six)
     lights = [Light((np.sin(angle), 0.4, np.cos(angle))) for angle in np.arange(8) * np.pi / 4]
     drawn = [to_bytes(six.shade([light], background=(0.03, 0.04, 0.055))) for light in lights]
-    write_sequence(out / "plume_frames", drawn)
-    planes = [*six_pictures(six).values()]
-    contact_sheet(out / "plume.png", {"light from round it": drawn, "six ways, alpha, glow": planes})
-    contact_sheet(out / "plume_guide.png", {"guide": [*guide_pictures(guide(volume, camera, March(4.0))).values()]})
-    # The error of weighing six lightmaps for an oblique light, against marching to the light itself.
+    planes = [to_bytes(plane) for plane in (*six.lightmaps, 1.0 - six.transparency, six.emission)]
+    contact_sheet(out / "plume.png", {"light from eight sides": drawn, "six ways, opacity, emission": planes})
+    maps = guide(volume, camera, March(4.0)).maps
+    contact_sheet(out / "plume_guide.png", {"guide": [to_bytes(plane / plane.max()) for plane in maps]})
+    # The error of six weighted lightmaps for an oblique light, against a march to the light.
     small = Camera.around(volume, pixels=32)
     oblique = (1.0, 0.7, 0.8)
-    exact = lit(volume, small, oblique, step=1.0)
+    exact = light_smoke(volume, small, [Light(oblique)], March(1.0, jitter=0.0)).planes[0]
     cold = replace(bake(volume, small, step=1.0, estimate=False), emission=None)
     weighed = cold.shade([Light(oblique)])[..., 0]
     error = float((weighed - exact).square().mean().sqrt() / exact.square().mean().sqrt())
@@ -140,13 +140,13 @@ def plume(out: Path, device: str) -> dict[str, float]:
         view = Camera.around(volume, toward=toward, pixels=RESOLUTION)
         sides.append(bake(volume, view, step=1.0, estimate=False))
         write_six_way(out / f"plume_{degrees:02.0f}.exr", sides[-1])
-    books = (out / "plume_1.png", out / "plume_2.png")
-    cells = {"rows": 2, "columns": 2, "gain": brightest_gain(sides)}
-    clipped = write_flipbook(books, sides, "unity", **cells)
-    read = read_flipbook(books, "unity", **cells)
-    lost = max(float((a.lightmaps - b.lightmaps.cpu()).abs().max()) for a, b in zip(read, sides, strict=True))
-    if clipped or not lost <= MOST_BOOK_ERROR / cells["gain"]:
-        raise WlmError(f"demo: plume: flip book: expected at most half a level lost, got {lost:.3g}, {clipped} clipped")
+    book = pack_book([Shot(number, side) for number, side in enumerate(sides, 1)])
+    files, clipped = write_book(book, out / "plume_book.png")
+    read = read_flipbook([*files], "unity", rows=2, columns=2)
+    pairs = zip(read, sides, strict=True)
+    lost = max(float((a.lightmaps - book.gain * b.lightmaps.cpu()).abs().max()) for a, b in pairs)
+    if clipped or not lost <= MOST_BOOK_ERROR:
+        raise WlmError(f"demo: plume: flip book: expected an error of half a level, got {lost:.3g}, {clipped} clipped")
     return {
         "covered": float((six.transparency < 0.99).float().mean()),
         "error of the step, RMS": six.error.rms,
@@ -157,15 +157,13 @@ def plume(out: Path, device: str) -> dict[str, float]:
 
 
 def _check_lightmaps(name: str, six: SixWay) -> None:
-    """Each map is bright where its name says, none has more light than there is, and the step is fine enough."""
+    """Checks that no lightmap has more light than is possible, and that the step is fine enough."""
     maps = six.lightmaps.cpu().numpy()
-    for fault in axis_faults(maps):
-        raise WlmError(f"demo: {name}: {fault}")
     for direction, plane in zip(DIRECTIONS, maps, strict=True):
         most = MOST_LIGHT["front" if direction == "front" else "side"]
         if not 0 <= plane.min() <= plane.max() <= most:
             raise WlmError(f"demo: {name}: {direction}: expected light of 0 to {most}, got {plane.max():.4g}")
-        # Scattered light passes through what hides the background.
+        # Only smoke that hides the background scatters light.
         if (plane > 1.0 - six.transparency.cpu().numpy() + 1e-3).any():
             raise WlmError(f"demo: {name}: {direction}: expected no more light than opacity")
     if six.error is not None and not six.error.rms <= MOST_STEP_ERROR:
@@ -173,12 +171,12 @@ def _check_lightmaps(name: str, six: SixWay) -> None:
 
 
 def _check_solids(name: str, scene: Scene, volume: DensityVolume, at: float) -> None:
-    """No smoke within an obstacle, but for the voxels of cells that its surface cuts."""
+    """Checks that there is no smoke within an obstacle, except in cells that its surface cuts."""
     axes = [volume.origin[i] + volume.voxel * (np.arange(n) + 0.5) for i, n in enumerate(volume.shape)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     density = volume.density.cpu().numpy()
     for obstacle in scene.obstacles:
-        # The solver placed it half a step ago, and a cell belongs to it by its centre.
+        # The obstacle's position is up to one step older, and a cell counts as inside by its centre.
         slack = 1.5 * scene.grid.cell + obstacle.fastest * scene.step * scene.smoke.substeps
         inside = np.linalg.norm(places - obstacle.centre(at), axis=-1) < obstacle.radius - slack
         if density[inside].any():

@@ -8,12 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-
-MOST_SIDE = 65536
-"""Largest number of texels along a side of a lightmap."""
-
-MOST_TEXELS = 1 << 28
-"""Largest number of texels of a lightmap: 16,384 x 16,384; one decoded frame takes 3 GiB."""
+from wlm.formats.limits import PICTURE_SIDE, PICTURE_TEXELS
 
 REACH = 2
 """Distance from a chart, in texels, that filters read: 1 for a bilinear read, 2 for one of the half-size mip."""
@@ -33,11 +28,11 @@ def check_size(height: int, width: int) -> None:
     """Checks the size of a lightmap before memory is allocated for it.
 
     Raises:
-        WlmError: It has no texel, or more than `MOST_SIDE` along a side or `MOST_TEXELS` in all.
+        WlmError: It has no texel, or more than `PICTURE_SIDE` along a side or `PICTURE_TEXELS` in all.
     """
-    if min(height, width) < 1 or max(height, width) > MOST_SIDE or height * width > MOST_TEXELS:
+    if min(height, width) < 1 or max(height, width) > PICTURE_SIDE or height * width > PICTURE_TEXELS:
         raise WlmError(
-            f"size: expected at least 1x1 texels, at most {MOST_SIDE} along a side and {MOST_TEXELS} in all, "
+            f"size: expected at least 1x1 texels, at most {PICTURE_SIDE} along a side and {PICTURE_TEXELS} in all, "
             f"found {width}x{height}"
         )
 

@@ -100,7 +100,7 @@ def lightmap_fit() -> tuple[Any, Any]:
 
     fit = SheetFit(moving_light(40, 24).light, tiny_profile())
     (batch,) = fit.batches(0)
-    trainer = Trainer(fit.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
+    trainer = Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
     trainer.run(3)
     return fit, trainer
 

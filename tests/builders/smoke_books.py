@@ -7,9 +7,8 @@ import torch
 from reference.flipbook import between
 
 from wlm.smoke.camera import Camera
-from wlm.smoke.flipbook.book import Book, pack_book
+from wlm.smoke.flipbook.book import Book, Shot, pack_book
 from wlm.smoke.flipbook.motion import ZERO
-from wlm.smoke.flipbook.shots import Shot
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
 

@@ -9,16 +9,13 @@ import torch
 from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames
 from builders.smoke_books import shown as shown_book
-from reference.flipbook import from_point
 
 from wlm.smoke.camera import LAYOUTS, Camera
-from wlm.smoke.flipbook.depth import encoded_depth
+from wlm.smoke.flipbook.book import Shot, pack_book
 from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.flipbook.shader import billboard_shader, smoke_shader
-from wlm.smoke.flipbook.textures import lay_out, pack
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.lights import PointLight
 
 
 def smoke(layout, _) -> Subject:
@@ -27,8 +24,8 @@ def smoke(layout, _) -> Subject:
     maps = torch.tensor(random.uniform(0, 1, (5, 8, 6, 9)), dtype=torch.float32)
     frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
     camera = Camera.look_at((0, 0, 5), (0, 0, 0), extent=6.0, height=6, width=9)
-    first, second = pack(frames, layout, rows=2, columns=3, gain=0.5, padding=2)
-    text = smoke_shader(layout, rows=2, columns=3, count=5, size=(6, 9), padding=2, gain=0.5)
+    book = pack_book([Shot(n, frame) for n, frame in enumerate(frames)], layout, gain=0.5, padding=2)
+    text = smoke_shader(book)
     asked, way, expected = [], [], []
     for n, frame in enumerate(frames):
         for row, column in ((0, 0), (3, 7), (5, 8)):
@@ -56,62 +53,16 @@ vec4 shown(ivec2 pixel)
 }
 """
     )
-    pages = {"u_first": np.float32(first), "u_second": np.float32(second)}
+    pages = {"u_first": book.first, "u_second": book.second}
     bound = {"u_points": points_of(asked), "u_ways": points_of(way), **pages}
     return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 2e-5)
-
-
-def smoke_point(_) -> Subject:
-    """A frame under lights at a point, by its texture of depth, as `from_point` has it; one lies in the smoke."""
-    random = np.random.default_rng(6)
-    maps = torch.tensor(random.uniform(0, 1, (8, 6, 9)), dtype=torch.float32)
-    camera = Camera.look_at((1, 2, 8), (1, 2, 3), extent=3.0, height=6, width=9)
-    frame, depth = SixWay(maps[:6], maps[6], None, camera), torch.tensor(random.uniform(-1, 1, (6, 9)))
-    first, second = pack([frame], "unity", rows=1, columns=1, padding=1)
-    book = {"rows": 1, "columns": 1, "count": 1, "size": (6, 9), "padding": 1, "hot": False}
-    text = smoke_shader("unity", **book, depth=0.4)
-    away = lay_out(encoded_depth(depth[None] / 3.0, 0.4), 1, 1, 1)
-    asked, way, expected = [], [], []
-    for position in ((0.2, 0.1, 0.3), (-2.0, 1.5, 0.0), (0.5, -3.0, -4.0)):
-        lamp = PointLight(tuple(np.add(position, (1, 2, 3)).tolist()), (4 * np.pi,) * 3, radius=0.7)
-        shown = from_point(frame, depth, lamp, (1, 2, 3))[..., 0]
-        for row, column in ((0, 0), (3, 4), (5, 8), (2, 5)):
-            asked.append([(column + 0.5) / 9, (row + 0.5) / 6, 0])
-            way.append(position)
-            expected.append([shown[row, column]])
-    main = (
-        POINTS
-        + """uniform sampler2D u_ways;
-uniform sampler2D u_first;
-uniform sampler2D u_second;
-uniform sampler2D u_depth;
-vec4 shown(ivec2 pixel)
-{
-    vec4 asked = texelFetch(u_points, pixel, 0);
-    vec2 at = wlm_smoke_uv(asked.xy, asked.z);
-    ivec2 texel = ivec2(floor(at * vec2(textureSize(u_first, 0))));
-    float depth = wlm_smoke_depth(texelFetch(u_depth, texel, 0));
-    vec4 way = wlm_smoke_point(asked.xy, vec2(4.5, 3.0), depth, texelFetch(u_ways, pixel, 0).xyz, 0.7);
-    float light = wlm_smoke_light(texelFetch(u_first, texel, 0), texelFetch(u_second, texel, 0), way.xyz);
-    return vec4(light * way.w, 0.0, 0.0, 0.0);
-}
-"""
-    )
-    pages = {"u_first": np.float32(first), "u_second": four(second), "u_depth": four(away)}
-    bound = {"u_points": points_of(asked), "u_ways": points_of(way), **pages}
-    return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 1e-4)
-
-
-def four(page: np.ndarray) -> np.ndarray:
-    """A texture of three channels with a fourth."""
-    return np.pad(np.float32(page), ((0, 0), (0, 0), (0, 1)))
 
 
 def smoke_motion(_) -> Subject:
     """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
     random = np.random.default_rng(7)
-    size, scale = {"rows": 2, "columns": 3, "count": 5, "size": (24, 24), "padding": 4}, 0.07
-    text = smoke_shader("unity", **size, motion=scale)
+    scale = 0.07
+    text = smoke_shader(replace(random_book(random_frames(size=(24, 24)), padding=4), scale=scale))
     asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
     way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
     way[0, :2] = ZERO
@@ -161,4 +112,4 @@ vec4 shown(ivec2 pixel)
 def smoke_subjects() -> dict[str, Callable[[object], Subject]]:
     """All of them by name; each is made with the folder for its files, of which it needs none."""
     layouts = {f"smoke {layout}": partial(smoke, layout) for layout in LAYOUTS}
-    return {"smoke motion": smoke_motion, "smoke point": smoke_point, "smoke billboard": billboard} | layouts
+    return {"smoke motion": smoke_motion, "smoke billboard": billboard} | layouts

@@ -77,6 +77,13 @@ def test_doctor_names_the_devices_and_the_cache():
     assert call.stderr == ""
 
 
+def test_doctor_reads_a_cache_that_others_change(tmp_path, monkeypatch):
+    (tmp_path / "kernel.o").write_bytes(bytes(3_000_000))
+    (tmp_path / "renamed.o").symlink_to(tmp_path / "gone.o")
+    monkeypatch.setattr("warp.config.kernel_cache_dir", str(tmp_path))
+    assert "3.0 MB" in call("doctor")
+
+
 def test_doctor_says_which_extra_lacks_what(monkeypatch):
     stated = ["numpy", "typer; extra == 'one'", 'no-such-package>=2; extra == "two"']
     monkeypatch.setattr("importlib.metadata.requires", lambda name: stated)

@@ -1,56 +1,66 @@
-"""Flip books as inputs of `shade` and `flipbook`: premultiplied or straight, of two textures or three."""
+"""`wlm smoke flipbook`, and flip books of other programs as inputs of `shade` and `flipbook`."""
 
-import dataclasses
+import json
 
 import numpy as np
 import pytest
 import torch
+from builders.running import call, fails
+from builders.smoke_books import random_frames
 from PIL import Image
-from typer.testing import CliRunner
 
-from wlm.cli.app import app
 from wlm.inspection import inspect
 from wlm.smoke.camera import Camera
-from wlm.smoke.flipbook.textures import is_straight, read_flipbook, write_flipbook
+from wlm.smoke.data import write_six_way
+from wlm.smoke.flipbook.book import Shot, pack_book, read_flipbook, write_book
 from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.scene import LightSettings, Looks
 from wlm.smoke.shading import Light
 
 SIZE = 16
 
 
-def call(*words) -> str:
-    result = CliRunner().invoke(app, ["smoke", *map(str, words)])
-    assert result.exit_code == 0, result.output
-    return result.output
+def info_of(folder) -> dict:
+    return json.loads((folder / "bundle.json").read_text())
 
 
-def fails(*words) -> str:
-    result = CliRunner().invoke(app, ["smoke", *map(str, words)])
-    assert result.exit_code == 2
-    return result.output
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory):
+    """Five frames of a scene with 20 a second, as bake leaves them, of fire with a ramp."""
+    folder = tmp_path_factory.mktemp("jet")
+    glow = ((0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.5, 0.0))
+    for i, six in enumerate(random_frames(), 1):
+        looks = Looks(lights=(LightSettings(toward=(1, 1, 1)),), glow=glow, time=i / 20)
+        write_six_way(folder / f"six_{i:04d}.exr", six, looks)
+    return folder
 
 
 @pytest.fixture
 def frames() -> list[SixWay]:
-    """Four frames whose smoke is a disc; its light is premultiplied."""
+    """Four frames of smoke in a disc, with premultiplied light."""
     rows, columns = np.mgrid[:SIZE, :SIZE] / (SIZE - 1.0) - 0.5
     opacity = torch.tensor(np.clip(1.2 - 3.0 * np.hypot(rows, columns), 0.0, 1.0), dtype=torch.float32)
     random = np.random.default_rng(0)
     maps = torch.tensor(random.uniform(0.2, 0.9, (4, 6, 1, 1)), dtype=torch.float32)
-    return [SixWay(one * opacity, 1.0 - opacity) for one in maps]
+    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=SIZE, width=SIZE)
+    return [SixWay(one * opacity, 1.0 - opacity, camera=camera) for one in maps]
+
+
+def write(frames, layout, path):
+    book = pack_book([Shot(n, frame) for n, frame in enumerate(frames, 1)], layout, gain=1.0)
+    return [*write_book(book, path)[0]]
 
 
 @pytest.fixture
 def straight(frames, tmp_path):
-    """The same as an engine has it that multiplies: two textures, and one of opacity."""
+    """The same with straight alpha: two textures, and one of opacity."""
     bare = []
     for frame in frames:
         opacity = 1.0 - frame.transparency
-        bare.append(
-            SixWay(torch.where(opacity > 0, frame.lightmaps / opacity.clamp(min=1e-3), torch.tensor(1.0)), None)
-        )
-    paths = tmp_path / "puff_RLT_2x2.png", tmp_path / "puff_BBF_2x2.png"
-    write_flipbook(paths, bare, "o3de", rows=2, columns=2)
+        light = torch.where(opacity > 0, frame.lightmaps / opacity.clamp(min=1e-3), torch.tensor(1.0))
+        bare.append(SixWay(light, None))
+    first, second = write(bare, "o3de", tmp_path / "a.png")
+    paths = first.rename(tmp_path / "puff_RLT_2x2.png"), second.rename(tmp_path / "puff_BBF_2x2.png")
     sheet = (1.0 - torch.stack([frame.transparency for frame in frames])).reshape(2, 2, SIZE, SIZE)
     sheet = sheet.swapaxes(1, 2).reshape(2 * SIZE, 2 * SIZE)
     Image.fromarray(np.rint(255 * sheet.numpy()).astype(np.uint8)).save(tmp_path / "opacity.png")
@@ -63,39 +73,57 @@ def light_of(path) -> np.ndarray:
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
+def test_folders_of_baked_frames(baked, tmp_path):
+    """The rate is that of the scene's frames that are taken; the fire has its ramp."""
+    text = call("smoke", "flipbook", baked, "-o", tmp_path / "all", "--engine", "three")
+    assert "2 x 3 cells of 16 x 12, padded by 1" in text and "first.png" in text
+    info = info_of(tmp_path / "all")
+    assert info["rate"] == pytest.approx(20.0) and info["frames"] == 5 and info["name"] == baked.name
+    assert info["extent"][1] == 2.0 and info.get("motion_scale") is None
+    assert "vec3(1.0, 0.5, 0.0)" in (tmp_path / "all" / "smoke.glsl").read_text()
+    call("smoke", "flipbook", baked, "-o", tmp_path / "some", "--count", 3, "--shader", "wgsl", "--mips", 2)
+    info = info_of(tmp_path / "some")
+    assert (info["rate"], info["frames"], info["levels"]) == (pytest.approx(10.0), 3, 2)
+    assert info["shader"] == "smoke.wgsl" and "@binding" in (tmp_path / "some" / "smoke.wgsl").read_text()
+    call("smoke", "flipbook", baked, "-o", tmp_path / "some", "--layout", "o3de", "--rate", 12)
+    assert info_of(tmp_path / "some")["rate"] == 12.0 and info_of(tmp_path / "some")["layout"] == "o3de"
+
+
 @pytest.mark.parametrize("suffix", ["png", "tga", "exr"])
 def test_premultiplied_light_is_shaded_and_repacked(frames, tmp_path, suffix):
-    paths = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix}"
-    write_flipbook(paths, frames, "embergen", rows=2, columns=2)
+    paths = write(frames, "embergen", tmp_path / f"a.{suffix}")
     book = [paths[0], "--with", paths[1], "--from", "embergen", "--cells", "2x2"]
-    call("shade", *book, "-o", tmp_path / "out", "--light", "1,0.5,0.3", "--background", "0,0.3,0")
-    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=SIZE, width=SIZE)
+    call("smoke", "shade", *book, "-o", tmp_path / "out", "--light", "1,0.5,0.3", "--background", "0,0.3,0")
     for number, frame in enumerate(frames, 1):
-        six = dataclasses.replace(frame, camera=camera)
-        expected = six.shade([Light((1.0, 0.5, 0.3))], background=(0.0, 0.3, 0.0)).numpy().clip(0, 1)
+        expected = frame.shade([Light((1.0, 0.5, 0.3))], background=(0.0, 0.3, 0.0)).numpy().clip(0, 1)
         seen = light_of(tmp_path / "out" / f"shade_{number:04d}.png")
         assert np.abs(seen - expected).max() < 0.02
-    call("flipbook", *book, "-o", tmp_path / "c.exr", "--layout", "unity")
+    call("smoke", "flipbook", *book, "-o", tmp_path / "c.exr")
     again = read_flipbook((tmp_path / "c_1.exr", tmp_path / "c_2.exr"), "unity", rows=2, columns=2)
     for one, frame in zip(again, frames, strict=True):
         np.testing.assert_allclose(one.lightmaps, frame.lightmaps, atol=0.005)
         np.testing.assert_allclose(one.transparency, frame.transparency, atol=0.005)
+    if suffix == "png":
+        # The rate and the size in the world are unknown; 8 bits use the whole range.
+        text = call("smoke", "flipbook", *book, "-o", tmp_path / "kit", "--engine", "unity")
+        info = info_of(tmp_path / "kit")
+        assert (info["rate"], info["extent"][1], info["layout"]) == (25.0, 1.0, "unity")
+        assert info["gain"] == pytest.approx(1 / max(float(frame.lightmaps.max()) for frame in frames), rel=0.01)
+        assert " 0 values clipped" in text and f"{info['gain']:.4g}" in text
+        text = call("smoke", "flipbook", *book, "-o", tmp_path / "g.tga", "--count", 2, "--gain", 9)
+        assert "1 x 2 cells of 16 x 16" in text and " 0 values clipped" not in text
 
 
-def test_straight_light_with_a_texture_of_opacity(frames, straight, tmp_path):
+def test_straight_light_with_a_texture_of_opacity(straight, tmp_path):
     first, second, opacity = straight
-    read = read_flipbook(straight, "o3de", rows=2, columns=2, straight=True)
-    for one, frame in zip(read, frames, strict=True):
-        np.testing.assert_allclose(one.lightmaps, frame.lightmaps, atol=0.01)
-        np.testing.assert_allclose(one.transparency, frame.transparency, atol=0.003)
-    assert not is_straight(read) and is_straight(read_flipbook(straight, "o3de", rows=2, columns=2))
-    words = ["shade", first, "--with", second, "--with", opacity, "--from", "o3de", "--cells", "2x2", "-o"]
-    assert "is it straight (--straight)?" in call(*words, tmp_path / "white")
-    assert "is it straight" not in call(*words, tmp_path / "out", "--straight", "--background", "0,0,1")
-    corner = light_of(tmp_path / "out" / "shade_0001.png")[0, 0]
-    np.testing.assert_allclose(corner, [0, 0, 1], atol=1e-6)
+    words = ["smoke", "shade", first, "--with", second, "--with", opacity, "--from", "o3de", "--cells", "2x2", "-o"]
+    call(*words, tmp_path / "white")
+    assert "is it straight (--straight)?" in call.stderr
+    call(*words, tmp_path / "out", "--straight", "--background", "0,0,1")
+    assert "is it straight" not in call.stderr
+    np.testing.assert_allclose(light_of(tmp_path / "out" / "shade_0001.png")[0, 0], [0, 0, 1], atol=1e-6)
     found = next(each for each in inspect(tmp_path) if each.path == first)
-    # What is printed for it is taken: without the third texture it can be repacked, not shaded.
+    # The printed command is accepted: without the third texture the book can be repacked, not shaded.
     book = f"{first} --with {second} --from o3de --cells 2x2"
     assert found.command == f"wlm smoke flipbook {book} -o OUT.png" and "no opacity" in found.problems[0]
     Image.open(first).convert("RGBA").save(first)
@@ -103,17 +131,34 @@ def test_straight_light_with_a_texture_of_opacity(frames, straight, tmp_path):
     assert found.command == f"wlm smoke shade {book} -o DIR" and not found.problems
 
 
-def test_what_is_refused(straight, tmp_path):
+def test_wrong_flip_books(straight, tmp_path):
     first, second, opacity = straight
-    words, out = ["shade", first, "--with", second, "--from", "o3de"], ["-o", tmp_path / "out"]
-    assert "no opacity" in fails(*words, "--cells", "2x2", *out)
-    assert "expected opacity" in fails(*words, "--cells", "2x2", "--straight", *out)
-    assert "--cells: expected rows and columns" in fails(*words, *out)
-    assert "--cells: expected rows and columns" in fails(*words, "--cells", "0x2", *out)
-    assert "expected 3 x 3 cells of whole pixels" in fails(*words, "--cells", "3x3", *out)
-    assert "--from: expected one of" in fails(*words[:-1], "unreal", "--cells", "2x2", *out)
-    assert "got 3" in fails(*words, *["--with", opacity] * 2, "--cells", "2x2", *out)
-    assert "--straight: has no meaning without --with" in fails("shade", first, "--straight", *out)
-    Image.new("L", (8, 8)).save(tmp_path / "small.png")
-    assert "of one size" in fails(*words, "--with", tmp_path / "small.png", "--cells", "2x2", *out)
+    words, out = ["smoke", "shade", first, "--with", second, "--from", "o3de"], ["-o", tmp_path / "out"]
+    for extra, line in (
+        (["--cells", "2x2"], "no opacity"),
+        (["--cells", "2x2", "--straight"], "expected opacity"),
+        ([], "--cells: expected rows and columns"),
+        (["--cells", "0x2"], "--cells: expected rows and columns"),
+        (["--cells", "3x3"], "expected 3 x 3 cells of whole pixels"),
+        (["--with", opacity, "--with", opacity, "--cells", "2x2"], "got 4"),
+    ):
+        assert line in fails(*words, *extra, *out)
+    assert "--straight: has no meaning without --with" in fails("smoke", "shade", first, "--straight", *out)
     assert not list((tmp_path / "out").glob("*"))
+
+
+def test_wrong_options_are_one_line(baked, tmp_path):
+    book = ["smoke", "flipbook", baked, "-o", tmp_path / "out"]
+    textures = ["smoke", "flipbook", baked, "-o", tmp_path / "a.png"]
+    for words, line in (
+        ([*book, "--engine", "godot", "--shader", "hlsl"], "shader and exact have no meaning for a kit"),
+        ([*book, "--engine", "unity", "--layout", "o3de"], "layout: expected unity for unity, got o3de"),
+        ([*book, "--layout", "godot"], "--layout"),
+        ([*book, "--rate", 0], "--rate: expected a number above 0, got 0"),
+        ([*book, "--gain", "nan"], "--gain: expected a number above 0, got nan"),
+        ([*textures, "--engine", "three"], "--engine: expected a folder as the output"),
+        ([*textures, "--shader", "wgsl"], "--shader: expected a folder as the output"),
+        ([*textures[:-1], tmp_path / "a.jpg"], "ends in .exr or .png or .tga"),
+    ):
+        assert call(*words, code=2) == "" and line in call.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,6 @@ import pytest
 from builders import atlas_meshes, small_sets
 from builders.contract import FILES
 from builders.godot_bakes import Writer, bake, probes
-from builders.probe_models import whole_model as random_model
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -98,20 +97,6 @@ def test_all_folders_that_are_written_are_known():
     texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
     formats = {name for text in texts for name in re.findall(r'^[A-Z][A-Z_]+ = "(wlm-[^"]+)"$', text, re.MULTILINE)}
     assert len(formats) > 3 and formats <= set(files._EXPORTS)
-
-
-def test_probes_of_exports_can_be_read_back(tmp_path):
-    model = random_model(count=3, probes=20, positions=True)
-    for engine, name, what in (
-        ("three", "grid.json", "a grid of light for three.js: 4 light probes"),
-        ("unreal", "light.json", "light probes for Unreal, volume textures and a shader: 4 light probes"),
-        ("unity", "probes.json", "light probes for Unity: 20 light probes"),
-    ):
-        folder = tmp_path / name.removesuffix(".json")
-        export(model, folder, engine, **({} if engine == "unity" else {"cells": 2}))
-        (finding,) = inspect(folder / name)
-        assert finding.what.startswith(f"{what} of 9 RGB coefficients")
-        assert finding.command == f"wlm compress {folder / name} -o OUT.wlm"
 
 
 def test_pictures_of_several_atlases_are_no_times(tmp_path):

@@ -97,9 +97,10 @@ def decoded(path, *words):
 
 @pytest.mark.parametrize("suffix", [".npz", ".json"])
 def test_decode_at_the_probes(suffix, fitted, carrying, room, tmp_path):
-    probes, decoder = data.load(room), wlm.load(fitted).decoder()
+    probes = data.load(room)
+    decoder = wlm.load(fitted).decoder(position=probes.position)
     light = decoded(tmp_path / f"a{suffix}", fitted, "--positions", room)
-    np.testing.assert_array_equal(light.values, decoder.decode_probes(probes.position))
+    np.testing.assert_array_equal(light.values, decoder.decode_probes())
     np.testing.assert_array_equal(light.position, probes.position)
     assert np.count_nonzero(~light.live) == DEAD
     stored = decoded(tmp_path / f"b{suffix}", carrying)
@@ -128,7 +129,7 @@ def test_decode_in_an_engines_convention(fitted, room, tmp_path):
     assert "the probes" in text and f"{PROBES}" in text
     with np.load(tmp_path / "a.npz") as arrays:
         assert arrays["convention"] == "unity"
-    expected = wlm.load(fitted).decoder().decode_probes(data.load(room).position)
+    expected = wlm.load(fitted).decoder(position=data.load(room).position).decode_probes()
     np.testing.assert_allclose(data.load(tmp_path / "a.npz").values, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -183,44 +184,6 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_walk_prints_and_writes_the_report(fitted, carrying, room, tmp_path):
-    words = ["--frames", 20, "--block", 0.25, "--budget", 5, "--json", tmp_path / "r.json"]
-    text = call("probe", "volume", fitted, room, *words)
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["frames"] == 20 and report["budget"] == 5 and report["updated"]["max"] == 5
-    np.testing.assert_allclose(report["sizes"], [0.25, 0.5, 1.0, 4.0])
-    assert report["volume_bytes"] >= 32768 * 27 * 4 and report["first_frames"] > 1
-    assert 0 < report["psnr"] <= report["light_psnr"] + 1.0  # no better than the probes as decoded, or hardly
-    words_there = ["20 frames", f"{report['coverage']['mean']:.2%}", f"{report['volume_bytes']:,}", "update, ms"]
-    for word in (*words_there, f"{report['psnr']:.2f}", f"{report['light_psnr']:.2f}"):
-        assert word in text
-    assert "walk: 20 of 20" in call.stderr
-    call("probe", "volume", carrying, *words)
-    again = json.loads((tmp_path / "r.json").read_text())
-    assert again["coverage"]["mean"] == pytest.approx(report["coverage"]["mean"], abs=0.05)
-
-
-def test_walk_along_a_path(carrying, tmp_path):
-    path = write_json(tmp_path / "path.json", [[1, 1, 1], [2, 1, 1], [1e6, 0, 0]])
-    call("probe", "volume", carrying, "--path", path, "--json", tmp_path / "r.json")
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["frames"] == 3 and report["coverage"]["min"] <= 1.0
-
-
-def test_walk_with_another_axis_up(carrying, monkeypatch):
-    asked = []
-
-    def path(position, frames, eye_height, up):
-        asked.append((len(position), frames, eye_height, up))
-        return position[:2]
-
-    monkeypatch.setattr("wlm.probe.volume.walk.camera_path", path)
-    call("probe", "volume", carrying, "--up", "z", "--eye", 0.8, "--frames", 7)
-    call("probe", "volume", carrying, "--block", 0.7)
-    # Live probes alone, and as many frames as it takes to go round.
-    assert asked[0] == (PROBES - DEAD, 7, 0.8, 2) and asked[1][1] > 20 and asked[1][2:] == (None, 1)
-
-
 def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
     odd = tmp_path / "[red]a[b].wlm"
     odd.write_bytes(fitted.read_bytes())
@@ -257,16 +220,11 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["evaluate", "{fit}", "absent.npz"], "absent.npz: cannot read the arrays: No such file"),
         (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
         (["info", "{tmp}"], "expected a file, found a folder"),
-        (["probe", "volume", "{fit}"], "stores no positions"),
-        (["probe", "volume", "{fit}", "{other}"], "expected the 160 probes of"),
-        (["probe", "volume", "{fit}", "{set}", "--up", "w"], "--up: expected x, y or z"),
-        (["probe", "volume", "{fit}", "{set}", "--frames", "0"], "camera path: expected at least 1 frame"),
-        (["probe", "volume", "{fit}", "{set}", "--block", "-1"], "volume block"),
-        (["probe", "volume", "{fit}", "{set}", "--budget", "0"], "volume budget"),
-        (["probe", "volume", "{fit}", "{set}", "--path", "absent.json"], "absent.json"),
+        (["probe", "volume", "{fit}", "-o", "{tmp}/out"], "stores no positions"),
+        (["probe", "volume", "{fit}", "{other}", "-o", "{tmp}/out"], "expected the 160 probes of"),
+        (["probe", "volume", "{fit}", "{set}", "-o", "{tmp}/out", "--block", "-1"], "volume block"),
         (["probe", "frobnicate"], "frobnicate"),
         (["probe"], "Missing command"),
-        (["probe", "volume", "{fit}", "{set}", "--at", "1,2,3"], "--at: has no meaning without --output"),
     ],
     ids=lambda value: "-".join(value[:1] + value[-2:]).replace("/", "_") if isinstance(value, list) else "",
 )

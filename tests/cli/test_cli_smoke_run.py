@@ -32,12 +32,12 @@ def png(path):
 
 
 def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
-    text = call("smoke", "run", scene, "-o", tmp_path / "run", "--orders", "single", "--step", 1)
+    text = call("smoke", "run", scene, "-o", tmp_path / "run", "--orders", "single")
     assert sorted(os.listdir(tmp_path / "run")) == [f"run_{n:04d}.png" for n in (1, 2, 3)]
     for stage in ("simulation", "lightmaps", "shadows and picture", "bytes", "writing"):
         assert stage in text
     call("smoke", "simulate", scene, "-o", tmp_path / "frames")
-    call("smoke", "predict", tmp_path / "frames", "--coarse", "--step", 1, "-o", tmp_path / "six")
+    call("smoke", "predict", tmp_path / "frames", "--coarse", "-o", tmp_path / "six")
     call("smoke", "shade", tmp_path / "six", "-o", tmp_path / "shaded")
     for number in (1, 2, 3):
         made = png(tmp_path / "run" / f"run_{number:04d}.png")
@@ -71,14 +71,11 @@ def test_what_run_refuses(scene, tmp_path, monkeypatch):
     out = tmp_path / "a"
     assert "--white: expected a number above 0" in fails("smoke", "run", scene, "-o", out, "--white", 0)
     for words, line in (
-        (("--orders", "two"), "--orders: expected one of all, single"),
+        (("--orders", "two"), "--orders"),
         (("--orders", "all", "--network", "a.safetensors"), "--network: expected --orders single"),
-        (("--seed", 1), "--seed: expected --orders single"),
         (("--albedo", "0.5,2,1"), "--albedo: expected numbers of 0 to 1"),
     ):
         assert line in fails("smoke", "run", scene, "-o", out, *words)
-    both = ("--step", 1, "--network", tmp_path / "n.safetensors")
-    assert "--step: expected no --network" in fails("smoke", "run", scene, "-o", out, *both)
     (tmp_path / "b.yaml").write_text(yaml.safe_dump(SCENE | {"camera": {"perspective": True}}))
     single = ("--orders", "single")
     assert "expected false for six-way lightmaps" in fails("smoke", "run", tmp_path / "b.yaml", "-o", out, *single)

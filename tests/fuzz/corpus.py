@@ -3,27 +3,24 @@
 import base64
 import gzip
 import json
-import tempfile
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import OpenEXR
 import warp as wp
-from builders import atlas_meshes, bench_rows, probe_models, probe_sets, smoke_plumes
+from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from benchmarks import Row, write_json
 from wlm.atlas.stored import store
-from wlm.export import export
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
 from wlm.probe.data import save_probes
-from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.flipbook.shots import with_surface
+from wlm.smoke.march.coarse import with_surface
 from wlm.smoke.march.fine import bake as bake_smoke
 from wlm.smoke.scene import Scene
 
@@ -165,13 +162,6 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
-    with tempfile.TemporaryDirectory() as grid:
-        export(probe_models.whole_model(count=3), Path(grid) / "out", "three", cells=2)
-        for name in ("grid.json", "grid.ktx2"):
-            (folder / name).write_bytes((Path(grid) / "out" / name).read_bytes())
-        export(probe_models.whole_model(count=3), Path(grid) / "unreal", "unreal", cells=2)
-        for name in ("light.json", AMBIENT_FILE, SH_FILES[0]):
-            (folder / f"unreal-{name}").write_bytes((Path(grid) / "unreal" / name).read_bytes())
     np.savez(folder / "positions.npz", position=room.position)
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 

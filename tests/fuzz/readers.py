@@ -33,9 +33,8 @@ from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
 from wlm.inspection.finding import UNREADABLE
 from wlm.probe.data import load_positions
-from wlm.probe.engines.unreal import AMBIENT_FILE, SH_FILES
 from wlm.smoke.data import load_frames, read_shaded
-from wlm.smoke.flipbook.textures import read_flipbook
+from wlm.smoke.flipbook.book import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
@@ -153,16 +152,6 @@ def _probes(path: Path) -> None:
     probes = wlm.probe.load(path)
     check_finite(position=probes.position, values=probes.values)
     assert probes.values.shape[0] == len(probes.position) > 0, "accepted without probes"
-
-
-def _texture() -> dict[str, bytes]:
-    return {"grid.ktx2": corpus("grid.ktx2")()[0]}
-
-
-def _unreal() -> dict[str, bytes]:
-    return {name: corpus(f"unreal-{SH_FILES[0]}")()[0] for name in SH_FILES} | {
-        AMBIENT_FILE: corpus("unreal-ambient.dds")()[0]
-    }
 
 
 def _positions(path: Path) -> None:
@@ -381,27 +370,6 @@ _ALL = (
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
-    Reader("probes-grid", "grid.json", corpus("grid.json"), _json, _probes, _texture),
-    Reader(
-        "probes-texture",
-        "grid.ktx2",
-        corpus("grid.ktx2"),
-        vary_ktx2,
-        lambda path: _probes(path.with_name("grid.json")),
-        lambda: {"grid.json": corpus("grid.json")()[0]},
-    ),
-    Reader("probes-unreal", "light.json", corpus("unreal-light.json"), _json, _probes, _unreal),
-    Reader(
-        "probes-unreal-texture",
-        AMBIENT_FILE,
-        corpus("unreal-ambient.dds"),
-        vary_dds,
-        lambda path: _probes(path.with_name("light.json")),
-        lambda: (
-            {name: data for name, data in _unreal().items() if name != AMBIENT_FILE}
-            | {"light.json": corpus("unreal-light.json")()[0]}
-        ),
-    ),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
     Reader("volume-npz", "a.npz", corpus("volume.npz", "volume-bricks.npz"), vary_npz, _volume),

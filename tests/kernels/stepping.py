@@ -78,7 +78,8 @@ class Case:
             affine.append([random.uniform(0.7, 1.0, 3), random.uniform(0.3, 0.6, 3)])
             weight.append(random.uniform(0.5, 2.0, (times, 3)))
         f32 = [np.array(values, np.float32) for values in (colour, scale, affine, weight)]
-        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], self.profile())
+        settings = {name: getattr(self.profile(), name) for name in ("gamma", "metric_weight", "peak")}
+        result = Targets(np.array(self.numbers), f32[0], np.array(mask), f32[1], f32[2], **settings)
         if self.emphasis != 0.0:
             result.weight, result.emphasis = f32[3], self.emphasis
         return result
@@ -121,7 +122,7 @@ def _clear_values(trainer: Trainer) -> dict[str, np.ndarray]:
 
 def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
     """The samples of the coming step: places int [N, B, 3] as (y, x, time) and features float32 [N, B, I]."""
-    kernels, samples = trainer._kernels, trainer.profile.samples
+    kernels, samples = trainer._kernels, trainer._samples
     shape = (trainer.tiles, samples)
     with interop.stream(trainer.device):
         trainer.batch.quantised = int(quantised)
@@ -227,7 +228,7 @@ def tolerance(trainer: Trainer) -> float:
 
     float32 gives 1e-6. On a GPU's matrix units operands are half floats, which gives 1e-3.
     """
-    halves = trainer.device != "cpu" and fits_matrix_units(trainer.inputs, trainer.profile.hidden)
+    halves = trainer.device != "cpu" and fits_matrix_units(trainer.inputs, trainer.hidden.shape[-1])
     return 5e-3 if halves else 2e-5
 
 

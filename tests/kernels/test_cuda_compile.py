@@ -19,17 +19,14 @@ from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.frames import KERNELS as FRAMES
 from wlm_kernels.probe import decode as probe_decode
-from wlm_kernels.probe import gaussian_sum, optimiser
+from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import (
     depth_lattice,
     diffusion,
-    march_coarse,
-    march_guide,
-    march_lights,
-    march_motion,
     march_six,
+    marches,
     path,
 )
 from wlm_kernels.smoke import march as smoke_march
@@ -124,8 +121,7 @@ def test_frames(tmp_path: Path):
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
 def test_gaussians(latent: int, tmp_path: Path):
     """A training step's sum of Gaussians, and the update."""
-    _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path / "step")
-    _compile_all([optimiser.update_kernel(latent)], tmp_path / "update")
+    _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path)
 
 
 @pytest.mark.slow
@@ -150,35 +146,17 @@ def test_probe_network(latent: int, hidden: int, outputs: int, tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
-def test_marching(dtype: type, tmp_path: Path):
-    """Marches through densities of either type."""
-    _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "bricks")
-    bricks = smoke_march.smoke_struct(dtype, True)
-    _compile_all(vars(march_guide.guide_kernels(smoke_march.smoke_struct(dtype, False))).values(), tmp_path / "guide")
-    _compile_all(vars(march_six.six_kernels(bricks)).values(), tmp_path / "six")
-    _compile_all([march_motion.motion_kernel(bricks)], tmp_path / "motion")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("hot", _slow_but(True, [False]))
-@pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
-def test_coarse_marching(dtype: type, hot: bool, tmp_path: Path):
-    """The march of all six lights in large steps, with emission and without."""
+def test_smoke(dtype: type, tmp_path: Path):
+    """All kernels that take smoke, for densities of either type."""
+    _compile_all([smoke_march.occupied_kernel(dtype)], tmp_path / "occupied")
     smoke = smoke_march.smoke_struct(dtype, True)
-    depths = vars(depth_lattice.depth_kernels(smoke, 2)).values()
-    _compile_all([march_coarse.coarse_kernel(smoke, hot), *depths], tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", _slow_but(wp.float16, [wp.float32]))
-def test_lights_and_paths(dtype: type, tmp_path: Path):
-    """The march to lights, light from points by diffusion, and the path tracer."""
-    smoke = smoke_march.smoke_struct(dtype, True)
-    _compile_all(vars(march_lights.light_kernels(smoke)).values(), tmp_path / "lights")
-    _compile_all(vars(diffusion.light_kernels(smoke)).values(), tmp_path / "points")
-    for solid in (False, True):
-        kernels = path.path_kernels(smoke, solid)
-        _compile_all([kernels.majorants, kernels.window, kernels.coarser, kernels.trace], tmp_path / f"path{solid}")
+    variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
+    for module in (marches, march_six, depth_lattice, diffusion, path):
+        launchers = {name: value.build for name, value in vars(module).items() if hasattr(value, "build")}
+        assert launchers
+        for name, build in launchers.items():
+            for extra in [(False,), (True,)] if name == "_trace" else [variants.get(name, ())]:
+                _compile_all([build(smoke, *extra)], tmp_path / f"{module.__name__}{name}{extra}")
 
 
 LATTICE_STEPS = (

@@ -157,7 +157,7 @@ def _stored(fit, case: Case) -> SheetModel:
         parts["net_static"] = parts.pop("net")
     return dataclasses.replace(
         base,
-        profile=fit.profile,
+        profile=case.profile(),
         period=fit.axis.period,
         scale=random.integers(143, 148, base.scale.shape, np.uint8),
         peak=random.integers(149, 153, base.peak.shape, np.uint8),

@@ -1,7 +1,5 @@
 """The lists of Gaussians by cube: who is in them, that nobody is missing, and that they can always be made."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,7 @@ from kernels.compare import array
 from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
-from wlm_kernels.probe.cubes import TESTS, Cubes, cube_of
+from wlm_kernels.probe.cubes import Cubes, cube_of
 
 CUT = 3.0
 LOW, HIGH = [-0.2, 0.0, 0.1], [1.0, 0.7, 0.9]
@@ -60,14 +58,12 @@ def _boxes(cubes: Cubes) -> tuple[np.ndarray, np.ndarray]:
     return np.where(cell == 0, -np.inf, low), np.where(cell == counts - 1, np.inf, low + cubes.size)
 
 
-def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.ndarray:
-    """How far each cube is from each Gaussian, [C, K], in units of what the test says that it reaches."""
+def _distances(rows: np.ndarray, cubes: Cubes, support: str) -> np.ndarray:
+    """Distance of each cube from each Gaussian, [C, K], in units of the size of its support."""
     low, high = _boxes(cubes)
     centre = rows[:, :3].astype(np.float64)
     apart = np.maximum(low[:, None] - centre, 0.0) + np.minimum(high[:, None] - centre, 0.0)
-    if test == "box":
-        return np.abs(apart / reference.reach(rows, CUT, support)).max(2)
-    if test == "sphere" or support == "sphere":
+    if support == "sphere":
         return np.linalg.norm(apart, axis=2) / reference.reach(rows, CUT, "sphere").max(1)
     whiten = reference.whitening(torch.tensor(rows, dtype=torch.float64)).numpy()
     nearest = [
@@ -79,13 +75,12 @@ def _distances(rows: np.ndarray, cubes: Cubes, test: str, support: str) -> np.nd
 
 
 @pytest.mark.parametrize("support", ["ellipsoid", "sphere"])
-@pytest.mark.parametrize("test", TESTS)
-def test_lists_hold_what_meets_the_cube(device: str, test: str, support: str):
-    """Against float64; "exact" against a solver of bounded least squares."""
+def test_lists_hold_what_meets_the_cube(device: str, support: str):
+    """The lists agree with float64, for ellipsoids with a solver of bounded least squares."""
     rows = _gaussians(30, 20.0)
-    cubes = probe_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3, test=test)
+    cubes = probe_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3)
     assert [*cubes.counts] == [4, 3, 3]
-    far = _distances(rows, cubes, test, support)
+    far = _distances(rows, cubes, support)
     listed = _table(cubes, len(rows))
     assert listed[far <= 1.0].all()
     assert not listed[far > 1.0 + LOOSE].any()
@@ -97,8 +92,8 @@ def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longe
     """The nearest point of a cube, where the ellipsoid's axes differ by more than float32 can tell."""
     rows = _gaussians(16, anisotropy, longest)
     rows[::2, 4] = rows[::2, 3]
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25, test="exact")
-    far = _distances(rows, cubes, "exact", "ellipsoid")
+    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25)
+    far = _distances(rows, cubes, "ellipsoid")
     listed = _table(cubes, len(rows))
     assert listed[far <= 1.0].all()
     # A cube is a little larger than it should be; to a sheet of 1e-5 that is far.
@@ -131,17 +126,10 @@ def test_no_list_lacks_a_gaussian_that_reaches(device: str, anisotropy: float, o
         shapes = gaussian_sum.shapes(used, CUT, support)
         want = wp.zeros((1, len(x)), dtype=float, device=device)
         gaussian_sum.sum(used, shapes, None, x, want, CUT)
-        for test, size in itertools.product(TESTS, (0.03, 0.31)):
+        for size in (0.03, 0.31):
             f = wp.zeros_like(want)
-            gaussian_sum.sum(used, shapes, probe_cubes.build(shapes, low, high, size, test=test), x, f, CUT)
+            gaussian_sum.sum(used, shapes, probe_cubes.build(shapes, low, high, size), x, f, CUT)
             np.testing.assert_array_equal(f.numpy(), want.numpy())
-
-
-def test_exact_lists_are_the_shortest(device: str):
-    shapes = _shapes(_gaussians(200, 20.0), device)
-    box, sphere, exact = (_table(probe_cubes.build(shapes, LOW, HIGH, 0.1, test=t), 200) for t in TESTS)
-    assert not (exact & ~box).any() and not (exact & ~sphere).any()
-    assert exact.sum() < 0.6 * box.sum() and box.sum() < 0.6 * sphere.sum()
 
 
 def test_cube_of_points(device: str):
@@ -157,8 +145,7 @@ def test_cube_of_points(device: str):
     assert 0 <= out.numpy()[-1] < 36
 
 
-@pytest.mark.parametrize("test", TESTS)
-def test_hard_gaussians(device: str, test: str):
+def test_hard_gaussians(device: str):
     """Collapsed: one cube. As large as all: every cube. Far off: the cubes at the border that face it. Not a number:
     every cube, for no test can say."""
     rows = np.tile(np.array([0.35, 0.35, 0.35, 0, 0, 0, 1, 0, 0, 0, 1], np.float32), (5, 1))
@@ -167,30 +154,28 @@ def test_hard_gaussians(device: str, test: str):
     rows[2, :3], rows[2, 3:6] = [9.0, 0.35, 0.35], np.log(1e-2)
     rows[3, 0] = np.nan
     rows[4, 4] = np.nan
-    cubes = probe_cubes.build(_shapes(rows, device), [0, 0, 0], [1, 1, 1], 0.1, test=test)
+    cubes = probe_cubes.build(_shapes(rows, device), [0, 0, 0], [1, 1, 1], 0.1)
     listed = _table(cubes, 5).reshape(10, 10, 10, 5)
     assert np.argwhere(listed[..., 0]).tolist() == [[3, 3, 3]]
     assert listed[..., [1, 3, 4]].all()
     assert np.argwhere(listed[..., 2]).tolist() == [[9, 3, 3]]
 
 
-@pytest.mark.parametrize("test", TESTS)
-def test_no_gaussians(device: str, test: str):
+def test_no_gaussians(device: str):
     """Empty lists; one cube where its size is left to us."""
     for size, count in ((0.5, 12), (None, 1)):
-        cubes = probe_cubes.build(_shapes(np.zeros((0, 11), np.float32), device), LOW, HIGH, size, test=test)
+        cubes = probe_cubes.build(_shapes(np.zeros((0, 11), np.float32), device), LOW, HIGH, size)
         assert cubes.start.numpy().tolist() == [0] * (count + 1) and cubes.item.shape == (0,)
 
 
-@pytest.mark.parametrize("test", TESTS)
-def test_flat_boxes(device: str, test: str):
+def test_flat_boxes(device: str):
     """Probes in a plane, in a line, or in one point."""
     rows = _gaussians(40, 5.0, longest=0.05)
     for axes in (1, 2, 3):
         high = np.array(HIGH)
         high[:axes] = LOW[:axes]
         for size in (0.05, None):
-            cubes = probe_cubes.build(_shapes(rows, device), LOW, high, size, test=test)
+            cubes = probe_cubes.build(_shapes(rows, device), LOW, high, size)
             counts = [*cubes.counts]
             assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
             assert _table(cubes, 40).any(0).all()
@@ -220,21 +205,19 @@ def test_everything_is_one_list(device: str):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "message"),
+    ("arguments", "message"),
     [
-        (([0, 0, 0], [1, 1, 1]), {"test": "ball"}, "test: expected one of box, sphere, exact, got 'ball'"),
-        (([0, 0, 0], [1, -1, 1]), {}, "expected two corners of a box"),
-        (([0, 0, 0], [1, np.nan, 1]), {}, "expected two corners of a box"),
-        (([0, 0], [1, 1]), {}, "expected two corners of a box"),
-        (([0, 0, 0], [1, 1, 1], 0.0), {}, "size: expected a positive number, got 0.0"),
-        (([0, 0, 0], [1, 1, 1], np.inf), {}, "size: expected a positive number, got inf"),
-        (([0, 0, 0], [1, 1, 1], 1e-4), {}, r"makes 10+ cubes, expected at most 1073741823"),
+        (([0, 0, 0], [1, -1, 1]), "expected two corners of a box"),
+        (([0, 0, 0], [1, np.nan, 1]), "expected two corners of a box"),
+        (([0, 0], [1, 1]), "expected two corners of a box"),
+        (([0, 0, 0], [1, 1, 1], 0.0), "size: expected a positive number, got 0.0"),
+        (([0, 0, 0], [1, 1, 1], np.inf), "size: expected a positive number, got inf"),
+        (([0, 0, 0], [1, 1, 1], 1e-4), r"makes 10+ cubes, expected at most 1073741823"),
         # Three Gaussians over half of what is allowed each.
-        (([0, 0, 0], [1, 1, 1], 1 / 800), {}, "makes 1536000000 pairs to test, expected at most 1073741823"),
-        (([0, 0, 0], [1, 1, 1], 1 / 800), {"test": "exact"}, "makes 1536000000 pairs to test"),
+        (([0, 0, 0], [1, 1, 1], 1 / 800), "makes 1536000000 pairs to test, expected at most 1073741823"),
     ],
 )
-def test_wrong_arguments(arguments: tuple, options: dict, message: str):
+def test_wrong_arguments(arguments: tuple, message: str):
     rows = np.tile(np.array([0.5, 0.5, 0.5, 1, 1, 1, 1, 0, 0, 0, 1], np.float32), (3, 1))
     with pytest.raises(ValueError, match=message):
-        probe_cubes.build(_shapes(rows, "cpu"), *arguments, **options)
+        probe_cubes.build(_shapes(rows, "cpu"), *arguments)

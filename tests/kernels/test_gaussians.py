@@ -12,7 +12,6 @@ from kernels.compare import array, close
 from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
-from wlm_kernels.probe.cubes import TESTS
 from wlm_kernels.probe.gaussian_sum import SUPPORTS
 
 TOLERANCE = 2e-5  # of a group's largest gradient; float32 gives 6e-6 where a needle is 30 times as long as wide
@@ -49,15 +48,15 @@ def _problem(latent: int, anisotropy: float, gaussians: int = 24, points: int = 
 
 
 class Sums:
-    """A problem on a device; `test` names the cubes' lists, None is no lists."""
+    """A problem on a device, with or without lists of Gaussians by cube."""
 
-    def __init__(self, problem: Problem, device: str, support: str = "ellipsoid", test: str | None = None, cut=CUT):
+    def __init__(self, problem: Problem, device: str, support: str = "ellipsoid", lists: bool = False, cut=CUT):
         self.support, self.cut = support, cut
         self.rows = array(problem.rows, float, device)
         self.x = array(problem.x, wp.vec3, device)
         self.grad_f = array(problem.grad_f, float, device)
         self.shapes = gaussian_sum.shapes(self.rows, cut, support)
-        self.cubes = test and probe_cubes.build(self.shapes, *CORNERS, test=test)
+        self.cubes = probe_cubes.build(self.shapes, *CORNERS) if lists else None
 
     def forward(self) -> np.ndarray:
         f = wp.full(self.grad_f.shape, np.nan, dtype=float, device=self.rows.device)
@@ -94,30 +93,30 @@ def _hold(got: np.ndarray, want: np.ndarray, rows: np.ndarray, turns: bool = Tru
             close(got[:, part], want[:, part], TOLERANCE, f"{name}: gradient of {group}")
 
 
-def _hold_all(problem: Problem, device: str, support: str, tests: tuple, turns: bool = True) -> None:
+def _hold_all(problem: Problem, device: str, support: str = "ellipsoid", turns: bool = True) -> None:
     want_f, want = reference.gradients(problem.rows, problem.x, problem.grad_f, CUT, support)
     alone = None
-    for test in tests:
-        sums = Sums(problem, device, support, test)
+    for lists in (False, True):
+        sums = Sums(problem, device, support, lists)
         f = sums.forward()
-        close(f, want_f, 1e-5, f"{test}: sum")
+        close(f, want_f, 1e-5, f"lists {lists}: sum")
         # A list leaves out what doesn't count, and keeps the order of what does.
         alone = f if alone is None else alone
         np.testing.assert_array_equal(f, alone)
-        _hold(sums.backward(), want, problem.rows, turns, f"{test}")
+        _hold(sums.backward(), want, problem.rows, turns, f"lists {lists}")
 
 
 @pytest.mark.parametrize("support", SUPPORTS)
 @pytest.mark.parametrize("anisotropy", [1.0, 30.0, 1000.0])
 def test_against_autograd(device: str, anisotropy: float, support: str):
     """Sum and gradients, with every kind of list and with none."""
-    _hold_all(_problem(9, anisotropy), device, support, (None, *TESTS), turns=anisotropy > 1)
+    _hold_all(_problem(9, anisotropy), device, support, turns=anisotropy > 1)
 
 
 @pytest.mark.parametrize("latent", [1, 17, *(pytest.param(n, marks=pytest.mark.slow) for n in (12, 32))])
 def test_latents(device: str, latent: int):
     """Latents on both sides of 16, where a loop is no longer unrolled."""
-    _hold_all(_problem(latent, 8.0), device, "ellipsoid", ("exact",))
+    _hold_all(_problem(latent, 8.0), device)
 
 
 def test_differences(device: str):
@@ -159,7 +158,7 @@ def test_hard_gaussians(device: str):
     points = [_points_within(row, 8, random) for row in rows[:6]]
     x = np.concatenate([problem.x, rows[:7, :3], *points]).astype(np.float32)
     problem = Problem(rows, x, random.normal(size=(9, len(x))).astype(np.float32))
-    _hold_all(problem, device, "ellipsoid", (None, "exact"))
+    _hold_all(problem, device)
     grad = Sums(problem, device).backward()
     assert not grad[:2, 6:10].any(), "no rotation, no gradient"
     assert grad[:2, :6].all()
@@ -170,11 +169,11 @@ def test_one_gaussian_and_one_point(device: str):
     rows = np.array([[0.5, 0.5, 0.5, -2, -1, -3, 1, 2, 3, 4, 2.0]], np.float32)
     x = rows[:, :3].copy()
     problem = Problem(rows, x, np.full((1, 1), 3.0, np.float32))
-    for grad in (Sums(problem, device).backward(), Sums(problem, device, test="box").backward()):
+    for grad in (Sums(problem, device).backward(), Sums(problem, device, lists=True).backward()):
         np.testing.assert_array_equal(grad, [[0.0] * 10 + [3.0]])
     assert Sums(problem, device).forward() == 2.0
     problem.x = (x + np.array([0.1, 0.05, -0.06])).astype(np.float32)
-    _hold_all(problem, device, "ellipsoid", (None, "exact"))
+    _hold_all(problem, device)
 
 
 def test_none(device: str):
@@ -182,10 +181,10 @@ def test_none(device: str):
     problem = _problem(1, 8.0)
     nowhere = Problem(problem.rows, problem.x[:0], problem.grad_f[:, :0])
     nothing = Problem(problem.rows[:0], problem.x, problem.grad_f)
-    for test in (None, *TESTS):
-        sums = Sums(nowhere, device, test=test)
+    for lists in (False, True):
+        sums = Sums(nowhere, device, lists=lists)
         assert sums.forward().shape == (1, 0) and not sums.backward()[:, 3:].any()
-        sums = Sums(nothing, device, test=test)
+        sums = Sums(nothing, device, lists=lists)
         assert not sums.forward().any() and sums.backward().shape == (0, 11)
 
 
@@ -195,19 +194,19 @@ def test_not_a_number(device: str):
     want, want_grad = Sums(problem, device).forward(), Sums(problem, device).backward()
     x, rows = np.insert(problem.x, 7, np.nan, axis=0), np.insert(problem.rows, 7, np.nan, axis=0)
     grad_f = np.insert(problem.grad_f, 7, 1.0, axis=1)
-    for test in (None, *TESTS):
-        sums = Sums(Problem(rows, x, grad_f), device, test=test)
+    for lists in (False, True):
+        sums = Sums(Problem(rows, x, grad_f), device, lists=lists)
         f, grad = sums.forward(), sums.backward()
         assert f[0, 7] == 0.0
         np.testing.assert_array_equal(np.delete(f, 7, 1), want)
         _hold(np.delete(grad, 7, 0), want_grad, problem.rows)
 
 
-@pytest.mark.parametrize("test", [None, "exact"])
-def test_same_bits_every_time(device: str, test: str | None):
+@pytest.mark.parametrize("lists", [False, True])
+def test_same_bits_every_time(device: str, lists: bool):
     """Nothing is added in an order that changes."""
     problem = _problem(9, 8.0)
-    first, second = (Sums(problem, device, test=test) for _ in range(2))
+    first, second = (Sums(problem, device, lists=lists) for _ in range(2))
     np.testing.assert_array_equal(first.forward(), second.forward())
     np.testing.assert_array_equal(first.backward(), second.backward())
 
@@ -224,12 +223,3 @@ def test_error_of_the_cut(device: str):
         assert 0 < three.max() < 0.2 * two.max()
     for ellipsoid, sphere in zip(errors["ellipsoid"], errors["sphere"], strict=True):
         assert sphere.mean() < ellipsoid.mean()
-
-
-def test_wrong_arguments():
-    rows = wp.zeros((2, 10), dtype=float, device="cpu")
-    with pytest.raises(ValueError, match="support: expected one of ellipsoid, sphere, got 'cube'"):
-        gaussian_sum.shapes(rows, CUT, "cube")
-    f, x = wp.zeros((1, 1), dtype=float, device="cpu"), wp.zeros(1, dtype=wp.vec3, device="cpu")
-    with pytest.raises(ValueError, match="rows: expected more than 10 columns, got 10"):
-        gaussian_sum.sum(rows, gaussian_sum.shapes(rows, CUT), None, x, f, CUT)

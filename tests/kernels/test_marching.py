@@ -5,9 +5,10 @@ import pytest
 import warp as wp
 from reference import marching as reference
 from reference.marching import Scene
+from reference.single_light import march_lit
 
 from kernels.compare import array, close
-from wlm_kernels.smoke import march_guide, march_six
+from wlm_kernels.smoke import march_six, marches
 from wlm_kernels.smoke.march import Medium, View, make_view, occupied
 from wlm_kernels.smoke.settings import March
 
@@ -46,7 +47,7 @@ def _run(launch, planes: tuple, scene: Scene, device: str, *arguments, dtype=wp.
 
 
 def _guide(scene: Scene, device: str, dtype=wp.float32, shared: bool = True, **march) -> np.ndarray:
-    return _run(march_guide.guide, (3,), scene, device, March(**march), dtype=dtype, shared=shared)
+    return _run(marches.guide, (3,), scene, device, March(**march), dtype=dtype, shared=shared)
 
 
 def _six(scene: Scene, device: str, dtype=wp.float32, hot=None, **march) -> np.ndarray:
@@ -54,7 +55,7 @@ def _six(scene: Scene, device: str, dtype=wp.float32, hot=None, **march) -> np.n
 
 
 def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
-    return _run(march_six.lit, (), scene, device, toward, March(**march))
+    return _run(march_lit, (), scene, device, toward, March(**march))
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -73,7 +74,7 @@ def test_shared_lights(device: str):
     """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
     scene = _scene(True)
     medium = Medium(array(scene.density, float, device), scene.extinction)
-    nodes = march_guide.lattice(medium, scene.up, 2.5)
+    nodes = marches.guide_nodes(medium, scene.up, 2.5)
     close(nodes.numpy(), reference.nodes(scene, 2.5), LOOSE, "nodes")
     marched, coarse, fine = (
         _guide(scene, device, step=step, jitter=0.0, shared=shared)[0]
@@ -82,7 +83,7 @@ def test_shared_lights(device: str):
     error = [np.sqrt(np.square(result - marched).mean() / np.square(marched).mean()) for result in (coarse, fine)]
     # Of noise from voxel to voxel, the worst that a lattice can meet.
     assert error[1] < 0.012 < error[0] < 0.2
-    nodes = march_guide.lattice(medium, scene.up, 0.01)
+    nodes = marches.guide_nodes(medium, scene.up, 0.01)
     assert nodes.shape == (11, 14, 12)
 
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke import marches
 from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import LIGHTS, PLANES, STRIP, Taps, decode, encode_six, kernels
 
@@ -137,7 +137,7 @@ def test_the_guide_of_six_lights(device, size, hot):
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
     encode_six(_array(planes, False, device), near, far, hot, out)
     result = torch.from_numpy(out.numpy()).double()
-    of = dict(zip(march_coarse.PLANES, planes.double(), strict=True))
+    of = dict(zip(marches.PLANES, planes.double(), strict=True))
     glow = of["emission"].clamp(min=0) if hot else torch.zeros(size, dtype=torch.float64)
     depth = ((far - of["depth"]) / (far - near)).clamp(0, 1) * (of["depth"] > 0)
     lights = [_srgb(of[name]) for name in ("right", "left", "top", "bottom", "front", "back")]

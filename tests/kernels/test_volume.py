@@ -60,13 +60,6 @@ class Grid:
         volume.read(pool, pages, bases, views, self.side, where, ahead, out, level, weight)
         return out.numpy(), level.numpy(), weight.numpy()
 
-    def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
-        pool, pages, bases = self._arrays()
-        out = array(np.full(self.pool.shape, np.nan), float, self.device)
-        valid = wp.empty(len(self.pages), dtype=wp.uint8, device=self.device)
-        volume.unscroll(pool, pages, bases, self.side, out, valid)
-        return out.numpy(), valid.numpy()
-
 
 def _filled(channels: int, device: str, share: float = 0.6, bases: np.ndarray = BASES) -> Grid:
     """A grid with a random share of its blocks."""
@@ -157,19 +150,3 @@ def test_continuous_across_missing_blocks(device: str):
     # Each level's share and value change by at most 3 sides of difference per side of a block, in each axis.
     bound = 2 * np.ptp(values_there) * 3 * np.abs(np.diff(way, axis=0)).max() / min(SIZES) * 2
     assert np.abs(np.diff(values, axis=0)).max() < bound < 0.1 * np.ptp(values)
-
-
-def test_unscroll(device: str):
-    """In the order of space; blocks that are not there are invalid and 0."""
-    grid = _filled(3, device)
-    values, valid = grid.unscroll()
-    names = [name for level in range(len(SIZES)) for name in grid.window(level)]
-    there = np.array([name in grid.blocks for name in names])
-    assert 0 < there.sum() < len(there)
-    np.testing.assert_array_equal(valid.astype(bool), there)
-    want = np.array([grid.blocks[name] for name in names if name in grid.blocks], np.float32)
-    np.testing.assert_array_equal(values[there], want)
-    assert not values[~there].any()
-    empty = Grid(BASES, SIZES, SIDE, 2, device)
-    values, valid = empty.unscroll()
-    assert not values.any() and not valid.any()

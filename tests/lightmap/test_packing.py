@@ -26,6 +26,11 @@ def _file_of(sheet) -> LightmapModel:
     return LightmapModel("random", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
 
 
+def reads_of(used: np.ndarray, sheet) -> Reads:
+    p = sheet.profile
+    return Reads.of(used, sheet.axis, p.uvt_resolution, p.uvt_slices, p.plane_columns, p.plane_rows)
+
+
 def _mask(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((236, 247)) < 0.4
 
@@ -60,7 +65,7 @@ def test_what_is_not_read_costs_nothing(tmp_path):
     # Two times read two slices of four and three rows of six each, and so of the planes.
     model = random_sheet((3, 0), times=(6.0, 18.0), mask=used[:108].copy(), columns=1, uvt_resolution=32, uvt_slices=4)
     model = dataclasses.replace(model, mask=np.pad(used, ((0, 128), (0, 0)))[:236, :119])
-    reads = Reads.of(used, model.profile, model.axis)
+    reads = reads_of(used, model)
     parts = {name: getattr(model, name)[0] for name in ("uv", "uvt", "ut", "vt")}
     cleared = clear_unread(parts, used, reads)
     texels, expected = decode_image(cleared["uv"]), decode_image(model.uv[0])
@@ -86,7 +91,7 @@ def test_what_is_not_read_changes_no_light(count, period, rows):
     times = tuple(np.linspace(0.0, 23.0, 7))
     model = random_sheet((3, 0), columns=1, times=times, period=period, uvt_slices=count, plane_rows=2 * count)
     model = dataclasses.replace(model, mask=mask)
-    reads = Reads.of(used, model.profile, model.axis)
+    reads = reads_of(used, model)
     assert reads.rows.sum() == rows and reads.columns.sum() < 16 and reads.texels.sum() < 10
     other = {name: getattr(model, name) ^ np.uint8(255) for name in ("ut", "vt")}
     for name, columns in zip(("ut", "vt"), reads.columns, strict=True):

@@ -7,9 +7,10 @@ import pytest
 import torch
 import warp as wp
 from kernels.compare import array, close
+from reference.single_light import march_lit
 
 from wlm import ops
-from wlm_kernels.smoke import march_guide, march_six
+from wlm_kernels.smoke import marches
 from wlm_kernels.smoke.march import Medium, make_view
 from wlm_kernels.smoke.settings import March
 
@@ -68,7 +69,7 @@ def _cloud(seed: int = 3) -> np.ndarray:
 
 
 def test_against_the_smoke_systems_marches(device: str):
-    """`march_six.lit`, which marches to the light from every sample, and the transparency of the guiding map."""
+    """A march to the light from every sample, and the transparency of the guiding map."""
     density = _cloud()
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     right, up, forward = turn * np.linalg.det(turn)
@@ -77,7 +78,7 @@ def test_against_the_smoke_systems_marches(device: str):
     toward = np.array([0.5, 0.7, -0.51]) / np.linalg.norm([0.5, 0.7, -0.51])
     lit = wp.zeros((18, 20), dtype=float, device=device)
     medium = Medium(array(density, float, device), 1.0)
-    march_six.lit(medium, view, toward, March(0.5, g=0.3), lit)
+    march_lit(medium, view, toward, March(0.5, g=0.3), lit)
 
     u, v = np.meshgrid(np.arange(20) + 0.5 - 10.0, 9.0 - np.arange(18) - 0.5)
     origin = middle - 20.0 * forward + u[..., None] * right + v[..., None] * up
@@ -90,7 +91,7 @@ def test_against_the_smoke_systems_marches(device: str):
     # What the lattice of optical depths, a voxel wide, leaves.
     close(radiance[..., 0], lit, 0.012)
     maps = wp.zeros((3, 18, 20), dtype=float, device=device)
-    march_guide.guide(medium, view, March(0.5, jitter=0.0, cutoff=0.0), maps)
+    marches.guide(medium, view, March(0.5, jitter=0.0, cutoff=0.0), maps)
     close(transmittance, maps.numpy()[1], 1e-5)
 
 

@@ -6,7 +6,7 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from wlm.errors import WlmError
 from wlm.probe.exact import decode64
-from wlm.probe.gaussian.decode import CULLINGS, GaussianDecoder
+from wlm.probe.gaussian.decode import GaussianDecoder
 from wlm.probe.gaussian.model import check_outputs
 from wlm_kernels.probe.network import most_outputs, probes_at_once
 
@@ -49,29 +49,6 @@ def test_far_from_the_origin(device):
     close(GaussianDecoder(model, device).decode(position), model, position)
 
 
-def test_all_lists_give_the_same(device):
-    model = random_model(count=60)
-    position = points(200, model)
-    decoders = [
-        GaussianDecoder(model, device, culling=culling, cube=cube) for culling in CULLINGS for cube in (None, 0.07)
-    ]
-    decoded = [decoder.decode(position) for decoder in decoders]
-    for other in decoded[1:]:
-        np.testing.assert_allclose(other, decoded[0], rtol=0, atol=3e-6 * np.abs(decoded[0]).max())
-    fewest, boxes, spheres, everything = (decoders[i].pairs for i in (1, 3, 5, 7))
-    assert everything == 60 and fewest < boxes < spheres
-
-
-def test_a_tighter_cut_costs_what_is_cut(device):
-    model = random_model(count=60)
-    position = points(200, model)
-    whole = GaussianDecoder(model, device).decode(position)
-    errors = [
-        np.abs(GaussianDecoder(model, device, cut=cut).decode(position) - whole).mean() for cut in (2.5, 2.0, 1.5)
-    ]
-    assert 0 < errors[0] < errors[1] < errors[2]
-
-
 def test_outside_is_the_nearest_point_of_the_box(device):
     model = random_model()
     inside = points(20, model)
@@ -88,7 +65,9 @@ def test_the_models_own_probes(device):
     decoder = GaussianDecoder(model, device)
     decoded = decoder.decode_probes()
     assert decoded.shape == (200, 27) and (decoded[model.dead] == 0).all() and (decoded[~model.dead] != 0).any(1).all()
-    np.testing.assert_array_equal(decoder.decode_probes(model.stored_positions()), decoded)
+    np.testing.assert_array_equal(
+        GaussianDecoder(model, device, position=model.stored_positions()).decode_probes(), decoded
+    )
     # The order of the points on the device does not show in the result.
     turned = decoder.decode(model.stored_positions()[::-1])[::-1]
     np.testing.assert_array_equal(turned[~model.dead], decoded[~model.dead])
@@ -99,7 +78,7 @@ def test_wrong_positions():
     with pytest.raises(WlmError, match="random: the file stores no positions"):
         decoder.decode_probes()
     with pytest.raises(WlmError, match="expected the positions of its own 200 probes"):
-        decoder.decode_probes(np.zeros((7, 3)))
+        GaussianDecoder(random_model(), position=np.zeros((7, 3)))
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
     with pytest.raises(WlmError, match="position 2: expected finite"):

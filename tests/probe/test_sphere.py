@@ -10,7 +10,6 @@ from wlm.probe.sphere import (
     cosine_factor,
     fibonacci_sphere,
     irradiance,
-    radiance,
     sh_count,
 )
 
@@ -75,7 +74,7 @@ def test_radiance_of_projected_light_is_that_light():
     values = (basis(directions, 9) * weights[:, None]).T @ np.stack([light, 2 * light, 0 * light], 1)
     there = unit(15)
     again = 1.0 + there[:, 1] * there[:, 2] - 0.5 * there[:, 0]
-    np.testing.assert_allclose(radiance(values, there), np.stack([again, 2 * again, 0 * again], 1), atol=1e-12)
+    np.testing.assert_allclose(basis(there, 9) @ values, np.stack([again, 2 * again, 0 * again], 1), atol=1e-12)
 
 
 def test_cosine_factors_are_the_published_ones():
@@ -120,7 +119,7 @@ def test_many_probes_at_once():
     light = irradiance(values, normals)
     assert light.shape == (4, 5, 6, 3) and light.dtype == np.float64
     np.testing.assert_allclose(light[2, 3], irradiance(values[2, 3], normals), rtol=1e-12)
-    assert radiance(values[:0], normals).shape == (0, 5, 6, 3)
+    assert irradiance(values[:0], normals).shape == (0, 5, 6, 3)
 
 
 def test_fibonacci_directions_are_even():

@@ -1,7 +1,6 @@
 """Grids for three.js: the layout, number by number, and what is refused."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -9,8 +8,6 @@ from builders.probe_models import random_model
 
 from wlm.errors import WlmError
 from wlm.export import export
-from wlm.probe import load, load_positions
-from wlm.probe.engines.lattice import grid_places
 
 
 @pytest.fixture(scope="module")
@@ -40,45 +37,6 @@ def test_texture_as_three_lays_it_out(grid):
         assert got[27] == 0.0
     np.testing.assert_array_equal(texels[:, 0], texels[:, 1])
     np.testing.assert_array_equal(texels[:, -1], texels[:, -2])
-
-
-def test_a_grid_is_read_as_probes(grid):
-    model, folder = grid
-    probes = load(folder / "grid.json")
-    info = json.loads((folder / "grid.json").read_text())
-    np.testing.assert_array_equal(probes.position, grid_places(np.array(info["box"]), np.array(info["resolution"])))
-    np.testing.assert_array_equal(load_positions(folder / "grid.json"), probes.position)
-    np.testing.assert_allclose(probes.values, model.decoder().decode(probes.position), rtol=1e-3, atol=1e-6)
-    with pytest.raises(WlmError, match="noon"):
-        load(folder / "grid.json", key="noon")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"box": None}, "box: expected two corners"),
-        ({"box": [[0, 0, 0], [1, "a", 1]]}, "box, resolution: expected numbers"),
-        ({"box": [[0, 0, 0], [1, 0, 1]]}, "the lower first"),
-        ({"resolution": [6, 3, 300]}, "resolution: expected three numbers"),
-        ({"resolution": [6, 3, 4]}, "expected .* slices"),
-        ({"texture": 7}, "texture: expected the name"),
-        ({"texture": "../x.ktx2"}, "texture"),
-        ({"texture": "grid.json"}, "expected a KTX2"),
-        ({"texture": "short.ktx2"}, "expected 6 x 3 x 49 texels"),
-        ({"texture": "flat.ktx2"}, "expected one 3D texture"),
-    ],
-)
-def test_a_damaged_grid_is_one_line(grid, tmp_path, change, message):
-    shutil.copytree(grid[1], tmp_path / "out")
-    data = bytearray((tmp_path / "out" / "grid.ktx2").read_bytes())
-    (tmp_path / "out" / "short.ktx2").write_bytes(data[:-1])
-    data[28:32] = bytes(4)  # the depth
-    (tmp_path / "out" / "flat.ktx2").write_bytes(data)
-    path = tmp_path / "out" / "grid.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(WlmError, match=message) as caught:
-        load(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_export_refuses(tmp_path):

@@ -8,7 +8,6 @@ from builders.probe_models import random_model
 
 from wlm.errors import WlmError
 from wlm.export import export
-from wlm.probe import load, load_positions
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 
@@ -37,28 +36,6 @@ def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
     assert (sh[model.dead] == 0).all()
     script = (tmp_path / "out" / "WlmLightProbes.cs").read_text()
     assert f'"{content["format"]}"' in script and f"version != {content['version']}" in script
-
-
-def test_it_is_read_as_probes(tmp_path):
-    model = random_model(probes=20, positions=True)
-    export(model, tmp_path / "out", "unity")
-    path = tmp_path / "out" / "probes.json"
-    probes = load(path)
-    np.testing.assert_allclose(probes.position, model.stored_positions(), rtol=1e-6)
-    np.testing.assert_array_equal(load_positions(path), probes.position)
-    values = model.decoder().decode_probes()
-    np.testing.assert_allclose(probes.values, values, atol=1e-5 * np.abs(values).max())
-    content = json.loads(path.read_text())
-    for change, message in [
-        ({"sh": content["sh"][:-1]}, r"expected 3 and 27 numbers of each probe in two lists, got \(60,\) and \(539,\)"),
-        ({"position": probes.position.tolist()}, "expected 3 and 27 numbers"),
-        ({"position": "here"}, "position: expected a list"),
-        ({"position": [], "sh": []}, "position"),
-    ]:
-        path.write_text(json.dumps(content | change))
-        with pytest.raises(WlmError, match=message) as caught:
-            load(path)
-        assert "\n" not in str(caught.value)
 
 
 def test_what_is_refused(tmp_path):

@@ -10,11 +10,12 @@ import pytest
 from builders.probe_models import random_model
 
 import wlm
+from benchmarks.rivals.probe import pack_unreal, unpack_unreal
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import grid_places
-from wlm.probe.engines.unreal import SH_FILES, pack_unreal, unpack_unreal
+from wlm.probe.engines.lattice import lattice_of
+from wlm.probe.engines.unreal import SH_FILES
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 FILES = ("ambient.dds", *SH_FILES)
@@ -128,9 +129,9 @@ def test_the_shader_reads_the_light(model, tmp_path):
     assert {path.name for path in paths} == {*FILES, "WlmProbes.usf", "light.json", "bundle.json"}
     paths = [tmp_path / "out" / name for name in (*FILES, "WlmProbes.usf")]
     content = json.loads((tmp_path / "out" / "light.json").read_text())
-    box, count = (np.array(content[field]) for field in ("box", "resolution"))
+    count = np.array(content["resolution"])
     assert count[0] == 6 and len(set(count.tolist())) == 3
-    centre = grid_places(box, count)
+    centre = lattice_of(model, 6, 128, None, "cpu").centres()
     light = model.decoder().decode(centre).reshape(-1, 9, 3)
     turned = from_canonical(light.astype(float), "unreal")
     stored = unpack_unreal(pack_unreal(turned.reshape(-1, 27), 3), 27, 3).reshape(-1, 9, 3)
@@ -164,58 +165,6 @@ def test_the_shader_compiles(model, tmp_path):
     command = ["glslangValidator", "-D", "-V", "-e", "main", "shader.comp"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-
-
-def test_it_is_read_as_probes(model, tmp_path):
-    """Of three channels and nine coefficients each in its place, in the lattice's order."""
-    export(model, tmp_path / "out", "unreal", cells=6)
-    path = tmp_path / "out" / "light.json"
-    probes = wlm.probe.load(path)
-    content = json.loads(path.read_text())
-    centre = grid_places(np.array(content["box"]), np.array(content["resolution"]))
-    np.testing.assert_array_equal(probes.position, centre)
-    np.testing.assert_array_equal(wlm.probe.load_positions(path), centre)
-    light = model.decoder().decode(centre)
-    # A step of 255 is a 127th of the range over the ambient light, 4.5 at most, and half of it the most that is lost.
-    # Between probes the volume may overshoot below zero, where Unreal's ambient light ends.
-    light = light.reshape(-1, 9, 3) * (light.reshape(-1, 9, 3)[:, :1] > 0)
-    light = light.reshape(-1, 27)
-    assert (light[:, :3] > 0).mean() > 0.8
-    assert (np.abs(probes.values - light) <= 0.02 * np.abs(light[:, :3]).repeat(9, 0).reshape(-1, 27) + 1e-6).all()
-    turned = from_canonical(light.reshape(-1, 9, 3).astype(float), "unreal").reshape(-1, 27)
-    stored = unpack_unreal(pack_unreal(turned, 3), 27, 3)
-    np.testing.assert_array_equal(from_canonical(probes.values.reshape(-1, 9, 3), "unreal").reshape(-1, 27), stored)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("light.json", {"box": None}, "box: expected two corners"),
-        ("light.json", {"resolution": [6, 3, 129]}, "resolution: expected three numbers of 1 to 128"),
-        ("light.json", {"resolution": [6, 3, 4]}, "ambient.dds: expected 6 x 3 x 4 texels, found 6 x .* in"),
-        ("ambient.dds", lambda data: data[:-1], "ambient.dds: expected .* texels, found .* in .* bytes"),
-        ("sh5.dds", lambda data: data + b"1", "sh5.dds: expected .* texels, found .* in .* bytes"),
-        (
-            "sh3.dds",
-            lambda data: data[:128] + b"\x1d" + data[129:],
-            "sh3.dds: expected a volume texture of R8G8B8A8_UNORM",
-        ),
-        ("sh3.dds", lambda data: data[:100], "sh3.dds: expected a DDS file"),
-        ("sh2.dds", None, "sh2.dds"),
-    ],
-)
-def test_a_damaged_export_is_one_line(model, tmp_path, name, change, message):
-    export(model, tmp_path, "unreal", cells=6)
-    path = tmp_path / name
-    if change is None:
-        path.unlink()
-    elif isinstance(change, dict):
-        path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    else:
-        path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(WlmError, match=message) as caught:
-        wlm.probe.load(tmp_path / "light.json")
-    assert "\n" not in str(caught.value)
 
 
 def test_what_is_refused(model, tmp_path):

@@ -87,19 +87,16 @@ def test_teleport_converges_in_the_frames_of_the_budget(device: str, budget: int
         assert (again.entered, again.updated, again.cached, again.probes, again.left) == (0, 0, 0, 0, 0)
 
 
-@pytest.mark.parametrize("forward", [None, [0.0, 0.0, 0.0], [3.0, 0.0, -4.0]])
-def test_nearest_blocks_first(device: str, forward: list[float] | None):
-    """By the distance in sides of their own, twice what it is behind a viewer who looks; the finest of two alike."""
+def test_nearest_blocks_first(device: str):
+    """Blocks are decoded by their distance in units of their own side, the finer one of two alike first."""
     position = _surface()
     viewpoint = np.array([3.0, 1.0, -5.0])
     volume = _volume(position, device, budget=90)
-    volume.update(viewpoint, forward)
-    looks = np.array(forward or [0.0, 0.0, 0.0]) / 5.0
+    volume.update(viewpoint)
 
     def rank(name: tuple[int, ...]) -> tuple[float, int]:
         away = np.array(name[1:]) + 0.5 - viewpoint / volume.sizes[name[0]]
-        length = np.linalg.norm(away)
-        return round(float(length**2 * (1 + 1.5 * (np.linalg.norm(looks) - looks @ away / length))), 3), name[0]
+        return round(float((away**2).sum()), 3), name[0]
 
     ranks = sorted(rank(name) for name in _names(position, volume))
     assert sorted(rank(name) for name in _there(volume)) == ranks[:90]

@@ -13,7 +13,7 @@ from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
 from wlm.smoke.march.fine import bake
-from wlm_kernels.smoke import depth_lattice, march_coarse
+from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke import march as kernels
 from wlm_kernels.smoke.settings import March
 
@@ -165,7 +165,7 @@ def test_emission_knows_no_nodes(device: str):
     camera = _camera(volume)
     rough, fine = (_planes(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
     assert torch.equal(rough[4:], fine[4:]) and not torch.equal(rough[:4], fine[:4])
-    emission = march_coarse.PLANES.index("emission")
+    emission = marches.PLANES.index("emission")
     assert float(fine[emission].max()) > 0.05
     cold = replace(volume, temperature=None)
     assert _march(cold, camera).emission is None
@@ -186,22 +186,9 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
     _march(volume, camera, step=7.9)
     (bricks,) = made
     assert 0 < bricks.numpy().sum() < bricks.size
-    monkeypatch.setattr(march_coarse, "BRICK", 0)
+    monkeypatch.setattr(marches, "BRICK", 0)
     torch.testing.assert_close(_planes(volume, camera, step=1.5), skipped, rtol=0, atol=1e-6)
     assert len(made) == 1
-
-
-def test_front_and_back_follow_from_the_transparency(device: str):
-    """(1 - T^2) / 2 and -T ln T, which the fine march finds too."""
-    volume = plume(device=device)
-    exact = bake(volume, _camera(volume), step=0.25, estimate=False)
-    t = exact.transparency.double()
-    torch.testing.assert_close(exact["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=2e-4)
-    back = torch.where(t > 0, -t * t.clamp(min=1e-30).log(), 0.0)
-    torch.testing.assert_close(exact["back"].double(), back, rtol=0, atol=2e-4)
-    result = _march(volume, _camera(volume), step=4.0)
-    t = result.transparency.double()
-    torch.testing.assert_close(result["front"].double(), 0.5 * (1 - t * t), rtol=0, atol=1e-6)
 
 
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
@@ -268,10 +255,3 @@ def test_settings_out_of_their_range(name: str, values: tuple[float, ...]):
     for value in values:
         with pytest.raises(ValueError, match=f"^{name}: expected [^\n]*, got {value}$"):
             March(**{name: value})
-
-
-def test_an_eye_is_refused(device: str):
-    volume = from_array(np.ones((4, 4, 4), np.float32), device=device)
-    eye = Camera.look_at((2.0, 2.0, 30.0), (2.0, 2.0, 2.0), extent=0.4, height=4, width=4, perspective=True)
-    with pytest.raises(ValueError, match="orthographic"):
-        _march(volume, eye)

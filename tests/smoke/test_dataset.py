@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from builders.smoke_axes import axis_faults, from_srgb
 from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
-from wlm.smoke.camera import axis_faults
 from wlm.smoke.march.fine import bake
 from wlm.smoke.network import dataset
 from wlm.smoke.network.dataset import (
@@ -20,7 +20,7 @@ from wlm.smoke.network.dataset import (
     make_validation,
     pool_of_volume,
 )
-from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, from_srgb
+from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from wlm import smoke
 from wlm.cli.smoke import app
 from wlm.errors import WlmError
+from wlm.smoke.flipbook.book import lay_out
 from wlm.smoke.flipbook.motion import (
     ZERO,
     encoded,
@@ -19,7 +20,6 @@ from wlm.smoke.flipbook.motion import (
     open_motion,
     scale_of,
 )
-from wlm.smoke.flipbook.textures import lay_out
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.motion import read_velocity, velocity_file
 from wlm.smoke.scene import load_scene

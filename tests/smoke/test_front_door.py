@@ -1,6 +1,5 @@
 """The calls of `wlm.smoke` as a user writes them: the README's snippet, and the three ways to lightmaps."""
 
-import numpy as np
 import pytest
 import torch
 from builders.smoke_plumes import plume
@@ -52,16 +51,3 @@ def test_a_predictor_for_many_frames(smoke):
     assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
     # Of smoke as smooth as this, on a grid as small, the march says all.
     assert float(predictor.share) < 0.2 and "its guide, the coarse march, is as accurate" in predictor.note()
-
-
-@pytest.mark.parametrize("options", [{}, {"perspective": True}, {"aspect": 2.0, "toward": (0, 1, 0)}])
-def test_a_camera_around_smoke_shows_all_of_it(smoke, options):
-    camera = wlm.smoke.Camera.around(smoke, pixels=20, **options)
-    size = smoke.voxel * np.array(smoke.shape)
-    assert camera == wlm.smoke.Camera.around((smoke.origin, size), pixels=20, **options)
-    corners = (smoke.origin + size * np.array(list(np.ndindex(2, 2, 2))) - camera.position) @ camera.axes.T
-    depth = -corners[:, 2:] if camera.perspective else 1.0
-    half = 0.5 * camera.extent * np.array([camera.width / camera.height, 1.0])
-    assert (corners[:, 2] < 0).all() and (np.abs(corners[:, :2] / depth) < half).all()
-    with pytest.raises(ValueError, match="toward: expected a direction"):
-        wlm.smoke.Camera.around(smoke, toward=(0, 0, 0))

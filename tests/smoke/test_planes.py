@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from builders.smoke_axes import from_srgb
 from builders.smoke_plumes import plume
 from builders.smoke_samples import view_of
 
@@ -19,7 +20,6 @@ from wlm.smoke.network.planes import (
     decode_lightmaps,
     encode_guide,
     encode_lightmaps,
-    from_srgb,
     render_guide,
     span,
     to_srgb,

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
-from wlm.fluid.volume import load_volume, save_volume
+from wlm.fluid.volume import save_volume
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke.data import (
     CHECKPOINT,
@@ -25,10 +25,8 @@ from wlm.smoke.data import (
     open_frames,
     read_six_way,
     spread,
-    write_guide,
     write_six_way,
 )
-from wlm.smoke.march.coarse import guide
 from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import (
     CameraSettings,
@@ -309,16 +307,6 @@ def test_frames_evenly_spread():
 
 
 @pytest.mark.parametrize("hot", [False, True])
-def test_a_volume_comes_back(tmp_path, hot, device):
-    volume = plume(hot=hot, device=device)
-    save_volume(tmp_path / "a.npz", volume)
-    result = load_volume(tmp_path / "a.npz", device=device)
-    assert torch.equal(result.density, volume.density)
-    assert (result.temperature is not None) == hot
-    assert not hot or torch.equal(result.temperature, volume.temperature)
-
-
-@pytest.mark.parametrize("hot", [False, True])
 def test_lightmaps_in_a_file(tmp_path, hot, device):
     volume = plume(hot=hot, device=device)
     camera = make_camera(CameraSettings(resolution=16, aspect=0.75), volume.origin, (1, 1.2, 1))
@@ -331,20 +319,6 @@ def test_lightmaps_in_a_file(tmp_path, hot, device):
     assert result.camera == camera and (result.emission is not None) == hot
     torch.testing.assert_close(result.lightmaps, six.lightmaps.half().float(), rtol=0, atol=0)
     torch.testing.assert_close(result.transparency, six.transparency.half().float(), rtol=0, atol=0)
-
-
-def test_a_guiding_map_in_a_file(tmp_path):
-    volume = plume()
-    camera = make_camera(CameraSettings(resolution=16, distance=9e4), volume.origin, (1, 1.2, 1))
-    result = guide(volume, camera)
-    write_guide(tmp_path / "a.exr", result)
-    planes, note = read_planes(tmp_path / "a.exr")
-    assert note["camera"]["extent"] == camera.extent
-    # Not half floats: depths are far beyond them.
-    np.testing.assert_array_equal(planes["depth"], result.depth.numpy())
-    np.testing.assert_array_equal(planes["light"], result.light.numpy())
-    np.testing.assert_array_equal(planes["transparency"], result.transparency.numpy())
-    assert planes["depth"].max() > 65504
 
 
 def test_files_that_are_no_lightmaps(tmp_path):

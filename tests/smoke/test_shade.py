@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from builders.smoke_shadows import shadow_of
 
 from wlm.fluid.obstacles import sphere
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.shading import Light, Ramp, obstacle_visibility
+from wlm.smoke.shading import Light, Ramp
 
 FULL = (4 * math.pi,) * 3
 
@@ -54,15 +55,11 @@ def test_rules(device: str, rule: str, share: tuple):
 
 
 def test_lights_add_up(device: str):
-    """Any number, none too; each with its own share of visible light."""
     six = _six(device)
     lights = [Light((1.0, 2.0, 0.5), (1, 2, 3)), Light((-1.0, 0.1, 0.5), (3, 2, 1)), Light((0.0, 0.0, -1.0))]
     both = sum(six.shade([light]) for light in lights)
     np.testing.assert_allclose(six.shade(lights).cpu(), both.cpu(), rtol=1e-5)
     assert not six.shade([]).any()
-    half = Light(lights[0].toward, lights[0].irradiance, torch.full((8, 8), 0.5, device=device))
-    expected = 0.5 * six.shade(lights[:1])
-    np.testing.assert_allclose(six.shade([half]).cpu(), expected.cpu(), rtol=1e-5)
 
 
 def test_glow(device: str):
@@ -105,7 +102,7 @@ def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
     depth = (0.3 - origin @ normal) / (ray @ normal)
     depth[:, :3] = 0.0
     depths = torch.tensor(depth, dtype=torch.float32, device=device)
-    result = obstacle_visibility(depths, camera, toward, *_box(low, high, device), resolution=512)
+    result = shadow_of(depths, camera, toward, *_box(low, high, device), resolution=512)
     at = origin + depth[..., None] * ray
     light = np.array(toward) / np.linalg.norm(toward)
 
@@ -128,12 +125,10 @@ def test_shadow_falls_behind_only(device: str):
     """Smoke between the light and the obstacle is lit; a greater bias spares what is close behind."""
     camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
     box = _box((-1, -1, -0.1), (1, 1, 0.1), device)
-    for depth, bias, expected in ((8.0, None, 1.0), (12.0, None, 0.0), (12.0, 3.0, 1.0)):
+    for depth, bias, expected in ((8.0, -1.0, 1.0), (12.0, -1.0, 0.0), (12.0, 3.0, 1.0)):
         depths = torch.full((9, 9), depth, device=device)
-        result = obstacle_visibility(depths, camera, (0, 0, 1), *box, bias=bias)
+        result = shadow_of(depths, camera, (0, 0, 1), *box, bias=bias)
         assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0
-    none = torch.zeros((0, 3), dtype=torch.int64, device=device)
-    assert (obstacle_visibility(depths, camera, (0, 0, 1), box[0], none) == 1).all()
 
 
 @pytest.mark.parametrize("far", [0.0, 1000.0])
@@ -143,7 +138,7 @@ def test_shadow_of_a_sphere(device: str, far: float):
     corners = torch.from_numpy((points + [far, 0, far]).astype(np.float32)).to(device)
     camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
     depths = torch.full((100, 100), 12.0, device=device)
-    light = obstacle_visibility(depths, camera, (0, 1, 0), corners, torch.from_numpy(triangles).to(device))
+    light = shadow_of(depths, camera, (0, 1, 0), corners, torch.from_numpy(triangles).to(device))
     area = float((1 - light).sum()) * (4.0 / 100) ** 2
     # The sphere has 48 sides.
     assert area == pytest.approx(24 * np.sin(np.pi / 24), rel=5e-3)
@@ -157,8 +152,6 @@ def test_wrong_settings():
         six.shade([Light((0, 0, 1), (-1, 0, 0))])
     with pytest.raises(ValueError, match="directions"):
         six.shade([Light((0, 0, 0))])
-    with pytest.raises(ValueError, match="visibility"):
-        six.shade([Light((0, 0, 1), FULL, torch.ones(2, 2))])
     with pytest.raises(ValueError, match="camera: expected that of the lightmaps"):
         replace(six, camera=None).shade([Light((0, 0, 1))])
     with pytest.raises(ValueError, match="transparency: expected"):
@@ -167,13 +160,3 @@ def test_wrong_settings():
         replace(six, camera=six.camera.finer(2))
     with pytest.raises(ValueError, match="depth: expected"):
         replace(six, depth=torch.ones(2, 2))
-    camera = six.camera
-    box = _box((0, 0, 0), (1, 1, 1), "cpu")
-    with pytest.raises(ValueError, match="depth"):
-        obstacle_visibility(torch.ones(2, 2), camera, (0, 0, 1), *box)
-    with pytest.raises(ValueError, match="toward"):
-        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 0), *box)
-    with pytest.raises(ValueError, match="bias: expected at least 0, got -1"):
-        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 1), *box, bias=-1)
-    with pytest.raises(ValueError, match="resolution: expected at least 8"):
-        obstacle_visibility(torch.ones(8, 8), camera, (0, 0, 1), *box, resolution=4)

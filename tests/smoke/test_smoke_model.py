@@ -291,17 +291,3 @@ def test_onnx_of_no_pixels_is_refused(tmp_path):
     with pytest.raises(ValueError, match="pixel"):
         export_onnx(random_model(), tmp_path / "a.onnx", height=0, width=22)
     assert not (tmp_path / "a.onnx").exists()
-
-
-@pytest.mark.slow  # the command's test does as much once
-@pytest.mark.parametrize("kind, stem", [("six", 2), ("paper", 1)])
-def test_onnx_computes_the_same(tmp_path, kind, stem):
-    for package in ("onnx", "onnxscript"):
-        pytest.importorskip(package)
-    runtime = pytest.importorskip("onnxruntime")
-    model = random_model(guide=kind, stem=stem, levels=2)
-    path = tmp_path / "a.onnx"
-    assert export_onnx(model, path, height=18, width=22) == path.stat().st_size
-    guide = torch.rand(1, len(GUIDES[kind]), 18, 22)
-    (planes,) = runtime.InferenceSession(path).run(["lightmaps"], {"guide": guide.numpy()})
-    assert np.allclose(planes, model.network(guide).detach(), atol=1e-5)

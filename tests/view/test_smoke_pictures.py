@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 import torch
 from builders.smoke_plumes import plume
+from builders.smoke_shadows import shadow_of
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import guide
-from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, obstacle_visibility
+from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
-from wlm.view.pictures import contact_sheet, to_bytes, write_sequence
-from wlm.view.smoke import draw_obstacles, guide_pictures, picture, six_pictures
-from wlm_kernels.smoke.settings import March
+from wlm.view.pictures import contact_sheet, to_bytes
+from wlm.view.smoke import Drawing, picture
 
 FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
 
@@ -32,6 +29,13 @@ def _camera(size=32, **settings):
 
 def _ball(x=0.0, y=0.0, z=0.0, radius=0.2, **more):
     return ObstacleSettings(radius=radius, path=((0.0, x, y, z),), colour=(1.0, 0.5, 0.0), **more)
+
+
+def draw_obstacles(obstacles, camera, lights, device):
+    """Light and distance of the obstacles alone."""
+    drawing = Drawing(camera, lights, obstacles=obstacles, device=device)
+    drawing.draw_obstacles()
+    return drawing.solid_light, drawing.solid_depth
 
 
 def _flat(camera, transparency, light=0.0, device="cpu"):
@@ -54,7 +58,7 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
     """A ball against the rays that meet it, worked out by hand."""
     camera = _camera(48, toward=toward, perspective=perspective)
     ball = _ball(0.1, -0.05, 0.2)
-    _, depth = draw_obstacles([ball], 0.0, camera, [], device)
+    _, depth = draw_obstacles([ball], camera, [], device)
     origin, way = (part.numpy() for part in camera.rays())
     middle = ball.centre(0.0) - origin
     along = (middle * way).sum(-1)
@@ -70,31 +74,31 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
 
 def test_an_obstacle_is_lit_from_where_the_light_is(device):
     camera = _camera(33)
-    light, depth = draw_obstacles([_ball()], 0.0, camera, [FRONT], device)
+    light, depth = draw_obstacles([_ball()], camera, [FRONT], device)
     seen = torch.isfinite(depth)
     # Face on: its colour times (E / pi + the ambient's 0.2).
     np.testing.assert_allclose(light[16, 16].cpu(), [1.2, 0.6, 0.0], atol=0.02)
     assert not light[~seen].any()
-    side, _ = draw_obstacles([_ball()], 0.0, camera, [Light((1.0, 0.0, 0.0), (1.0,) * 3)], device)
+    side, _ = draw_obstacles([_ball()], camera, [Light((1.0, 0.0, 0.0), (1.0,) * 3)], device)
     row = side[16, seen[16]][:, 0]
     assert row[-1] > row[0] and float(row[0]) == pytest.approx(0.2)
     # The nearer one of two hides the other, whatever their order.
     for order in (1, -1):
         both = [_ball(z=0.25, radius=0.1), ObstacleSettings(radius=0.2, path=((0.0, 0, 0, 0),), colour=(0.0, 0.0, 1.0))]
-        shown, _ = draw_obstacles(both[::order], 0.0, camera, [FRONT], device)
+        shown, _ = draw_obstacles(both[::order], camera, [FRONT], device)
         assert shown[16, 16, 0] > 0.5 and shown[16, 16, 2] == 0 and shown[16, 11, 2] > 0.3
     # What lies behind the camera isn't seen.
-    _, none = draw_obstacles([_ball()], 0.0, _camera(33, distance=0.3, target=(0, 0, 0.5)), [FRONT], device)
+    _, none = draw_obstacles([_ball()], _camera(33, distance=0.3, target=(0, 0, 0.5)), [FRONT], device)
     assert torch.isfinite(none).any()
-    _, none = draw_obstacles([_ball(z=1.2)], 0.0, _camera(33, distance=0.3), [FRONT], device)
+    _, none = draw_obstacles([_ball(z=1.2)], _camera(33, distance=0.3), [FRONT], device)
     assert not torch.isfinite(none).any()
-    assert not torch.isfinite(draw_obstacles([], 0.0, camera, [], device)[1]).any()
+    assert not torch.isfinite(draw_obstacles([], camera, [], device)[1]).any()
 
 
 def test_an_obstacle_before_and_behind_smoke(device):
     camera = _camera(33)
     six = _flat(camera, 0.25, 0.5, device)
-    ball, depth = draw_obstacles([_ball()], 0.0, camera, [FRONT], device)
+    ball, depth = draw_obstacles([_ball()], camera, [FRONT], device)
     seen = torch.isfinite(depth)
     background = (0.1, 0.2, 0.3)
     shown = {"background": background, "obstacles": [_ball()]}
@@ -123,11 +127,10 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
     light = Light((0.0, 0.0, 3.0), (4 * math.pi, 0.0, 0.0))
     found = picture(six, [light], background=(0.2, 0.4, 0.6), ramp=ramp)
     torch.testing.assert_close(found[3, 4].cpu(), torch.tensor([0.25 + 1.0 + 0.1, 0.5 + 0.2, 0.3]))
-    # The same as in torch, lights without number, with their shares of the smoke, and a glow of three stops.
-    seen = torch.linspace(0, 1, 64, device=device).reshape(8, 8)
+    # The same as in torch, with several lights and an emission in three stops.
     six = replace(six, emission=torch.linspace(-1, 4, 64, device=device).reshape(8, 8))
     ramp = Ramp((0.0, 0.5, 2.0), ((0, 0, 0.3), (2.0, 1.0, 0.0), (1, 5, 1)))
-    lights = [light, Light((1.0, 2.0, -1.0), (3.0, 4.0, 5.0), seen)]
+    lights = [light, Light((1.0, 2.0, -1.0), (3.0, 4.0, 5.0))]
     for given in (lights, lights[:1], []):
         for colours in (ramp, None):
             for rule in ("squared", "absolute"):
@@ -136,42 +139,10 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
                 torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
     with pytest.raises(ValueError, match="irradiance"):
         picture(six, [Light((0, 0, 1), (-1, 0, 0))])
-    with pytest.raises(ValueError, match="visibility"):
-        picture(six, [Light((0, 0, 1), visibility=seen[:4])])
     with pytest.raises(ValueError, match="transparency"):
         picture(replace(six, transparency=None), [light])
     with pytest.raises(ValueError, match="depth"):
         picture(six, [light], obstacles=[_ball()])
-
-
-def test_pictures_of_the_maps(device):
-    volume = plume(hot=True, device=device)
-    camera = make_camera(CameraSettings(resolution=24), volume.origin, (1, 1.2, 1))
-    six = bake(volume, camera, step=1.0, estimate=False)
-    shown = six_pictures(six)
-    assert [*shown] == ["right", "left", "top", "bottom", "front", "back", "alpha", "emission"]
-    assert (shown["right"][:, 12:].mean() > shown["left"][:, 12:].mean()) and shown["alpha"].max() > 200
-    np.testing.assert_array_equal(shown["top"], to_bytes(six["top"]))
-    assert "emission" not in six_pictures(SixWay(six.lightmaps, None))
-    found = guide(volume, camera, March(2.0, jitter=0.0))
-    planes = guide_pictures(found)
-    smoke = found.depth.cpu().numpy() > 0
-    assert (planes["depth"][~smoke] == 0).all() and planes["depth"][smoke].min() >= 51
-    nearest = np.unravel_index(np.where(smoke, found.depth.cpu().numpy(), np.inf).argmin(), smoke.shape)
-    assert (planes["depth"][nearest] == 255).all() and (planes["transparency"][0, 0] == 255).all()
-    nothing = guide(plume(0, device=device), camera)
-    assert not guide_pictures(nothing)["depth"].any()
-
-
-def test_a_sequence(tmp_path):
-    frames = [np.full((2, 3, 3), value, np.uint8) for value in (1, 2)]
-    paths = write_sequence(tmp_path / "a", frames, "lit")
-    assert [path.name for path in paths] == ["lit_0001.png", "lit_0002.png"]
-    for path, frame in zip(paths, frames, strict=True):
-        with Image.open(path) as image:
-            np.testing.assert_array_equal(np.asarray(image), frame)
-    with pytest.raises(WlmError, match="cannot write there"):
-        write_sequence(tmp_path / "none" / "a", frames)
 
 
 def test_a_contact_sheet(tmp_path):
@@ -197,20 +168,20 @@ def test_a_contact_sheet(tmp_path):
 
 @pytest.mark.parametrize("orders", ["single", "all"])
 def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
-    """With fire in its colours, a point light and visibilities; then with an obstacle, put together by hand: it keeps
-    off the light of a direction, not that of a point."""
+    """With fire in its colours and a point light; then with an obstacle, combined by hand: it shadows the directional
+    light, not the point light."""
     volume = replace(plume(hot=True, device=device), emission=8.0)
     camera = make_camera(CameraSettings(resolution=20), volume.origin, volume.size)
-    half = torch.rand(20, 20, generator=torch.Generator().manual_seed(1)).to(device)
-    lights = [Light((1.0, 1.0, 1.0), (9.0, 4.0, 2.0), half), PointLight((0.4, 0.6, 0.6), (1.0, 2.0, 3.0))]
+    lights = [Light((1.0, 1.0, 1.0), (9.0, 4.0, 2.0)), PointLight((0.4, 0.6, 0.6), (1.0, 2.0, 3.0))]
     looks = {"background": (0.1, 0.2, 0.3), "ramp": Ramp((0.0, 1.0), ((0.0, 0.0, 0.0), (2.0, 0.5, 0.1)))}
 
-    def shaded(smoke, background, lights):
-        if orders == "single":
-            options = {"albedo": (0.9, 0.5, 0.0), "background": background, "ramp": looks["ramp"]}
-            return replace(smoke, lights=tuple(lights)).shade(**options)
-        moved = replace(smoke, lit=replace(smoke.lit, lights=tuple(lights)))
-        return moved.shade(background=background, ramp=looks["ramp"])
+    def shaded(smoke, background, seen=None):
+        options = {"background": background, "ramp": looks["ramp"]}
+        if seen is not None:
+            planes = smoke.planes.clone()
+            planes[0] *= seen if orders == "single" else seen[..., None]
+            smoke = replace(smoke, planes=planes)
+        return smoke.shade(albedo=(0.9, 0.5, 0.0), **options) if orders == "single" else smoke.shade(**options)
 
     if orders == "single":
         smoke = light_smoke(volume, camera, lights)
@@ -219,14 +190,13 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
         smoke = scatter(volume, camera, lights, (0.9, 0.5, 0.0))
         drawn, depth = picture(smoke, **looks), smoke.lit.depth
         assert smoke.lit.thrown.any()
-    torch.testing.assert_close(drawn, shaded(smoke, looks["background"], lights))
+    torch.testing.assert_close(drawn, shaded(smoke, looks["background"]))
     ball = [_ball(0.1, 0.6, 0.25)]
     points, triangles, _ = (torch.from_numpy(part).to(device) for part in obstacle_mesh(ball, 0.0))
-    solid, away = draw_obstacles(ball, 0.0, camera, lights[:1], device)
+    solid, away = draw_obstacles(ball, camera, lights[:1], device)
     behind = torch.where(torch.isfinite(away)[..., None], solid, torch.tensor(looks["background"], device=device))
-    seen = obstacle_visibility(depth, camera, (1.0, 1.0, 1.0), points, triangles)
-    by_hand = shaded(smoke, behind, [replace(lights[0], visibility=seen), lights[1]])
-    by_hand = torch.where((away < depth)[..., None], solid, by_hand)
+    seen = shadow_of(depth.contiguous(), camera, (1.0, 1.0, 1.0), points, triangles)
+    by_hand = torch.where((away < depth)[..., None], solid, shaded(smoke, behind, seen))
     extra = {"albedo": (0.9, 0.5, 0.0)} if orders == "single" else {}
     torch.testing.assert_close(picture(smoke, obstacles=ball, **looks, **extra), by_hand)
     assert (seen < 0.5).any() and (away < depth).any() and not torch.equal(by_hand, drawn)

@@ -42,7 +42,7 @@ def show():
     """Opens files in a window that is never shown."""
     pytest.importorskip("pyvista")
     try:
-        rendering.require_opengl("view")
+        rendering.require_opengl()
     except WlmError as error:
         pytest.skip(str(error))
     windows = []

@@ -35,18 +35,19 @@ from wlm.atlas.model import (
 from wlm.atlas.stored import StoredScene
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, encode_artifact
+from wlm.formats.limits import PICTURE_SIDE
 from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.formats.zstd import pack_parts, unpack_parts
 from wlm.system import Header, Name
-from wlm.texels import MOST_SIDE, check_size
+from wlm.texels import check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # limit on the length of an axis of a part
 _MOST_UV_SET = 9999  # as in the names that `wlm.formats.gltf` reads
 _GEOMETRY = ("mesh", "mask")
 
-_Size = Annotated[list[Annotated[int, Field(ge=1, le=MOST_SIDE)]], Field(min_length=2, max_length=2)]
+_Size = Annotated[list[Annotated[int, Field(ge=1, le=PICTURE_SIDE)]], Field(min_length=2, max_length=2)]
 _Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 
 from wlm import system
 from wlm.atlas import codec
@@ -45,7 +44,7 @@ from wlm.atlas.views import (
 )
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics import SSIM_WINDOW, flip_display
+from wlm.metrics import SSIM_WINDOW, picture_error, ssim
 from wlm.metrics.error import psnr_from_mse
 from wlm.ops import raster
 from wlm.ops.views import View, Viewpoint
@@ -71,9 +70,6 @@ _PERCENTILE, _ABOVE = 0.999, 2.0  # see the peak
 _BINS, _OCTAVES = 8192, (-32.0, 32.0)  # bins and range of a histogram of light
 _ON_DEVICE = 1 << 32  # bytes of reference lightmaps that stay on the device
 
-# Wang et al. 2004, as in `wlm.metrics.structural`.
-_SIGMA, _C1, _C2 = 1.5, 0.01, 0.03
-_HALF = SSIM_WINDOW // 2
 # Relative rounding error of reading a constant colour bilinearly in float32.
 _ROUNDING = 1e-6
 
@@ -253,15 +249,12 @@ def compare(
                     borders[name] = _near_border(visible, label, place)[hit]
                 for state in states:
                     target = reference.light(points, state).double()
-                    similarity = _Similarity(hit, target, peaks[state])
                     sampled = (number * len(states) + state) % stride == 0
-                    screen = _Screen(reference.exposure(state), hit, target, sampled)
+                    pictures = _View(hit, target, peaks[state], reference.exposure(state), sampled)
                     for name, decoder in decoders.items():
                         error = _colours(decoder, points, state, scene, name) - target
                         border = borders[name if name in labels else None]
-                        decoded = target + error
-                        figures = similarity.mean(decoded), *screen.errors(decoded)
-                        tallies[name].add(number, state, error, border, *figures)
+                        tallies[name].add(number, state, error, border, *pictures.errors(target + error))
             if meter.due(number + 1):
                 meter.report(number + 1)
         texel_errors = _texel_errors(scene, reference, decoders, device)
@@ -475,84 +468,29 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
     return torch.nn.functional.max_pool2d(border[None].float(), 3, stride=1, padding=1)[0] > 0
 
 
-class _Similarity:
-    """SSIM of one view's decoders, equal to `wlm.metrics.ssim` of the whole pictures.
+class _View:
+    """The pictures of a view of the original, compared with those of decoders."""
 
-    That function compares two images on the host; this class computes the part of the reference, float64 [N, 3] at the
-    covered pixels [h, w], once for all decoders, on their device, and only where the scene covers the picture.
-    """
+    def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
+        """Makes the pictures of light [N, 3] at the covered pixels [h, w]; FLIP is computed only if asked for."""
+        whole = hit.cpu().numpy()
+        # SSIM reads half a window around a covered pixel.
+        rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
+        spans = (
+            slice(max(int(at[0]) - SSIM_WINDOW // 2, 0), int(at[-1]) + SSIM_WINDOW // 2 + 1) for at in (rows, columns)
+        )
+        self._hit, self._peak, self._exposure, self._flip = whole[tuple(spans)], peak, exposure, flip
+        self._light, self._screen = self._pictures(target)
 
-    def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float) -> None:
-        self._peak = peak
-        height, width = hit.shape
-        rows, columns = (torch.nonzero(hit.any(dim=axis)).flatten() for axis in (1, 0))
-        top, bottom = max(int(rows[0]) - _HALF, 0), min(int(rows[-1]) + _HALF + 1, height)
-        left, right = max(int(columns[0]) - _HALF, 0), min(int(columns[-1]) + _HALF + 1, width)
-        crop = hit[top:bottom, left:right]
-        # The crop's outermost pixels are uncovered, or have no whole window in the picture.
-        inside = crop[_HALF:-_HALF, _HALF:-_HALF] if min(crop.shape) >= SSIM_WINDOW else crop[:0]
-        self._inside = inside
-        if not (peak > 0.0 and bool(inside.any())):
-            self._inside = inside[:0]
-            return
-        nearest = distance_transform_edt(~crop.cpu().numpy(), return_distances=False, return_indices=True)
-        index = torch.zeros(crop.shape, dtype=torch.int64, device=hit.device)
-        index[crop] = torch.arange(len(target), device=hit.device)
-        row, column = torch.tensor(nearest, device=hit.device).long()
-        self._hit, self._source = crop, index[row, column]
-        self._reference = target[self._source].permute(2, 0, 1)
-        self._mean, square = _blur(torch.stack([self._reference, self._reference.square()]))
-        self._variance = square - self._mean.square()
+    def errors(self, light: torch.Tensor) -> tuple[float, float, float]:
+        """Computes SSIM, NaN without a peak, and as displayed the mean squared error and FLIP or NaN."""
+        picture, screen = self._pictures(light)
+        similarity = ssim(self._light, picture, self._hit, self._peak) if self._peak > 0.0 else math.nan
+        return similarity, *picture_error(self._screen, screen, self._hit, self._flip)
 
-    def mean(self, colour: torch.Tensor) -> float:
-        """Averages SSIM of decoded colours [N, 3] over covered pixels whose window is in the picture; NaN if there are
-        none, or no range."""
-        if not self._inside.numel():
-            return math.nan
-        picture = torch.where(self._hit, colour[self._source].permute(2, 0, 1), self._reference)
-        mean, square, product = _blur(torch.stack([picture, picture.square(), picture * self._reference]))
-        variance, covariance = square - mean.square(), product - mean * self._mean
-        c1, c2 = (_C1 * self._peak) ** 2, (_C2 * self._peak) ** 2
-        similarity = (2.0 * mean * self._mean + c1) * (2.0 * covariance + c2)
-        similarity /= (mean.square() + self._mean.square() + c1) * (variance + self._variance + c2)
-        return float(similarity.mean(dim=0)[self._inside].mean())
-
-
-def _blur(image: torch.Tensor) -> torch.Tensor:
-    """Computes Gaussian means of [..., h, w] where the whole window is inside: [..., h - 10, w - 10]."""
-    offset = torch.arange(-_HALF, _HALF + 1, dtype=image.dtype)
-    weight = torch.exp(-0.5 * (offset / _SIGMA) ** 2)
-    weight = (weight / weight.sum()).tolist()
-    for axis in (-2, -1):
-        count = image.shape[axis] - 2 * _HALF
-        blurred = weight[_HALF] * image.narrow(axis, _HALF, count)
-        for k in range(_HALF):
-            pair = image.narrow(axis, k, count) + image.narrow(axis, 2 * _HALF - k, count)
-            blurred.add_(pair, alpha=weight[k])
-        image = blurred
-    return image
-
-
-class _Screen:
-    """The original in a view, as displayed on a screen with an exposure; FLIP is computed only if asked for."""
-
-    def __init__(self, factor: float, hit: torch.Tensor, target: torch.Tensor, flip: bool) -> None:
-        self._factor, self._shown = factor, self._coded(target, factor)
-        hit = hit.cpu().numpy()
-        rows, columns = (np.flatnonzero(hit.any(axis=axis)) for axis in (1, 0))
-        self._hit = hit[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        self._flip = flip
-
-    def errors(self, light: torch.Tensor) -> tuple[float, float]:
-        """Computes the mean squared error of decoded light [N, 3] at the covered pixels, and their FLIP or NaN."""
-        shown = self._coded(light, self._factor)
-        mse = float(np.square(shown - self._shown).mean())
-        if not self._flip:
-            return mse, math.nan
+    def _pictures(self, light: torch.Tensor) -> np.ndarray:
+        """Returns light [N, 3] as a picture, and the picture as displayed, float64 [2, h, w, 3]; black elsewhere."""
+        values = light.cpu().numpy().astype(np.float64)
         pictures = np.zeros((2, *self._hit.shape, 3))
-        pictures[0][self._hit], pictures[1][self._hit] = self._shown, shown
-        return mse, float(flip_display(*pictures)[self._hit].mean())
-
-    @staticmethod
-    def _coded(light: torch.Tensor, factor: float) -> np.ndarray:
-        return to_srgb(light.cpu().numpy() * factor)
+        pictures[:, self._hit] = values, to_srgb(values * self._exposure)
+        return pictures

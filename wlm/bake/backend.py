@@ -1,22 +1,17 @@
 """Loads Mitsuba and the compiler that it needs, or reports in one line what to install."""
 
-import contextlib
 import ctypes
-import os
-import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
+from wlm.formats.stderr import captured_stderr
 
 _EXTRA = "bake"
 _VARIANTS = {"cpu": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 _MAPS = Path("/proc/self/maps")
 _CHATTER = (b"jit_find_library", b"jitc_llvm_")
-_STDERR = 2
 _INSTALL = "install LLVM 16 or later (apt install libllvm19, for example), or name its library in DRJIT_LIBLLVM_PATH"
 
 
@@ -34,7 +29,8 @@ def start(device: str = "cpu") -> ModuleType:
     """
     if device not in _VARIANTS:
         raise WlmError(f"device: expected cpu or cuda, the first GPU, for a bake, got {device}")
-    with _without_chatter():
+    # Dr.Jit's C library writes lines when it finds no LLVM.
+    with captured_stderr(lambda line: line.startswith(_CHATTER)):
         mitsuba, drjit = need("mitsuba", _EXTRA), need("drjit", _EXTRA)
         has_llvm = drjit.has_backend(drjit.JitBackend.LLVM)
     if device == "cpu":
@@ -47,24 +43,6 @@ def start(device: str = "cpu") -> ModuleType:
         raise WlmError(f"{_EXTRA}: Mitsuba finds no NVIDIA GPU, or no OptiX in its driver: take --device cpu")
     mitsuba.set_variant(_VARIANTS[device])
     return mitsuba
-
-
-@contextlib.contextmanager
-def _without_chatter() -> Iterator[None]:
-    """Suppresses the output of Dr.Jit's C library when it finds no LLVM; other lines are passed on."""
-    with tempfile.TemporaryFile() as sink:
-        sys.stderr.flush()
-        saved = os.dup(_STDERR)
-        os.dup2(sink.fileno(), _STDERR)
-        try:
-            yield
-        finally:
-            os.dup2(saved, _STDERR)
-            sink.seek(0)
-            for line in sink.read().splitlines(keepends=True):
-                if not line.startswith(_CHATTER):
-                    os.write(saved, line)
-            os.close(saved)
 
 
 def _old_llvm() -> str | None:

@@ -13,7 +13,7 @@ from wlm.bake.texels import Texels, place_texels
 from wlm.bake.work import Task, each_hour
 from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
-from wlm.formats.exr import HALF_MAX, read_part, write_exr, write_part
+from wlm.formats.exr import HALF_MAX, write_exr, write_planes
 from wlm.formats.folder import claim, compact_json, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.hdr_blocks import need
@@ -226,15 +226,12 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     with staged(folder, INDEX, FORMAT) as made:
         for file, stamp, light, noise in zip(names[_LIGHT], stamps, baked.light, baked.noise, strict=True):
             write_exr(made / file, light)
-            _write_planes(
-                made / f"{_NOISE}_{stamp}.exr",
-                dict(zip(("noise.R", "noise.G", "noise.B"), noise.transpose(2, 0, 1), strict=True)),
-            )
+            planes = dict(zip(("noise.R", "noise.G", "noise.B"), noise.transpose(2, 0, 1), strict=True))
+            write_planes(made / f"{_NOISE}_{stamp}.exr", planes)
         if baked.direction is not None:
             for file, direction in zip(names[_DIRECTION], baked.direction, strict=True):
                 write_exr(made / file, direction)
-        planes = {"coverage": baked.coverage, "back": baked.back}
-        _write_planes(made / _COVERAGE, {name: plane.astype(np.float16) for name, plane in planes.items()})
+        write_planes(made / _COVERAGE, {"coverage": baked.coverage, "back": baked.back})
         write_mask(made / _MASK, baked.mask)
         geometry = baked.geometry
         write_glb(made / _MESH, geometry.document, geometry.replacements, 1)
@@ -250,7 +247,3 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
         (made / INDEX).write_text(compact_json(content), encoding="utf-8")
         written = sorted(path.name for path in made.iterdir())
     return [folder / name for name in written]
-
-
-def _write_planes(path: Path, planes: dict[str, np.ndarray]) -> None:
-    write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}, read_part)

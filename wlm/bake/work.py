@@ -106,35 +106,25 @@ def each_hour(
         make: Computes an hour's result, and calls its second argument with the finished share.
         progress: Called regularly.
     """
+    meter, results = Meter(progress, "bake", _REPORTS * len(hours)), []
     try:
-        return _hours(hours, checkpoint, table, make, Meter(progress, "bake", _REPORTS * len(hours)))
+        for number, hour in enumerate(hours):
+            result = None if checkpoint is None else checkpoint.finished(number, table)
+            if result is None:
+
+                def report(share: float, number: int = number) -> None:
+                    done = int(_REPORTS * (number + share))
+                    if meter.due(done):
+                        meter.report(done)
+
+                result = make(hour, report)
+                if checkpoint is not None:
+                    checkpoint.add_finished(number, result)
+            meter.report(_REPORTS * (number + 1))
+            results.append(result)
     except KeyboardInterrupt:
         if checkpoint is not None:
             # Hours that finish quickly aren't written individually.
             checkpoint.flush()
         raise
-
-
-def _hours(
-    hours: Sequence[float],
-    checkpoint: Checkpoint | None,
-    table: Mapping[str, Part],
-    make: Callable[[float, Callable[[float], None]], dict[str, np.ndarray]],
-    meter: Meter,
-) -> list[dict[str, np.ndarray]]:
-    results = []
-    for number, hour in enumerate(hours):
-        result = None if checkpoint is None else checkpoint.finished(number, table)
-        if result is None:
-
-            def report(share: float, number: int = number) -> None:
-                done = int(_REPORTS * (number + share))
-                if meter.due(done):
-                    meter.report(done)
-
-            result = make(hour, report)
-            if checkpoint is not None:
-                checkpoint.add_finished(number, result)
-        meter.report(_REPORTS * (number + 1))
-        results.append(result)
     return results

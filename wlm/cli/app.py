@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import bake, compare, doctor, inspect, smoke, verbs, view, web
+from wlm.cli import bake, doctor, inspect, smoke, verbs, view, web
 from wlm.cli import probe_volume as probe
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
@@ -109,7 +109,6 @@ verbs.register(
     "Show what a compressed file contains: settings, sizes on disk and on a device.\n\n"
     "wlm info FILE.wlm --help lists the options of the file's system.",
 )
-app.command()(compare.compare)
 app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)

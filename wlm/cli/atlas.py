@@ -25,7 +25,6 @@ from wlm.cli.options import (
     Engine,
     ExactShader,
     ModelFile,
-    PageFile,
     Profile,
     ReportFile,
     Resume,
@@ -112,7 +111,6 @@ def evaluate(
     views: _Views = None,
     resolution: _Resolution = None,
     json_path: ReportFile = None,
-    html_path: PageFile = None,
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
@@ -124,8 +122,6 @@ def evaluate(
     """Compare compressed lightmaps with the originals on rendered views of the scene."""
     if json_path is not None:
         check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
     quiet_warp()
     from wlm.atlas import evaluate, load
     from wlm.interop import check_device
@@ -140,10 +136,6 @@ def evaluate(
         report = evaluate(model, scene, views=views, resolution=resolution, device=device, progress=progress)
     if not report.views:
         raise WlmError(f"{file}: cannot be scored: no camera sees its charts, neither from around nor from inside")
-    if html_path is not None:
-        from wlm.view.reports import atlas_report
-
-        atlas_report(html_path, model, scene, report, views or _VIEWS)
     if json_path is not None:
         write_json(json_path, report.to_json() | {"cameras": views, "resolution": resolution, "device": device})
     _show_report(file, model, report)

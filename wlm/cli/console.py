@@ -5,7 +5,6 @@ import json
 import os
 import stat
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -21,6 +20,7 @@ from rich.table import Table
 from wlm.cli.signals import deferred_interrupt
 from wlm.errors import WlmError, printable
 from wlm.formats.lock import locked
+from wlm.formats.stderr import captured_stderr
 
 if TYPE_CHECKING:
     from wlm.formats.checkpoint import Checkpoint
@@ -49,7 +49,6 @@ __all__ = [
 
 _PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
 _PLAIN_REPORTS = 10  # lines of progress in a log
-_STDERR = 2
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
@@ -225,19 +224,8 @@ def quiet_warp() -> None:
 
     wp.config.log_level = wp.LOG_WARNING
     # Warp's C library writes to the stderr of the process, whatever the settings are.
-    with tempfile.TemporaryFile() as sink:
-        sys.stderr.flush()
-        saved = os.dup(_STDERR)
-        os.dup2(sink.fileno(), _STDERR)
-        try:
-            wp.init()
-        finally:
-            os.dup2(saved, _STDERR)
-            sink.seek(0)
-            for line in sink.read().splitlines(keepends=True):
-                if _MISSING_DRIVER not in line:
-                    os.write(saved, line)
-            os.close(saved)
+    with captured_stderr(lambda line: _MISSING_DRIVER in line):
+        wp.init()
     cache = Path(wp.config.kernel_cache_dir)
     if not (cache.is_dir() and any(cache.iterdir())):
         note("compiling kernels (first run; cached afterwards)")

@@ -1,8 +1,10 @@
 """`wlm doctor`: shows devices, libraries, and installed and missing extras."""
 
+import os
 import platform
 import re
 import sys
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -36,10 +38,20 @@ def doctor() -> None:
         rows.add_row("extras", "unknown: wlm is not installed as a package; pip install -e .")
     rows.add_section()
     cache = Path(wp.config.kernel_cache_dir)
-    size = sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
+    size = _size_of(cache)
     rows.add_row("kernel cache", escape(str(cache)))
     rows.add_row("size of the cache", f"{size / 1e6:.1f} MB")
     show(rows)
+
+
+def _size_of(folder: Path) -> int:
+    """Returns the bytes of all files under a folder, in which other processes may add and remove files."""
+    total = 0
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            with suppress(FileNotFoundError):
+                total += (Path(parent) / name).stat().st_size
+    return total
 
 
 def _extras() -> dict[str, list[str]]:

@@ -28,7 +28,6 @@ from wlm.cli.options import (
     Engine,
     ExactShader,
     ModelFile,
-    PageFile,
     Profile,
     ReportFile,
     Resume,
@@ -128,7 +127,6 @@ def evaluate(
     file: ModelFile,
     set_path: _Set,
     json_path: ReportFile = None,
-    html_path: PageFile = None,
     views: Annotated[
         int, typer.Option(min=0, help="Number of rendered views of the set's mesh to score, if it names one.")
     ] = 50,
@@ -146,8 +144,6 @@ def evaluate(
     """
     if json_path is not None:
         check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap import evaluate
@@ -160,10 +156,6 @@ def evaluate(
     with running("score") as progress:
         size = file.stat().st_size
         report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
-    if html_path is not None:
-        from wlm.view.reports import lightmap_report
-
-        lightmap_report(html_path, model, lightmaps, report)
     if json_path is not None:
         write_json(json_path, report.to_json())
     _show_report(file, report)

@@ -18,9 +18,6 @@ CheckpointEvery = Annotated[
     ),
 ]
 ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write the report as JSON.")]
-PageFile = Annotated[
-    Path | None, typer.Option("--html", metavar="REPORT.html", help="Write an HTML page with tables, plots, pictures.")
-]
 SceneFile = Annotated[
     Path | None, typer.Option("--mesh", metavar="SCENE.glb", help="Mesh of the scene: .glb, .gltf or .obj.")
 ]

@@ -28,7 +28,6 @@ from wlm.cli.options import (
     ExactShader,
     Key,
     ModelFile,
-    PageFile,
     Profile,
     ReportFile,
     Resume,
@@ -40,8 +39,6 @@ from wlm.cli.options import (
 from wlm.cli.settings import with_settings
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from wlm.probe import ProbeModel, ProbeSet, Report
 
 _Probes = Annotated[
@@ -103,7 +100,6 @@ def evaluate(
     file: ModelFile,
     probes_path: _Probes,
     json_path: ReportFile = None,
-    html_path: PageFile = None,
     volume: Annotated[
         bool, typer.Option("--volume", help="Also score the light sampled from the cascaded volume along a walk.")
     ] = False,
@@ -111,9 +107,6 @@ def evaluate(
         int, typer.Option(help="Number of pictures of balls, and of --mesh, under the light to score; 0 for none.")
     ] = 0,
     mesh: SceneFile = None,
-    hold_out: Annotated[
-        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again and score the light at the others.")
-    ] = False,
     key: Key = None,
     convention: _Convention = None,
     device: Device = "cpu",
@@ -121,8 +114,6 @@ def evaluate(
     """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes."""
     if json_path is not None:
         check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
     quiet_warp()
     from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
     from wlm.probe import evaluate, load
@@ -133,13 +124,9 @@ def evaluate(
     note_warnings(probes.warnings)
     with running("evaluate") as progress:
         size = file.stat().st_size
-        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
+        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size)
     if not probes.source.startswith(model.source):
         note(f"warning: {probes_path}: not the input of {file}; another key, convention or file?")
-    if html_path is not None:
-        from wlm.view.reports import probe_report
-
-        probe_report(html_path, model, probes, report)
     pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
     walks = score_walks(model, probes, device) if volume else {}
     if json_path is not None:
@@ -169,12 +156,13 @@ def decode(
     check_output(output, ".npz", ".json")
     quiet_warp()
     from wlm.probe import load_positions, save_probes
+    from wlm.probe.places import positions_of
     from wlm.system import load
 
     model = load(file, "probe")
     position = model.stored_positions() if positions is None else load_positions(positions)
     own = positions is None or model.has_probes_at(position)
-    given = position if own and positions is not None else own_positions(model, original)
+    given = position if own and positions is not None else positions_of(model, original)
     decoder = model.decoder(device, position=given)
     values = decoder.decode_probes() if own else decoder.decode(position)
     save_probes(output, position, values, convention=convention)
@@ -229,23 +217,6 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
     models.describe(file, "probe", device, as_json, facts)
 
 
-def own_positions(model: "ProbeModel", original: Path | None) -> "np.ndarray | None":
-    """Reads the positions of the model's own probes from another file; None if there is none.
-
-    Raises:
-        WlmError: They are not those of the model's probes.
-    """
-    from wlm.errors import WlmError
-    from wlm.probe import load_positions
-
-    if original is None:
-        return None
-    position = load_positions(original)
-    if not model.has_probes_at(position):
-        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
-    return position
-
-
 def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     columns = ["PSNR, dB", "live probes, dB", "irradiance, dB", "bytes on disk", "share of float32", "bits per probe"]
     rows = table(str(file), ["", *columns])
@@ -259,11 +230,6 @@ def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     rows.add_section()
     if report.between_psnr is not None:
         rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
-    if report.held_out is not None:
-        held = report.held_out
-        rows.add_row(f"{held.probes:,} probes left out of a fit", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
-        rows.add_row("  nearest uncompressed probe there", number(held.nearest, ".2f"))
-        rows.add_row("  8 uncompressed probes by distance", number(held.distance, ".2f"))
     show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe

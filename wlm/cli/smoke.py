@@ -1,26 +1,39 @@
-"""`wlm smoke`: simulate smoke, render guiding maps, and make six-way lightmaps by a march or by the network."""
+"""`wlm smoke`: simulate smoke, light it, and make six-way lightmaps by a march or by the network."""
 
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from wlm.cli import smoke_book, smoke_light, smoke_network, smoke_run
-from wlm.cli.console import escape, exclusive, note, number, quiet_warp, running, show, show_facts, table
+from wlm.cli import smoke_book, smoke_network
+from wlm.cli.console import (
+    check_output,
+    escape,
+    exclusive,
+    note,
+    note_warnings,
+    number,
+    quiet_warp,
+    running,
+    show,
+    show_facts,
+    table,
+)
 from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
-    G,
+    SHEET,
+    Background,
     Input,
-    SceneFrames,
-    SceneName,
-    SceneScale,
     SmokeOptions,
-    check_choice,
-    march_frames,
+    White,
+    check_white,
+    outputs,
+    vector,
+    vectors,
     with_smoke,
     write_lightmaps,
 )
@@ -32,6 +45,8 @@ if TYPE_CHECKING:
     from wlm.smoke.camera import Camera
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.model import SmokeModel
+    from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lights import AnyLight
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
 
@@ -40,20 +55,32 @@ INSTEAD = {
     "decode": "wlm smoke predict SMOKE --network FILE",
     "export": "wlm smoke export-onnx FILE",
 }
-_MARCH = 130  # steps of `predict --coarse` along the longest edge
+_WARM = 2  # first frames of `run`, which compile kernels and are not timed if there are others
 
 app = typer.Typer(help="Smoke: simulation, six-way lightmaps, and pictures.")
 
-_Output = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
+_SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
+]
+_SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
+_SceneScale = Annotated[
+    float, typer.Option(min=0.001, max=100.0, help="Factor on the number of cells along each axis of the scene.")
+]
+_Albedo = Annotated[
+    str | None,
+    typer.Option(metavar="R,G,B", help="Single scattering albedo, three numbers or one; default the scene's."),
+]
+_G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
+_Lightmaps = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
 
 
 @app.command()
 @exclusive
 def simulate(
-    scene_name: SceneName,
+    scene_name: _SceneName,
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
-    frames: SceneFrames = None,
-    scale: SceneScale = 1.0,
+    frames: _SceneFrames = None,
+    scale: _SceneScale = 1.0,
     velocity: Annotated[
         bool, typer.Option("--velocity", help="Also keep the velocity of the air, for flipbook --motion.")
     ] = False,
@@ -107,64 +134,15 @@ def simulate(
 @app.command()
 @with_smoke
 @exclusive
-def guide(
-    smoke: Input,
-    output: _Output,
-    options: SmokeOptions,
-    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Step of the march in voxels.")] = March.step,
-    jitter: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Largest random shift of the samples, as a share of a step.")
-    ] = March.jitter,
-    seed: Seed = March.seed,
-    threshold: Annotated[
-        float, typer.Option(min=0.0, help="Optical depth of a voxel from which smoke has a surface.")
-    ] = March.threshold,
-    g: G = March.g,
-    resume: Resume = False,
-) -> None:
-    """Render guiding maps, the input of the network: light, transparency and depth of a coarse march (algorithm 1).
-
-    Finished frames are kept when the command is stopped; repeat it with --resume to make the others.
-    """
-    quiet_warp()
-    from wlm.smoke.data import write_guide
-    from wlm.smoke.march.coarse import guide
-
-    march = March(step, jitter=jitter, seed=seed, threshold=threshold, g=g)
-    frames = options.open(smoke)
-    camera = options.view(frames, orthographic=False)
-    rows = table(str(smoke), ["file", "covered pixels", "mean light", "nearest depth", "farthest depth"])
-
-    def make(frame: int, file: "Callable[[], Path]", volume: "DensityVolume", view: "Camera") -> None:
-        maps = guide(volume, view, march)
-        path = file()
-        write_guide(path, maps)
-        depth = maps.depth[maps.depth > 0]
-        covered = maps.transparency < 0.99
-        rows.add_row(
-            escape(path.name),
-            f"{float(covered.float().mean()):.1%}",
-            number(float(maps.light[covered].mean()) if covered.any() else None, ".4g"),
-            number(float(depth.min()) if len(depth) else None, ".4g"),
-            number(float(depth.max()) if len(depth) else None, ".4g"),
-        )
-
-    march_frames(frames, camera, output, "guide", make, asdict(march), resume=resume)
-    show(rows)
-
-
-@app.command()
-@with_smoke
-@exclusive
 def bake(
     smoke: Input,
-    output: _Output,
+    output: _Lightmaps,
     options: SmokeOptions,
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the march in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="Rays along the edge of a pixel.")] = 1,
-    g: G = March.g,
+    g: _G = 0.0,
     fit: Annotated[
-        str,
+        Literal["axes", "sphere"],
         typer.Option(help="axes: exact for lights along the six axes; sphere: least error over all light directions."),
     ] = "axes",
     albedo: Annotated[
@@ -178,7 +156,6 @@ def bake(
     An EXR has the channels right, left, top, bottom, front, back, transparency, and emission of hot smoke. Finished
     frames are kept when the command is stopped; repeat it with --resume to make the others.
     """
-    check_choice("--fit", fit, ("axes", "sphere"))
     if fit == "sphere" and supersample > 1:
         raise WlmError("--supersample: expected 1 with --fit sphere")
     if albedo is not None and fit == "axes":
@@ -202,16 +179,12 @@ def bake(
 @exclusive
 def predict(
     smoke: Input,
-    output: _Output,
+    output: _Lightmaps,
     options: SmokeOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Network that wlm smoke train wrote; default the shipped one.")
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Use a coarse march alone, without a network.")] = False,
-    step: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=1000.0, help=f"Step of --coarse in voxels; default 1/{_MARCH} of the longest edge."),
-    ] = None,
     seed: Seed = 0,
     resume: Resume = False,
 ) -> None:
@@ -222,31 +195,21 @@ def predict(
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network beside it")
-    if step is not None and not coarse:
-        raise WlmError("--step: expected --coarse: a network uses the step that it was trained with")
     quiet_warp()
     from wlm.smoke.codec import open_network
+    from wlm.smoke.march.coarse import bake_coarse, coarse_march
 
     frames = options.open(smoke)
+    made: dict[str, Any] = {"made": "coarse", "seed": seed}
     if coarse:
-        made = {"made": "coarse", "step": step, "seed": seed}
-        make = _coarse(step, seed)
+
+        def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
+            return bake_coarse(volume, camera, coarse_march(volume, seed))
     else:
         model = open_network(network)
-        made = {"made": "network", "of": dict(model.summary), "seed": seed}
+        made |= {"made": "network", "of": dict(model.summary)}
         make = _predicted(model, seed, frames.device)
     write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
-
-
-def _coarse(step: float | None, seed: int) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Returns a function that makes lightmaps by a coarse march."""
-    from wlm.smoke.march.coarse import bake_coarse
-
-    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        voxels = max(volume.shape) / _MARCH if step is None else step
-        return bake_coarse(volume, camera, March(voxels, seed=seed))
-
-    return make
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
@@ -266,5 +229,223 @@ def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[Densit
     return make
 
 
-for _module in (smoke_book, smoke_light, smoke_network, smoke_run):
+@app.command()
+@with_smoke
+@exclusive
+def light(
+    smoke: Input,
+    output: Annotated[Path, output_option("OUT", "A .png or .exr, or for frames a folder of PNGs.")],
+    options: SmokeOptions,
+    lights: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--light", metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."
+        ),
+    ] = None,
+    points: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--point", metavar="X,Y,Z[:R,G,B]", help="Position of a point light and its intensity; repeat for more."
+        ),
+    ] = None,
+    sky: Annotated[
+        str | None, typer.Option(metavar="R,G,B", help="Radiance of a uniform sky, also visible as the background.")
+    ] = None,
+    albedo: _Albedo = None,
+    g: _G = 0.0,
+    orders: Annotated[
+        Literal["all", "single"], typer.Option(help="Orders of scattering: all, or single scattering alone.")
+    ] = "all",
+    samples: Annotated[
+        int | None, typer.Option(min=2, max=2**20, help="Trace this many paths per pixel instead of marching.")
+    ] = None,
+    background: Background = None,
+    white: White = 1.0,
+) -> None:
+    """Light smoke into pictures by a march towards each light, with predicted multiple scattering, or by path tracing.
+
+    Without --light, --point and --sky the lights are those of the scene, or one from 1,1,1. The march takes a sky as
+    twelve lights, and draws a scene's obstacles and their shadows. Path tracing has no bias and states its noise; in
+    it obstacles absorb all light, fire emits grey light, and the background is black or the sky.
+    """
+    if samples is not None and background is not None:
+        raise WlmError("--background: expected none with --samples: a traced picture shows only the sky")
+    colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
+    behind = around if background is None else vector("--background", background)
+    check_white(white)
+    own, twelve = _lights(lights, points), () if around is None else _sky_lights(around)
+    quiet_warp()
+    from wlm.formats.exr import write_exr
+    from wlm.smoke.scene import obstacle_mesh
+    from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lighting import LitSmoke, light_smoke
+    from wlm.smoke.transport.orders import ScatteredSmoke, orders_march, scatter
+    from wlm.smoke.transport.tracing import HIGHEST, trace
+    from wlm.view.pictures import contact_sheet, save_png, to_bytes
+    from wlm.view.smoke import picture
+
+    frames = options.open(smoke)
+    camera = options.view(frames, orthographic=False)
+    if frames.scene is not None:
+        colour = colour or frames.scene.smoke.albedo
+    if not own and around is None:
+        own = [Light((1.0, 1.0, 1.0))] if frames.scene is None else [each.light() for each in frames.scene.lights]
+    colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
+    file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
+    rows = table(str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))])
+    pictures = []
+    with running("light") as progress:
+        for frame, volume in frames.volumes(progress=progress):
+            note_warnings(volume.warnings)
+            view, looks, noise = frames.view(camera, volume), frames.looks(frame), []
+            if samples is None:
+                march, lamps = orders_march(volume, g), [*own, *twelve]
+                if orders == "single":
+                    made: LitSmoke | ScatteredSmoke = light_smoke(volume, view, lamps, march)
+                else:
+                    made = scatter(volume, view, lamps, colour, march=march)
+                extra: dict[str, Any] = {} if looks is None else {"background": looks.background, "ramp": looks.ramp}
+                if looks is not None:
+                    extra |= {"obstacles": looks.obstacles, "time": looks.time}
+                image = picture(made, albedo=colour, **extra | ({} if behind is None else {"background": behind}))
+            else:
+                solid = None if looks is None else obstacle_mesh(looks.obstacles, looks.time)[:2]
+                paths: dict[str, Any] = {"sky": around, "albedo": colour, "g": g, "obstacles": solid}
+                try:
+                    traced = trace(volume, view, own, samples=samples, orders=0, highest=highest, **paths)
+                except WlmError as error:
+                    raise WlmError(f"{frames.file(frame)}: {error}") from error
+                image, noise = traced.total, [f"{traced.error:.2%}"]
+            path = file(frame)
+            if path.suffix.lower() == ".exr":
+                write_exr(path, image.cpu().numpy())
+            else:
+                pictures.append(to_bytes(image, white))
+                save_png(path, pictures[-1])
+            clipped = float((image > white).any(-1).float().mean())
+            rows.add_row(escape(path.name), f"{image.mean():.4g}", f"{image.max():.4g}", f"{clipped:.1%}", *noise)
+    if not frames.single:
+        contact_sheet(output / SHEET, {"": pictures})
+    show(rows)
+
+
+@app.command()
+@exclusive
+def run(
+    scene_name: _SceneName,
+    output: Annotated[Path, output_option("OUT", "A folder of PNGs, or an .mp4.")],
+    frames: _SceneFrames = None,
+    scale: _SceneScale = 1.0,
+    resolution: Annotated[
+        int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's.")
+    ] = None,
+    orders: Annotated[
+        Literal["all", "single"] | None,
+        typer.Option(
+            help="Orders of scattering: all, or single by six-way lightmaps. Default all, or single with --network."
+        ),
+    ] = None,
+    albedo: _Albedo = None,
+    network: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Make the six-way lightmaps by this network of wlm smoke train."),
+    ] = None,
+    white: White = 1.0,
+    device: Device = "cpu",
+) -> None:
+    """Simulate a scene, light it and draw it frame by frame, without intermediate files.
+
+    The lights and the fire of the scene illuminate the smoke with all orders of scattering. The table has the median
+    time of each stage; on a GPU a CUDA graph replaces the stages of the light after some frames.
+    """
+    check_white(white)
+    if orders == "all" and network is not None:
+        raise WlmError("--network: expected --orders single: it makes six-way lightmaps")
+    colour = _given_albedo(albedo)
+    film_file = output.suffix.lower() == ".mp4"
+    if film_file:
+        check_output(output, ".mp4")
+    quiet_warp()
+    from wlm.formats.film import film
+    from wlm.interop import check_device
+    from wlm.smoke.data import NumberedFiles
+    from wlm.smoke.network.prediction import SmokePredictor
+    from wlm.smoke.scene import load_scene
+    from wlm.view.pictures import save_png
+    from wlm.view.smoke_run import Lighting, write_all
+    from wlm.view.smoke_run import run as frames_of
+
+    device = check_device(device)
+    scene = load_scene(scene_name)
+    if scale != 1.0:
+        scene = scene.scaled(scale)
+    single = orders == "single" or network is not None
+    camera = scene.camera if resolution is None else scene.camera.model_copy(update={"resolution": resolution})
+    if camera.perspective and single:
+        raise WlmError(f"{scene_name}: camera.perspective: expected false for six-way lightmaps, found true")
+    scene = scene.model_copy(update={"camera": camera, "frames": frames or scene.frames})
+    if colour is not None:
+        scene = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"albedo": colour})})
+    predictor = None if network is None else SmokePredictor(network, device)
+    lighting = Lighting(None if single else scene.smoke.albedo, predictor)
+    with running("run", unit="frame") as progress:
+        made = frames_of(scene, lighting, white=white, device=device, progress=progress)
+        if film_file:
+            width = max(round(camera.resolution * camera.aspect), 1)
+            with film(output, camera.resolution, width, scene.rate) as add:
+                seconds = write_all(made, lambda number, pixels: add(pixels))
+        else:
+            files = NumberedFiles(output, "run", ".png")
+            seconds = write_all(made, lambda number, pixels: save_png(files.file(number), pixels))
+    rows = table(f"{output}: {scene.name}, {scene.frames} frames", ["stage", "ms per frame", "frames"])
+    for stage, taken in seconds.items():
+        counted = taken[_WARM:] or taken
+        rows.add_row(stage, number(1e3 * median(counted), ".4g"), f"{len(taken)}")
+    show(rows)
+
+
+def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
+    """Reads the numbers of `--albedo`, one for all colours or three; None if it is not given."""
+    if text is None:
+        return None
+    values = vector("--albedo", text if "," in text else ",".join([text] * 3))
+    if not all(0 <= value <= 1 for value in values):
+        raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
+    return values
+
+
+def _checked(option: str, make: Callable[..., Any], *values: Any) -> Any:
+    """Calls a function of an option's values; its ValueError becomes one line that names the option."""
+    try:
+        return make(*values)
+    except ValueError as error:
+        raise WlmError(f"{option}: {error}") from error
+
+
+def _sky_lights(radiance: tuple[float, float, float]) -> "tuple[Light, ...]":
+    """Returns the lights that approximate the sky of `--sky`."""
+    from wlm.smoke.transport.lights import sky_lights
+
+    return _checked("--sky", sky_lights, radiance)
+
+
+def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
+    """Returns the lights of `--light` and `--point`."""
+    from wlm.smoke.camera import unit
+    from wlm.smoke.shading import Light
+    from wlm.smoke.transport.lights import PointLight, checked_colour
+
+    made: list[AnyLight] = []
+    for option, texts in (("--light", directions), ("--point", places)):
+        for text in texts or ():
+            values = vectors(option, text)
+            if len(values) == 2:
+                _checked(option, checked_colour, "colour", values[1])
+            if option == "--light":
+                _checked(option, unit, values[0], "direction")
+            made.append(_checked(option, Light if option == "--light" else PointLight, *values))
+    return made
+
+
+for _module in (smoke_book, smoke_network):
     _module.register(app)

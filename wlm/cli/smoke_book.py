@@ -1,21 +1,23 @@
 """`wlm smoke shade` and `flipbook`: six-way lightmaps as pictures, as textures, and as folders for engines."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from wlm.cli.console import check_output, escape, note_warnings, quiet_warp, running, show, table
+from wlm.cli.console import check_output, escape, note, quiet_warp, running, show, table
 from wlm.cli.options import Device, Engine, ShaderLanguage, output_option
-from wlm.cli.smoke_options import SHEET, Background, White, check_choice, check_white, outputs, vector, vectors
+from wlm.cli.smoke_options import SHEET, Background, White, check_white, outputs, vector, vectors
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    from wlm.smoke.flipbook.book import Book
-    from wlm.smoke.flipbook.shots import BakedFiles, FlipBook, Shot
+    from wlm.smoke.flipbook.book import Book, Shot
     from wlm.smoke.shading import Light
     from wlm.system import OnProgress
+
+    _Source = tuple[bool, Callable[[int | None, OnProgress], Iterable[Shot]]]
 
 _TEXTURES = (".exr", ".png", ".tga")
 _PADDING = 1  # pixels around a frame that the filter of a folder's shader reads
@@ -34,13 +36,9 @@ _With = Annotated[
 _Cells = Annotated[
     str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book given by --with, such as 8x8.")
 ]
+_Layout = Literal["unity", "o3de", "o3de-tlrb", "embergen"]
 _From = Annotated[
-    str | None,
-    typer.Option(
-        "--from",
-        metavar="LAYOUT",
-        help="Layout of the flip book given by --with: unity (default), o3de, o3de-tlrb or embergen.",
-    ),
+    _Layout | None, typer.Option("--from", help="Layout of the flip book given by --with; default unity.")
 ]
 _Straight = Annotated[
     bool, typer.Option("--straight", help="The flip book given by --with has straight (not premultiplied) alpha.")
@@ -62,7 +60,9 @@ def shade(
     ] = None,
     background: Background = None,
     white: White = 1.0,
-    rule: Annotated[str, typer.Option(help="Weights of the lightmaps: squared, absolute or normalised.")] = "squared",
+    rule: Annotated[
+        Literal["squared", "absolute", "normalised"], typer.Option(help="Weights of the lightmaps under a light.")
+    ] = "squared",
     textures: _With = None,
     cells: _Cells = None,
     source_layout: _From = None,
@@ -74,9 +74,6 @@ def shade(
     Without --light the lights are those of the scene, or one from 1,1,1. The default irradiance, 4 pi, shows a lightmap
     unchanged.
     """
-    from wlm.smoke.camera import RULES
-
-    check_choice("--rule", rule, RULES)
     check_white(white)
     lights = [_light(text) for text in light or ()]
     behind = None if background is None else vector("--background", background)
@@ -85,13 +82,13 @@ def shade(
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
     from wlm.view.smoke import picture
 
-    source = _source(lightmaps, textures, cells, source_layout, straight, device)
+    single, shots = _source(lightmaps, textures, cells, source_layout, straight, device)
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
-    file = outputs(lightmaps, source.single, output, "shade", ".png")
+    file = outputs(lightmaps, single, output, "shade", ".png")
     rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
     pictures = []
     with running("shade") as progress:
-        for shot in _shots(source, progress):
+        for shot in shots(None, progress):
             if shot.six.transparency is None:
                 raise WlmError(f"{lightmaps}: no opacity: expected an alpha channel, or a third texture by --with")
             looks = shot.looks or plain
@@ -106,7 +103,7 @@ def shade(
             clipped = float((shaded > white).any(-1).float().mean())
             figures = (f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}")
             rows.add_row(escape(path.name), *figures)
-    if not source.single:
+    if not single:
         contact_sheet(output / SHEET, {"": pictures})
     show(rows)
 
@@ -116,7 +113,7 @@ def flipbook(
     output: Annotated[Path, output_option("OUT", "A folder, or a .png, .tga or .exr: written as OUT_1 and OUT_2.")],
     engine: Engine = None,
     shader: ShaderLanguage = None,
-    layout: Annotated[str, typer.Option(help="Channels: unity, o3de, o3de-tlrb or embergen.")] = "unity",
+    layout: Annotated[_Layout, typer.Option(help="Order of the channels in the two textures.")] = "unity",
     count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
     gain: Annotated[
         float | None,
@@ -136,9 +133,6 @@ def flipbook(
     motion: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity, for a texture of motion.")
     ] = None,
-    depth: Annotated[
-        Path | None, typer.Option(metavar="SMOKE", help="The smoke itself, for a texture of depth for point lights.")
-    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Pack six-way lightmaps into a flip book: two textures for an importer, or a folder with shader and kit.
@@ -153,14 +147,29 @@ def flipbook(
                 raise WlmError(f"--{option}: expected a folder as the output, got {output}")
         gain = 1.0 if gain is None and output.suffix.lower() == ".exr" else gain
     quiet_warp()
-    source = _source(lightmaps, textures, cells, source_layout, straight, device)
-    for option, given in (("motion", motion), ("depth", depth)):
-        if given is not None and textures:
-            raise WlmError(f"--{option}: expected lightmaps of bake or predict: the camera of a flip book is unknown")
-    packing = {"count": count, "gain": gain, "rate": rate, "mips": mips, "motion": motion, "depth": depth}
-    packed = _packed(lightmaps, source, layout, device, **packing, padding=0 if in_files else _PADDING)
+    from wlm.smoke.flipbook.book import pack_book, write_book
+    from wlm.smoke.flipbook.motion import mip_padding, open_motion
+
+    _, read = _source(lightmaps, textures, cells, source_layout, straight, device)
+    if motion is not None and textures:
+        raise WlmError("--motion: expected lightmaps of bake or predict: the camera of a flip book is unknown")
+    for option, value in (("gain", gain), ("rate", rate)):
+        if value is not None and not 0 < value < float("inf"):
+            raise WlmError(f"--{option}: expected a number above 0, got {value}")
+    air = None if motion is None else open_motion(motion, device)
+    with running("flipbook") as progress:
+        shots = list(read(count, progress))
+    padding = 0 if in_files else _PADDING
+    if mips is not None:
+        padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
+    try:
+        with running("motion") as progress:
+            report = None if air is None else progress
+            packed = pack_book(shots, layout, gain=gain, rate=rate, padding=padding, air=air, progress=report)
+    except ValueError as error:
+        raise WlmError(f"{lightmaps}: {error}") from error
     if in_files:
-        contents, clipped = _write_textures(packed, output)
+        contents, clipped = write_book(packed, output)
     else:
         from wlm.export import export
         from wlm.smoke.bundle import bundle as bundle_of
@@ -183,99 +192,38 @@ def _source(
     lightmaps: Path,
     textures: Sequence[Path] | None,
     cells: str | None,
-    layout: str | None,
+    layout: _Layout | None,
     straight: bool,
     device: str,
-) -> "BakedFiles | FlipBook":
-    """Opens lightmaps or the flip book that the options describe.
-
-    Raises:
-        WlmError: An option has no meaning, or the path is neither.
-    """
+) -> "_Source":
+    """Opens lightmaps or a flip book; returns whether there is one frame, and a function that yields some frames."""
     from wlm.interop import check_device
-    from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.flipbook.shots import FlipBook, baked_files
+    from wlm.smoke.data import six_way_files, spread
+    from wlm.smoke.flipbook.book import Shot, is_straight, read_flipbook, read_shots
 
     device = check_device(device)
     if not textures:
         for option, given in (("cells", cells), ("from", layout), ("straight", straight)):
             if given:
                 raise WlmError(f"--{option}: has no meaning without --with, the second texture of a flip book")
-        if (baked := baked_files(lightmaps, device)) is None:
+        files = {1: lightmaps} if lightmaps.suffix.lower() == ".exr" else six_way_files(lightmaps)
+        if not files:
             raise WlmError(
                 f"{lightmaps}: expected six-way lightmaps: make them of smoke with wlm smoke bake or predict"
             )
-        return baked
-    if len(textures) > 2:
-        raise WlmError(f"--with: expected a second texture and possibly one of opacity, got {len(textures)}")
-    layout = "unity" if layout is None else layout
-    check_choice("--from", layout, tuple(LAYOUTS))
+        return not lightmaps.is_dir(), partial(read_shots, files, device)
     rows, cross, columns = (cells or "").partition("x")
     if not (cross and rows.isdecimal() and columns.isdecimal() and 0 < int(rows) <= 64 and 0 < int(columns) <= 64):
         raise WlmError(f"--cells: expected rows and columns of 1 to 64, such as 8x8, got {cells}")
-    return FlipBook((lightmaps, *textures), layout, int(rows), int(columns), straight, device)
+    options = {"rows": int(rows), "columns": int(columns), "straight": straight, "device": device}
+    frames = read_flipbook((lightmaps, *textures), layout or "unity", **options)
+    if not straight and is_straight(frames):
+        note(f"{lightmaps}: light where there is no smoke: is it straight (--straight)?")
 
+    def shots(count: int | None, progress: "OnProgress") -> "Iterable[Shot]":
+        return [Shot(n, frames[n - 1]) for n in spread(range(1, len(frames) + 1), count)]
 
-def _shots(source: "BakedFiles | FlipBook", progress: "OnProgress", count: int | None = None) -> "Iterator[Shot]":
-    for shot in source.shots(count, progress):
-        note_warnings(shot.warnings)
-        yield shot
-
-
-def _packed(
-    lightmaps: Path,
-    source: "BakedFiles | FlipBook",
-    layout: str,
-    device: str,
-    *,
-    count: int | None,
-    gain: float | None,
-    rate: float | None,
-    mips: int | None,
-    motion: Path | None,
-    depth: Path | None,
-    padding: int,
-) -> "Book":
-    """Packs frames into a flip book, as the options of the same names say; `padding` is replaced by that for `mips`.
-
-    Raises:
-        WlmError: An option or the lightmaps are wrong.
-    """
-    from wlm.smoke.camera import LAYOUTS
-    from wlm.smoke.data import load_frames
-    from wlm.smoke.flipbook.book import pack_book
-    from wlm.smoke.flipbook.motion import mip_padding, open_motion
-
-    check_choice("--layout", layout, tuple(LAYOUTS))
-    for option, number in (("gain", gain), ("rate", rate)):
-        if number is not None and not 0 < number < float("inf"):
-            raise WlmError(f"--{option}: expected a number above 0, got {number}")
-    if depth is not None and not depth.exists():
-        raise WlmError(f"{depth}: expected the smoke of the flip book, found none")
-    # These inputs are opened before the long work.
-    air = None if motion is None else open_motion(motion, device)
-    volumes = None if depth is None else load_frames(depth, device=device)
-    with running("flipbook") as progress:
-        shots = list(_shots(source, progress, count))
-    if mips is not None:
-        padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
-    options: dict[str, Any] = {"gain": gain, "rate": rate, "padding": padding, "air": air, "volumes": volumes}
-    try:
-        with running("motion and depth") as progress:
-            options["progress"] = None if air is None and volumes is None else progress
-            return pack_book(shots, layout, **options)
-    except ValueError as error:
-        raise WlmError(f"{lightmaps}: {error}") from error
-
-
-def _write_textures(book: "Book", output: Path) -> tuple[dict[Path, Sequence[str]], int]:
-    """Writes the textures of a flip book; returns their channels by path and the number of clipped values."""
-    from wlm.smoke.flipbook.textures import write_page
-
-    endings = {"first": "1", "second": "2", "motion": "motion", "depth": "depth"}
-    paths = {name: output.with_name(f"{output.stem}_{endings[name]}{output.suffix}") for name in book.pages}
-    clipped = sum(write_page(path, book.pages[name]) for name, path in paths.items())
-    return {path: book.channels[name] for name, path in paths.items()}, clipped
+    return len(frames) == 1, shots
 
 
 def _show(title: str, book: "Book", contents: Mapping[Path, Sequence[str]], clipped: int) -> None:
@@ -289,6 +237,4 @@ def _show(title: str, book: "Book", contents: Mapping[Path, Sequence[str]], clip
     rows.add_row("gain", f"{book.gain:.4g}", f"{clipped:,} values clipped")
     if book.scale is not None:
         rows.add_row("largest motion", f"{book.scale:.4g}", "share of a frame, to the next frame")
-    if book.reach is not None:
-        rows.add_row("largest depth", f"{book.reach:.4g}", "frame heights in front of or behind the billboard")
     show(rows)

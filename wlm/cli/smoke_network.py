@@ -24,7 +24,6 @@ from wlm.cli.options import (
     CheckpointEvery,
     Device,
     ModelFile,
-    PageFile,
     ReportFile,
     Resume,
     Seed,
@@ -123,7 +122,6 @@ def evaluate(
         int | None, typer.Option(min=16, max=512, help="Cells of the air along an edge; default as in the training.")
     ] = None,
     json_path: ReportFile = None,
-    html_path: PageFile = None,
     device: Device = "cpu",
 ) -> None:
     """Measure a network on smoke that it was not trained on.
@@ -133,8 +131,6 @@ def evaluate(
     """
     if json_path is not None:
         check_output(json_path, ".json")
-    if html_path is not None:
-        check_output(html_path, ".html")
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network
@@ -149,10 +145,6 @@ def evaluate(
     if json_path is not None:
         content = {"network": _facts(network, model), "device": device, **sizes}
         write_json(json_path, content | {"sets": [comparison.to_json() for comparison in comparisons]})
-    if html_path is not None:
-        from wlm.view.reports import smoke_report
-
-        smoke_report(html_path, network.stem, model, comparisons)
     _show_comparisons(network, comparisons)
 
 

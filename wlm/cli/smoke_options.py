@@ -24,18 +24,6 @@ SHEET = "sheet.png"
 _CAMERA = ("toward", "turn", "extent", "distance", "perspective")
 _VOLUME = ("up", "extinction", "emission", "density", "temperature")
 
-SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
-]
-SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
-SceneScale = Annotated[
-    float, typer.Option(min=0.001, max=100.0, help="Factor on the number of cells along each axis of the scene.")
-]
-Albedo = Annotated[
-    str | None,
-    typer.Option(metavar="R,G,B", help="Single scattering albedo, three numbers or one; default the scene's."),
-]
-G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
 White = Annotated[float, typer.Option(help="Radiance that becomes white in a PNG.")]
 Background = Annotated[
     str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke; default the scene's, or black.")
@@ -72,11 +60,7 @@ class SmokeOptions:
     device: Device = "cpu"
 
     def open(self, smoke: Path) -> "Frames":
-        """Opens a volume or a folder of frames.
-
-        Raises:
-            WlmError: A setting is wrong, there is no such device, or the smoke cannot be opened.
-        """
+        """Opens a volume or a folder of frames."""
         from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
@@ -90,11 +74,7 @@ class SmokeOptions:
         return load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
 
     def view(self, frames: "Frames", *, orthographic: bool = True) -> "CameraSettings":
-        """Returns the camera of the scene, or the default one, changed by the options.
-
-        Raises:
-            WlmError: A setting is wrong, or `orthographic` lightmaps are to be made in perspective.
-        """
+        """Returns the camera of the scene, or the default one, changed by the options; errors name the option."""
         from wlm.config import check_settings
         from wlm.smoke.scene import CameraSettings
 
@@ -131,11 +111,7 @@ def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
-    """Reads the values of a repeatable option NAME=VALUE.
-
-    Raises:
-        WlmError: A value has another form or an unknown name.
-    """
+    """Reads the values of a repeatable option NAME=VALUE with known names."""
     values = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
@@ -153,11 +129,7 @@ def _float(option: str, text: str) -> float:
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
-    """Reads three finite numbers from the text of an option.
-
-    Raises:
-        WlmError: The text has another form.
-    """
+    """Reads three finite numbers from the text of an option."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -168,11 +140,7 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
 
 
 def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
-    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples.
-
-    Raises:
-        WlmError: The text has another form.
-    """
+    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples."""
     place, colon, colour = text.partition(":")
     values = [vector(option, place)]
     if colon:
@@ -180,46 +148,21 @@ def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
     return values
 
 
-def given_albedo(text: str | None) -> tuple[float, float, float] | None:
-    """Reads the numbers of `--albedo`, one for all colours or three; None if it is not given.
-
-    Raises:
-        WlmError: The text has another form, or a number is outside 0 to 1.
-    """
-    if text is None:
-        return None
-    values = vector("--albedo", text if "," in text else ",".join([text] * 3))
-    if not all(0 <= value <= 1 for value in values):
-        raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
-    return values
-
-
 def check_white(white: float) -> None:
-    """Checks the value of `--white`.
-
-    Raises:
-        WlmError: It is not above 0.
-    """
+    """Checks the value of `--white`, which must be above 0."""
     if not 0 < white < float("inf"):
         raise WlmError(f"--white: expected a number above 0, got {white}")
 
 
-def check_choice(option: str, value: str, choices: Sequence[str]) -> None:
-    """Checks a value that must be one of several words.
+def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *others: str) -> Callable[[int], Path]:
+    """Checks the output, a file or for frames a folder, and returns a function for the file of a frame.
 
-    Raises:
-        WlmError: It is not one of them.
+    The frames in a folder have the first suffix.
     """
-    if value not in choices:
-        raise WlmError(f"{option}: expected one of {', '.join(choices)}, got {value!r}")
-
-
-def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> Callable[[int], Path]:
-    """Checks the output, a file or for frames a folder, and returns a function for the file of a frame."""
     from wlm.smoke.data import NumberedFiles
 
     if single:
-        check_output(output, suffix)
+        check_output(output, suffix, *others)
         return lambda number: output
     _check_folder(smoke, output)
     return NumberedFiles(output, stem, suffix, SHEET).file
@@ -228,54 +171,6 @@ def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str) -> 
 def _check_folder(smoke: Path, output: Path) -> None:
     if output.resolve() == smoke.resolve():
         raise WlmError(f"{output}: expected another folder than that of the frames")
-
-
-def march_frames(
-    frames: "Frames",
-    camera: "CameraSettings",
-    output: Path,
-    stem: str,
-    make: "Callable[[int, Callable[[], Path], DensityVolume, Camera], None]",
-    settings: Mapping[str, Any],
-    *,
-    resume: bool,
-) -> None:
-    """Makes an EXR of each frame.
-
-    Args:
-        frames: The smoke.
-        camera: The camera of all frames.
-        output: A file, or for frames a folder.
-        stem: First part of the names in the folder.
-        make: Makes an EXR of a frame's number, volume and camera; it calls a function for the path when it is about to
-            write.
-        settings: JSON values that the results depend on besides smoke and camera.
-        resume: Whether to keep the frames that an interrupted run of the same settings has made.
-    """
-    from wlm.smoke.data import NumberedFiles
-
-    if frames.single:
-        if resume:
-            raise WlmError(f"--resume: expected a folder of frames, {frames.path} is one volume")
-        check_output(output, ".exr")
-        file, numbers, partial = (lambda number: output), frames.numbers, None
-    else:
-        _check_folder(frames.path, output)
-        smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
-        scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
-        views = {"scene": scene, "camera": camera.model_dump(mode="json")}
-        run = {**settings, **smoke, **views}
-        files = NumberedFiles(output, stem, ".exr", SHEET, run=run, resume=resume)
-        file, numbers, partial = files.file, [each for each in frames.numbers if each not in files.done], files.partial
-        if resume:
-            done = len(files.done)
-            note(f"{output}: {done} frames are finished" if done else f"{partial}: there is nothing to resume")
-    with running(stem, partial, "frame", whole=False) as progress:
-        for frame, volume in frames.volumes(numbers, progress):
-            note_warnings(volume.warnings)
-            make(frame, functools.partial(file, frame), volume, frames.view(camera, volume))
-    if partial is not None:
-        files.finish()
 
 
 def write_lightmaps(
@@ -288,37 +183,54 @@ def write_lightmaps(
     resume: bool,
     errors: bool = False,
 ) -> None:
-    """Makes and writes the lightmaps of each frame, shows a table, and notes lightmaps that are dark where lit.
+    """Makes and writes the lightmaps of each frame, and shows a table.
 
     Args:
-        frames, camera, output, resume: Arguments of `march_frames`.
+        frames: The smoke.
+        camera: The camera of all frames.
+        output: A file, or for frames a folder.
         make: Makes the lightmaps of a volume.
-        settings: As for `march_frames`; an "albedo" other than None is part of the lightmaps already.
+        settings: JSON values that the results depend on besides smoke and camera. An "albedo" other than None is part
+            of the lightmaps already.
+        resume: Whether to keep the frames that an interrupted run of the same settings has made.
         errors: Whether the lightmaps have the error of their step.
     """
-    from wlm.smoke.camera import axis_faults
-    from wlm.smoke.data import write_six_way
-    from wlm.smoke.flipbook.shots import with_surface
+    from wlm.smoke.data import NumberedFiles, write_six_way
+    from wlm.smoke.march.coarse import with_surface
 
+    files = None
+    if frames.single:
+        if resume:
+            raise WlmError(f"--resume: expected a folder of frames, {frames.path} is one volume")
+        check_output(output, ".exr")
+    else:
+        _check_folder(frames.path, output)
+        smoke = {"extinction": frames.extinction, "emission": frames.emission, "device": frames.device[:4]}
+        scene = dict(frames.options) if frames.scene is None else frames.scene.model_dump(mode="json")
+        run = {**settings, **smoke, "scene": scene, "camera": camera.model_dump(mode="json")}
+        files = NumberedFiles(output, "six", ".exr", SHEET, run=run, resume=resume)
+        if resume:
+            done = len(files.done)
+            note(f"{output}: {done} frames are finished" if done else f"{files.partial}: there is nothing to resume")
     columns = ["file", "covered pixels", "mean light", *(["largest error", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
-
-    def write(frame: int, file: Callable[[], Path], volume: "DensityVolume", view: "Camera") -> None:
-        looks = frames.looks(frame)
-        if looks is not None and settings.get("albedo") is not None:
-            looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
-        six = with_surface(make(volume, view), volume, looks)
-        path = file()
-        write_six_way(path, six, looks)
-        covered = six.transparency < 0.99
-        for fault in axis_faults(six.lightmaps.cpu().numpy()) if covered.any() else ():
-            note(f"{path}: note: {fault}")
-        rows.add_row(
-            escape(path.name),
-            f"{float(covered.float().mean()):.1%}",
-            number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
-            *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()),
-        )
-
-    march_frames(frames, camera, output, "six", write, settings, resume=resume)
+    numbers = [each for each in frames.numbers if files is None or each not in files.done]
+    with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
+        for frame, volume in frames.volumes(numbers, progress):
+            note_warnings(volume.warnings)
+            looks = frames.looks(frame)
+            if looks is not None and settings.get("albedo") is not None:
+                looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
+            six = with_surface(make(volume, frames.view(camera, volume)), volume, looks)
+            path = output if files is None else files.file(frame)
+            write_six_way(path, six, looks)
+            covered = six.transparency < 0.99
+            rows.add_row(
+                escape(path.name),
+                f"{float(covered.float().mean()):.1%}",
+                number(float(six.lightmaps[:, covered].mean()) if covered.any() else None, ".4g"),
+                *((f"{six.error.largest:.2g}", f"{six.error.rms:.2g}") if errors else ()),
+            )
+    if files is not None:
+        files.finish()
     show(rows)

@@ -43,7 +43,8 @@ def view(
     ] = None,
     tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",
     walk: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Viewpoints of the volume, as for wlm probe volume --path.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Viewpoints of the volume: a JSON list of x, y, z, or `position` of a .npz."),
     ] = None,
     up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames per second of an animation or of frames.")] = 24.0,
@@ -68,11 +69,11 @@ def view(
     elif frames is not None:
         raise WlmError("--frames: has no meaning without --movie")
     quiet_warp()
+    from wlm.formats.hdr_blocks import need
     from wlm.view.opening import open_scene
-    from wlm.view.rendering import import_pyvista
     from wlm.view.window import Window
 
-    import_pyvista("view")
+    need("pyvista", "view")
     options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "flat": flat, "up": up}
     options |= {name: values.pop(name) for name in _SETTINGS if name in values}
     with running("view") as progress:

@@ -115,15 +115,17 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
     return np.frombuffer(data, np.uint8).reshape(height // 4, width // 4, BLOCK_BYTES).copy()
 
 
+# The mode of a block by its first byte: the number of its lowest bit that is set.
+_MODE_OF = np.array([RESERVED, *((byte & -byte).bit_length() - 1 for byte in range(1, 256))], np.uint8)
+
+
 def block_modes(blocks: np.ndarray) -> np.ndarray:
     """Returns the mode of each block, uint8 [...]; `RESERVED` for the reserved encoding.
 
     Args:
         blocks: uint8 [..., 16].
     """
-    first = blocks[..., 0].astype(np.int32)
-    lowest = first & -first
-    return np.where(first > 0, np.log2(np.maximum(lowest, 1)), RESERVED).astype(np.uint8)
+    return _MODE_OF[blocks[..., 0]]
 
 
 def decode_blocks(blocks: np.ndarray) -> np.ndarray:

@@ -21,11 +21,11 @@ from PIL.PngImagePlugin import PngImageFile
 
 from wlm.errors import WlmError
 from wlm.formats.exr import MAGIC as EXR_MAGIC
-from wlm.formats.exr import read_part
+from wlm.formats.exr import float_planes, read_part
 from wlm.formats.light import read_light
 from wlm.formats.limits import IMAGE_BYTES, PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.mask import DAMAGED_PICTURE
-from wlm.formats.reading import open_file, read_file
+from wlm.formats.reading import damaged, open_file, read_file
 
 _PNG_MAGIC = b"\x89PNG"
 _FIRST = ("R", "G", "B", "A")  # in this order; other channels follow, sorted by name
@@ -59,31 +59,21 @@ def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
 def _read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     channels = read_part(path).channels
     names = tuple(sorted(channels, key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)))
-    planes = [channels[name].pixels for name in names]
-    for name, plane in zip(names, planes, strict=True):
-        if plane is None or plane.dtype not in (np.float16, np.float32):
-            content = "no pixels" if plane is None else plane.dtype
-            raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if plane.shape != planes[0].shape:
-            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {plane.shape}")
-    if not planes:
+    if not names:
         raise WlmError(f"{path}: expected channels, found none")
-    return np.stack(planes, axis=-1).astype(np.float32, copy=False), names
+    return np.stack(float_planes(path, channels, names), axis=-1), names
 
 
 def _read_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     data = read_file(path, IMAGE_BYTES, "the PNG")
-    try:
-        # `Image.open` would try the readers of other formats, too.
-        with PngImageFile(io.BytesIO(data)) as image:
-            check_sides(str(path), image.width, image.height)
-            size = image.width * image.height * len(image.getbands())
-            check_growth(str(path), len(data), size, PICTURE_GROWTH, PICTURE_BYTES)
-            if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
-                raise WlmError(f"{path}: expected a PNG of grey or RGB, with alpha or without, found {image.mode}")
-            pixels, names = np.asarray(image), image.getbands()
-    except DAMAGED_PICTURE as error:
-        raise WlmError(f"{path}: cannot read the PNG: {str(error) or type(error).__name__}") from error
+    # `Image.open` would try the readers of other formats, too.
+    with damaged(f"{path}: cannot read the PNG", *DAMAGED_PICTURE), PngImageFile(io.BytesIO(data)) as image:
+        check_sides(str(path), image.width, image.height)
+        size = image.width * image.height * len(image.getbands())
+        check_growth(str(path), len(data), size, PICTURE_GROWTH, PICTURE_BYTES)
+        if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
+            raise WlmError(f"{path}: expected a PNG of grey or RGB, with alpha or without, found {image.mode}")
+        pixels, names = np.asarray(image), image.getbands()
     levels = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
     return levels.reshape(*pixels.shape[:2], -1), ("L",) if len(names) == 1 else tuple(names)
 

@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats import float_texels as texels
 from wlm.formats.atomic import atomic_write
 from wlm.formats.float_texels import Layout, check_picture, decode_texels
-from wlm.formats.reading import open_file, read_file
+from wlm.formats.reading import open_file
 
 DXGI_FORMATS = {
     "R32G32B32A32_FLOAT": 2,
@@ -76,8 +76,6 @@ _DIMENSION_2D, _DIMENSION_3D = 3, 4
 # Size, flags, height, width; pixel format: size, flags, code; caps 2. Then the DX10 header.
 _READ_HEADER = struct.Struct("<4s 4I 56x 2I 4s 24x I 12x")
 _DX10 = struct.Struct("<5I")  # format, dimension, flags, array size, alpha mode
-_DEPTH_FIELD, _DEPTH_AT = struct.Struct("<I"), 24
-_MOST_VOLUME_BYTES = 1 << 26
 _CAPS2_CUBE = 0x200
 _FLAG_CUBE = 0x4
 
@@ -217,39 +215,6 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     if len(data) != expected:
         raise WlmError(f"{path}: expected {expected} bytes of texels, found another number: does it change?")
     return decode_texels(path, layout, data, width, height), layout.names
-
-
-def read_word_volume(path: str | os.PathLike[str], fmt: str, size: tuple[int, int, int]) -> np.ndarray:
-    """Reads a volume texture with four bytes per texel.
-
-    Args:
-        path: The file.
-        fmt: A key of `wlm.formats.dds.DXGI_FORMATS`.
-        size: Width, height and depth.
-
-    Returns:
-        uint32 [depth, height, width], little-endian, the first channel in the lowest bits.
-
-    Raises:
-        WlmError: The file cannot be read, is another kind of texture, has another size or is cut short.
-    """
-    width, height, depth = size
-    head = _READ_HEADER.size + _DX10.size
-    data = read_file(path, _MOST_VOLUME_BYTES, "the texture")
-    if len(data) < head or not data.startswith(MAGIC):
-        raise WlmError(f"{path}: expected a DDS file of {width} x {height} x {depth} texels, found other content")
-    _, _, _, rows, columns, _, _, code, caps2 = _READ_HEADER.unpack_from(data)
-    number, dimension, *_ = _DX10.unpack_from(data, _READ_HEADER.size)
-    expected = (b"DX10", DXGI_FORMATS[fmt], _DIMENSION_3D)
-    if (code, number, dimension) != expected or not caps2 & _CAPS2_VOLUME:
-        raise WlmError(f"{path}: expected a volume texture of {fmt}, found another kind")
-    found = (columns, rows, *_DEPTH_FIELD.unpack_from(data, _DEPTH_AT))
-    if found != size or len(data) != head + 4 * width * height * depth:
-        raise WlmError(
-            f"{path}: expected {width} x {height} x {depth} texels, found {' x '.join(map(str, found))} "
-            f"in {len(data) - head} bytes"
-        )
-    return np.frombuffer(data, "<u4", offset=head).reshape(depth, height, width)
 
 
 def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:

@@ -4,9 +4,7 @@ import contextlib
 import io
 import json
 import os
-import tempfile
-import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +15,12 @@ from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
 from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.reading import open_file
+from wlm.formats.stderr import captured_stderr
 
 MAGIC = b"\x76\x2f\x31\x01"
 """The first bytes of an EXR file."""
 
 _SAMPLE_BYTES = 2  # of a half float: the library's header does not distinguish half and float
-_STDERR = 2
-_STDERR_LOCK = threading.Lock()
 
 HALF_MAX = 65504.0
 """The largest finite half float."""
@@ -53,14 +50,25 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     if any(name not in channels for name in _COLOUR):
         raise WlmError(f"{path}: expected channels R,G,B or R,G,B,A, found {','.join(channels) or 'none'}")
     names = (*_COLOUR, _ALPHA) if _ALPHA in channels else _COLOUR
-    planes = [channels[name].pixels for name in names]
-    for name, plane in zip(names, planes, strict=True):
-        if plane is None or plane.dtype not in (np.float16, np.float32):
-            content = "no pixels" if plane is None else plane.dtype
+    return np.stack(float_planes(path, channels, names), axis=-1), names
+
+
+def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
+    """Returns the pixels of some channels of a part, float32 [H, W] each.
+
+    Raises:
+        WlmError: A channel is neither half nor float, or has another shape than the first.
+    """
+    planes: list[np.ndarray] = []
+    for name in names:
+        pixels = channels[name].pixels
+        if pixels is None or pixels.dtype not in (np.float16, np.float32):
+            content = "no pixels" if pixels is None else pixels.dtype
             raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if plane.shape != planes[0].shape:
-            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {plane.shape}")
-    return np.stack(planes, axis=-1).astype(np.float32, copy=False), names
+        if planes and pixels.shape != planes[0].shape:
+            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {pixels.shape}")
+        planes.append(pixels.astype(np.float32, copy=False))
+    return planes
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
@@ -130,15 +138,7 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
             neither half nor float.
     """
     part = read_part(path)
-    planes = {}
-    for name, channel in part.channels.items():
-        pixels = channel.pixels
-        if pixels is None or pixels.dtype not in (np.float16, np.float32):
-            content = "no pixels" if pixels is None else pixels.dtype
-            raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if planes and pixels.shape != next(iter(planes.values())).shape:
-            raise WlmError(f"{path}: channel {name}: expected the shape of the other channels, found {pixels.shape}")
-        planes[name] = pixels.astype(np.float32)
+    planes = dict(zip(part.channels, float_planes(path, part.channels, part.channels), strict=True))
     try:
         note = json.loads(part.header.get(_NOTE, "{}"))
     except (ValueError, TypeError, RecursionError):
@@ -265,28 +265,14 @@ class _Chatter:
 
 @contextlib.contextmanager
 def _captured_chatter() -> Iterator[_Chatter]:
-    """Captures the messages of OpenEXR: of its C library on the process's stderr, of its Python module on sys.stdout.
-
-    Other lines, for example from other threads, are passed on afterwards.
-    """
-    chatter = _Chatter()
-    printed = io.StringIO()
-    with _STDERR_LOCK, tempfile.TemporaryFile() as sink:
-        saved = os.dup(_STDERR)
-        os.dup2(sink.fileno(), _STDERR)
-        try:
-            with contextlib.redirect_stdout(printed):
-                yield chatter
-        finally:
-            os.dup2(saved, _STDERR)
-            sink.seek(0)
-            lines = sink.read().splitlines(keepends=True)
-            ours = [line for line in lines if b"(EXR_ERR_" in line]
-            for line in lines:
-                if line not in ours:
-                    os.write(saved, line)
-            os.close(saved)
-            # The reason follows the error code; our own message names the file.
-            reasons = [line.decode(errors="replace").partition(") ")[2] for line in ours]
-            messages = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
-            chatter.text = one_line(messages, 200)
+    """Captures messages: those of OpenEXR's C library on the process's stderr, of its Python module on sys.stdout."""
+    chatter, printed = _Chatter(), io.StringIO()
+    lines: list[bytes] = []
+    try:
+        with captured_stderr(lambda line: b"(EXR_ERR_" in line) as lines, contextlib.redirect_stdout(printed):
+            yield chatter
+    finally:
+        # The reason follows the error code; our own message names the file.
+        reasons = [line.decode(errors="replace").partition(") ")[2] for line in lines]
+        messages = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
+        chatter.text = one_line(messages, 200)

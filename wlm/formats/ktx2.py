@@ -18,7 +18,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.deflate import inflate
 from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
-from wlm.formats.reading import open_file, read_file
+from wlm.formats.reading import open_file
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
@@ -41,9 +41,6 @@ _LEVEL = struct.Struct("<3Q")  # a level's offset, length and length without sup
 _BLOCK_BYTES = 16
 _MAX_SIDE = 16384  # texels; the limit of desktop GPUs
 _MAX_DEPTH = 2048  # slices, likewise
-_MOST_TEXELS = 2**22  # texels of a volume that is read: 600,000 probes
-_MOST_PAIRS = 4096  # bytes of the descriptor and the key/value data
-
 _CHANNELS = {
     "R16G16_UNORM": 2,
     "R16G16_UINT": 2,
@@ -147,33 +144,6 @@ def write_ktx2(
         *(0, 0),
     )
     return atomic_write(path, [header, *index, descriptor, pairs, *pieces])
-
-
-def read_half_volume(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads a 3D texture of RGBA half floats that `write_ktx2` wrote.
-
-    Args:
-        path: The file.
-
-    Returns:
-        float16 [D, H, W, 4].
-
-    Raises:
-        WlmError: The file cannot be read, is another kind of texture, or is cut short.
-    """
-    head = _HEADER.size + _LEVEL.size
-    largest = head + _MOST_TEXELS * 8 + _MOST_PAIRS
-    data = read_file(path, largest, "the texture")
-    if len(data) < head or data[: len(MAGIC)] != MAGIC:
-        raise WlmError(f"{path}: expected a KTX2 texture")
-    fields = _HEADER.unpack_from(data)
-    fmt, _, width, height, depth, layers, faces, levels, packing = fields[1:10]
-    start, length, _ = _LEVEL.unpack_from(data, _HEADER.size)
-    if (fmt, layers, faces, levels, packing) != (VK_FORMATS["R16G16B16A16_SFLOAT"], 0, 1, 1, 0) or not depth:
-        raise WlmError(f"{path}: expected one 3D texture of half floats in RGBA, not packed, found format {fmt}")
-    if length != 8 * width * height * depth or start + length > len(data):
-        raise WlmError(f"{path}: expected {width} x {height} x {depth} texels, found {length} bytes of them")
-    return np.frombuffer(data, "<f2", 4 * width * height * depth, start).reshape(depth, height, width, 4)
 
 
 def _texel_bytes(fmt: str) -> int:

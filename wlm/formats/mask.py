@@ -13,7 +13,7 @@ from PIL.PngImagePlugin import PngImageFile
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.limits import IMAGE_BYTES
-from wlm.formats.reading import read_file
+from wlm.formats.reading import damaged, read_file
 
 DAMAGED_PICTURE = (
     OSError,
@@ -46,18 +46,17 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
         WlmError: The mask is missing, damaged or of another size.
     """
     data = read_file(path, IMAGE_BYTES, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})")
-    try:
-        # `Image.open` would try the readers of other formats and refuse masks of 16384 x 16384. From a file on disk,
-        # Pillow would allocate the claimed size of a chunk.
-        with PngImageFile(io.BytesIO(data)) as image:
-            # The size in the header is checked before anything is decoded.
-            if (image.height, image.width) != size:
-                raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
-            # The index of a palette has no meaning here, and alpha is not coverage.
-            colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
-    except DAMAGED_PICTURE as error:
-        problem = str(error) or type(error).__name__
-        raise WlmError(f"{path}: cannot read the mask: expected a PNG: {problem}") from error
+    # `Image.open` would try the readers of other formats and refuse masks of 16384 x 16384. From a file on disk, Pillow
+    # would allocate the claimed size of a chunk.
+    with (
+        damaged(f"{path}: cannot read the mask: expected a PNG", *DAMAGED_PICTURE),
+        PngImageFile(io.BytesIO(data)) as image,
+    ):
+        # The size in the header is checked before anything is decoded.
+        if (image.height, image.width) != size:
+            raise WlmError(f"{path}: the mask is {image.width}x{image.height}, but {beside} is {size[1]}x{size[0]}")
+        # The index of a palette has no meaning here, and alpha is not coverage.
+        colour = np.asarray(image.convert("RGB") if image.mode in ("P", "PA", "RGBA", "LA") else image)
     return colour > 0 if colour.ndim == 2 else (colour > 0).any(axis=2)
 
 

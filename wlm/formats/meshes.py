@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.errors import WlmError, one_line
+from wlm.errors import WlmError
 from wlm.formats.limits import MODEL_BYTES
-from wlm.formats.reading import read_file
+from wlm.formats.reading import damaged, read_file
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
 """File name extensions that are read here."""
@@ -53,16 +53,13 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
     if suffix not in SUFFIXES:
         raise WlmError(f"{path}: expected a mesh ({', '.join(SUFFIXES)}), found {suffix or 'a name without an ending'}")
     data = read_file(path, MODEL_BYTES, f"the {suffix[1:].upper()} file")
-    try:
+    # trimesh's readers raise any NumPy error on damaged text.
+    with damaged(f"{path}: malformed {suffix[1:].upper()}", Exception):
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
             meshes = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh)]
         parts = [_checked(each) for each in meshes]
-    except Exception as error:  # trimesh's readers raise any NumPy error on damaged text
-        raise WlmError(
-            f"{path}: malformed {suffix[1:].upper()}: {one_line(error, 90) or type(error).__name__}"
-        ) from error
     if not parts:
         return MeshArrays(np.empty((0, 3)), None, np.empty((0, 3), np.int32))
     first = np.cumsum([0, *(len(position) for position, _, _ in parts)])

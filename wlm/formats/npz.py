@@ -14,7 +14,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.limits import SURE_BYTES, VOLUME_BYTES, check_growth
-from wlm.formats.reading import open_file
+from wlm.formats.reading import damaged, open_file
 from wlm.formats.scratch import room
 
 _SUFFIX = ".npy"
@@ -42,25 +42,20 @@ def read_npz(
     Raises:
         WlmError: The file is missing, damaged or not a `.npz` file, or an array exceeds the limits.
     """
-    try:
-        with open_file(path, "the arrays") as file:
-            if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
-                raise WlmError(f"{path}: cannot read the arrays: expected at most {VOLUME_BYTES} bytes")
-            if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
-                raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
-            with zipfile.ZipFile(file) as archive:
-                members = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist()}
-                arrays = {}
-                for name in choose(list(members)):
-                    if name not in members:
-                        raise WlmError(f"{path}: {name} is missing; found {', '.join(members) or 'nothing'}")
-                    arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, sure)
-                return arrays
-    except WlmError:
-        raise
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
-    except Exception as error:
-        raise WlmError(f"{path}: cannot read the arrays: {str(error) or type(error).__name__}") from error
+    with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:
+        if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
+            raise WlmError(f"{path}: cannot read the arrays: expected at most {VOLUME_BYTES} bytes")
+        if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+            raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist()}
+            arrays = {}
+            for name in choose(list(members)):
+                if name not in members:
+                    raise WlmError(f"{path}: {name} is missing; found {', '.join(members) or 'nothing'}")
+                arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, sure)
+            return arrays
 
 
 def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, sure: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.limits import INDEX_BYTES
 
 # Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
@@ -91,10 +91,23 @@ def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_B
         WlmError: See `read_file`; or the content is not JSON.
     """
     data = read_file(path, limit, what)
-    try:
+    with damaged(f"{path}: not valid JSON", ValueError, RecursionError, MemoryError):
         return json.loads(data)
-    except (ValueError, RecursionError, MemoryError) as error:
-        raise WlmError(f"{path}: not valid JSON: {error or 'too large for the memory'}") from error
+
+
+@contextmanager
+def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turns exceptions that damaged data causes in the block into a one-line error of a message and the reason.
+
+    Raises:
+        WlmError: One of the exceptions was raised, or a WlmError, which stays as it is.
+    """
+    try:
+        yield
+    except WlmError:
+        raise
+    except errors as error:
+        raise WlmError(f"{message}: {one_line(error, 120) or type(error).__name__}") from error
 
 
 def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool = False) -> Path:

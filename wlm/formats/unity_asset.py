@@ -9,17 +9,16 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError, one_line
+from wlm.errors import WlmError
 from wlm.formats import unity_child
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import PROBES
-from wlm.formats.reading import read_file
+from wlm.formats.reading import damaged, read_file
 
 _EXTRA = "unity"
 _BYTES = 1 << 28
@@ -94,40 +93,32 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     if data.startswith((_TEXT, _BUNDLE)):
         found = "YAML" if data.startswith(_TEXT) else "an asset bundle"
         raise WlmError(f"{path}: expected a binary asset of Unity's editor, found {found}")
-    objects = _damaged(path, lambda: list_objects(path, data))
-    if not any(kind in _WANTED for kind, _, _, _ in objects):
-        raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
     positions, values = [np.empty((0, 3))], [np.empty((0, _COEFFICIENTS, _CHANNELS))]
     rectangles: list[Rectangle] = []
-    for kind, tree, content, order in objects:
-        if kind not in _WANTED:
-            continue
-        arrays = _damaged(path, lambda: _Walk(content, order, _WANTED[kind]).arrays(tree))  # noqa: B023  (called now)
-        if kind == "LightProbes":
-            place = _damaged(path, lambda: _columns(arrays[_POSITIONS], ["x", "y", "z"]))  # noqa: B023
-            light = _damaged(path, lambda: _columns(arrays[_LIGHT], _NAMES))  # noqa: B023
+    with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", *_DAMAGE):
+        objects = list_objects(path, data)
+        if not any(kind in _WANTED for kind, _, _, _ in objects):
+            raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
+        for kind, tree, content, order in objects:
+            if kind not in _WANTED:
+                continue
+            arrays = _Walk(content, order, _WANTED[kind]).arrays(tree)
+            if kind != "LightProbes":
+                rectangles += _rectangles(arrays[_RENDERERS])
+                continue
+            place, light = _columns(arrays[_POSITIONS], ["x", "y", "z"]), _columns(arrays[_LIGHT], _NAMES)
             if len(place) != len(light):
                 raise WlmError(f"{path}: expected light for each of {len(place)} probes, found that of {len(light)}")
             positions.append(place)
             values.append(light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1))
-        else:
-            rectangles += _damaged(path, lambda: _rectangles(arrays[_RENDERERS]))  # noqa: B023
     position = np.concatenate(positions)
     if len(position) > PROBES:
         raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
     return LightingData(position, np.concatenate(values), tuple(rectangles))
 
 
+_DAMAGE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error)
 _NAMES = [f"sh[{i:2d}]" for i in range(_COEFFICIENTS * _CHANNELS)]
-
-
-def _damaged(path: str | os.PathLike[str], read: Callable[[], Any]) -> Any:
-    """Calls a function and turns the exceptions of damaged data into one-line errors."""
-    try:
-        return read()
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error) as error:
-        reason = one_line(f"{type(error).__name__}: {error}", 120)
-        raise WlmError(f"{path}: the asset is damaged, or UnityPy cannot read its version: {reason}") from error
 
 
 def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, Any, bytes, str]]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.blosc import unpack as unpack_blosc
+from wlm.formats.reading import damaged
 
 _MAGIC, _OLDEST, _NEWEST = 0x56444220, 222, 224
 _HALF = "_HalfFloat"
@@ -28,6 +29,7 @@ _MASK_BYTES = _LEAF**3 // 8
 _FARTHEST = 1 << 30  # bound of coordinates, which prevents overflow
 _LONGEST_TEXT = 1 << 16
 _MOST_GRIDS = 4096
+_DAMAGE = (ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,7 @@ class VdbFile:
             WlmError: The content is no OpenVDB file, is too old or too new, or is damaged.
         """
         self._where, self._data = where, data
-        with _reading(where):
+        with damaged(f"{where}: cannot read the OpenVDB file", *_DAMAGE):
             entries = list(self._list())
         self._entries = {entry.name: entry for entry in reversed(entries)}
         self.names = tuple(dict.fromkeys(entry.name for entry in entries if entry.type in _FLOATS))
@@ -93,7 +95,7 @@ class VdbFile:
             WlmError: The grid is damaged, is a frustum, or has a bounding box that is too large.
         """
         entry, where = self._entries[name], f"{self._where}: {name}"
-        with _reading(where):
+        with damaged(f"{where}: cannot read the OpenVDB file", *_DAMAGE):
             matrix, cursor, flags = self._head(entry, where)
             if entry.parent:
                 if entry.parent not in self._entries or self._entries[entry.parent].parent:
@@ -174,20 +176,6 @@ class _Cursor:
         """Reads a mask, bool [count]."""
         packed = np.frombuffer(self.take(count // 8), np.uint8)
         return np.unpackbits(packed, bitorder="little").view(bool)
-
-
-class _reading:
-    """Turns the exceptions of damaged bytes into one-line errors."""
-
-    def __init__(self, where: str) -> None:
-        self._where = where
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)):
-            raise WlmError(f"{self._where}: cannot read the OpenVDB file: {error or kind.__name__}") from error
 
 
 class _Tree:

@@ -9,7 +9,7 @@ from wlm.inspection.files import kind_of
 from wlm.smoke.data import SCENE_FILE, is_six_way, six_way_files
 from wlm.system import system_of
 
-_PROBES = ("probes", "godot bake", "probe export", "unity asset")
+_PROBES = ("probes", "godot bake", "unity asset")
 
 
 def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]]:
@@ -41,7 +41,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
         if (path / SCENE_FILE).is_file():
             return "volume", paths
         frames = six_way_files(path)
-        return ("six-way", frames) if frames else ("set", paths)
+        return ("six-way", list(frames.values())) if frames else ("set", paths)
     kind = kind_of(path)
     if kind == "model":
         return system_of(path), paths

@@ -32,14 +32,11 @@ BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
 FRAMES = "frames of smoke that wlm smoke simulate wrote"
 """Description of a folder of smoke."""
 
-# Exports that can be read back.
-_PROBE_EXPORTS = {
+# `format` of our JSON documents and the description of the folders that they are in.
+_EXPORTS = {
     "wlm-light-probe-grid": "a grid of light for three.js",
     "wlm-unity-probes": "light probes for Unity",
     "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
-}
-# `format` of our JSON documents and the description of the folders that they are in.
-_EXPORTS = _PROBE_EXPORTS | {
     "wlm-bake": BAKED,
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-probe-export": "light probes: buffers and a shader",
@@ -230,15 +227,10 @@ def _kind_of_json(path: Path) -> str:
         return "json"
     form = str(content.get("format"))
     if form in _EXPORTS:
-        return "probe export" if form in _PROBE_EXPORTS else "export"
+        return "export"
     if "lightmaps" in content:
         return "set"
     return "probes" if "probes" in content or "position" in content else "json"
-
-
-def _probe_export(path: Path) -> Finding:
-    found = _probes(path)
-    return replace(found, what=f"{document_of(path)}: {found.what}")
 
 
 def _unity_asset(path: Path) -> Finding:
@@ -266,7 +258,6 @@ _KINDS = {
     "mesh": _Kind(_mesh, "atlas"),
     "model": _Kind(_model),
     "picture": _Kind(inspect_picture),
-    "probe export": _Kind(_probe_export, "probe"),
     "probes": _Kind(_probes, "probe"),
     "set": _Kind(inspect_set, "lightmap"),
     "unity asset": _Kind(_unity_asset, "probe"),

@@ -19,7 +19,6 @@ from wlm.inspection.finding import Finding, command
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _FIRST = 80  # bytes that include the size, except in EXR and Radiance files
 _FACES = 6  # faces of a cube
-_GUIDE = {"light", "transparency", "depth"}
 # Share of values at 1, median radiance, and mean distance from 8-bit levels that suggest other data than radiance.
 _AT_ONE, _BRIGHT, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 255.0, 0.08
 _MANY = 1000  # fewest texels for the test of levels
@@ -100,8 +99,6 @@ def inspect_picture(path: Path) -> Finding:
     if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
         return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))
-    if set(picture.channels) >= _GUIDE:
-        return Finding(path, f"a guiding map of smoke, {picture.size}; wlm smoke predict makes its own from a volume")
     if picture.is_cube:
         return Finding(path, f"six faces of a cube, {picture.size}: a reflection probe, which no command reads")
     if "_comp_dir" in name or "_comp_shadowmask" in name:

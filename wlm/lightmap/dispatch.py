@@ -5,14 +5,13 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
-from wlm.lightmap.targets import TileJob
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
 from wlm.metrics.tiled import nanmean
@@ -37,24 +36,14 @@ class Batch:
         kind: STATIC or DYNAMIC.
         rows: int [n], positions of the tiles among the tiles of the sheet's fit.
         first: Number of tiles of that kind in earlier batches of the sheet.
-        fit: The fit of the sheet.
+        fit: The `wlm.lightmap.fit.SheetFit` of the sheet.
     """
 
     number: int
     kind: TileKind
     rows: np.ndarray
     first: int
-    fit: "BatchOwner"
-
-
-class BatchOwner(Protocol):
-    """The fit of a sheet, as batches use it; see `wlm.lightmap.fit.SheetFit`."""
-
-    def job(self, batch: Batch) -> TileJob: ...
-
-    def store(self, batch: Batch, parts: Parts) -> None: ...
-
-    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool: ...
+    fit: Any
 
 
 @dataclass(eq=False)

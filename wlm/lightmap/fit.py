@@ -176,7 +176,6 @@ class SheetFit:
     Tiles are cut out of the sheet as they are needed, a few at a time: all tiles of a large set do not fit in memory.
 
     Attributes:
-        profile: The settings, with sizes for the number of times.
         index: int [N], numbers of the tiles in their grid, rising.
         kinds: int [N], `TileKind` of each.
         model: Complete except for the maps and networks of batches that have not been stored.
@@ -202,20 +201,21 @@ class SheetFit:
             WlmError: A number is outside the grid or given twice, there is none, or the encoder of frames is missing.
         """
         # Frames are chosen by the sizes that the profile names, so that two states stay frames.
-        named, self.profile, self._lightmaps = profile, profile.for_times(len(lightmaps.times)), lightmaps
+        fitted, self._lightmaps = profile.for_times(len(lightmaps.times)), lightmaps
         grid, times = TileGrid.of(*lightmaps.mask.shape), len(lightmaps.times)
         self.index = np.arange(grid.count) if tiles is None else np.array(sorted(tiles), np.int64)
         check_index(self.index, grid)
-        facts = self._classify(progress)
+        meter = Meter(progress, "tiles", len(self.index))
+        facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak, profile.static_budget_db)
         self.kinds = np.array([tile.kind for tile in facts])
-        framed = choose_frames(self.kinds, self.index, lightmaps.mask, times, named)
+        framed = choose_frames(self.kinds, self.index, lightmaps.mask, times, profile)
         self.warning = None
-        if named.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
+        if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             self.warning, framed[:] = f"{lightmaps.name}: {warning}", False
         self.kinds[framed] = TileKind.FRAMES
         kind = np.zeros(grid.count, np.uint8)
         kind[self.index] = self.kinds
-        table = part_table(self.profile, kind, times)
+        table = part_table(fitted, kind, times)
         arrays = {name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"}
         self.model = SheetModel(
             name=lightmaps.name,
@@ -223,7 +223,7 @@ class SheetFit:
             height=grid.height,
             times=lightmaps.times,
             period=lightmaps.period,
-            profile=self.profile,
+            profile=fitted,
             mask=lightmaps.mask,
             kind=kind,
             constant=_constants(facts, times),
@@ -236,8 +236,15 @@ class SheetFit:
                 getattr(self.model, name)[:] = stored
         for i, row in enumerate(self._mapped):
             self.model.peak[i], self.model.affine[i] = facts[row].peak, facts[row].affine
-        self._scale = self.model.scales
-        self._store_frames(progress)
+        # The axis and the scales of a sheet do not change during a fit.
+        self._axis, self._scale = self.model.axis, self.model.scales
+        framed_rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
+        meter = Meter(progress, "frames", len(framed_rows))
+        for i, number in enumerate(self.index[framed_rows].tolist()):
+            tile, needed = split(lightmaps, profile.gamma, [number]), needed_blocks(lightmaps.mask, number)
+            self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0], needed)
+            if meter.due(i + 1):
+                meter.report(i + 1)
 
     def batches(self, first: int, most: int | None = None) -> list[Batch]:
         """Returns batches of `BATCH_TEXELS`, of at most `most` tiles and at least one; dynamic tiles come first.
@@ -264,14 +271,14 @@ class SheetFit:
             batch.kind == TileKind.DYNAMIC,
             self._scale[slots],
             self.model.affine[slots].astype(np.float32),
-            self.profile,
-            self.model.axis,
+            self.model.profile,
+            self._axis,
         )
 
     def table(self, batch: Batch) -> dict[str, Part]:
         """Returns the types and shapes of the parts of a finished batch, as the trainer returns them."""
         kind = np.full(len(batch.rows), batch.kind, np.uint8)
-        table = part_table(self.profile, kind, len(self.model.times))
+        table = part_table(self.model.profile, kind, len(self.model.times))
         if batch.kind == TileKind.STATIC:
             return {"net": table["net_static"], "uv": table["uv"]}
         return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
@@ -279,10 +286,11 @@ class SheetFit:
     def store(self, batch: Batch, parts: Parts) -> None:
         """Puts the maps and networks of a finished batch into the model."""
         dynamic = batch.kind == TileKind.DYNAMIC
-        maps = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",)
+        maps, settings = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",), self.model.profile
+        sizes = settings.uvt_resolution, settings.uvt_slices, settings.plane_columns, settings.plane_rows
         for i, row in enumerate(batch.rows):
             used = valid_texels(self.model.mask, int(self.index[row]))
-            reads = Reads.of(used, self.profile, self.model.axis) if dynamic else None
+            reads = Reads.of(used, self._axis, *sizes) if dynamic else None
             cleared = clear_unread({name: parts[name][i] for name in maps}, used, reads)
             self.model.uv[np.searchsorted(self._mapped, row)] = cleared.pop("uv")
             for name, values in cleared.items():
@@ -300,26 +308,21 @@ class SheetFit:
         if parts is None:
             return False
         try:
-            check_packable(parts, self.profile, batch.kind == TileKind.DYNAMIC)
+            check_packable(parts, self.model.profile, batch.kind == TileKind.DYNAMIC)
         except WlmError as error:
             raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
         self.store(batch, parts)
         return True
 
-    def _classify(self, progress: OnProgress | None) -> list[_Facts]:
-        facts: list[_Facts] = []
-        meter = Meter(progress, "tiles", len(self.index))
-        for fact in each(self._look, self.index.tolist()):
-            facts.append(fact)
-            if len(facts) % _LOOK == 0 and meter.due(len(facts)):
-                meter.report(len(facts))
-        return facts
 
-    def _look(self, number: int) -> _Facts:
-        """Classifies a tile and computes its scale, shift and spread (section 4)."""
-        gamma, peak = self.profile.gamma, self.profile.peak
-        tile = split(self._lightmaps, gamma, [number])
-        kind = TileKind(int(classify(tile, gamma, self.profile.static_budget_db, peak)[0]))
+def _classify(
+    lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None, budget_db: float
+) -> list[_Facts]:
+    """Classifies tiles and computes the scale, shift and spread of each (section 4); settings as in `Profile`."""
+
+    def look(number: int) -> _Facts:
+        tile = split(lightmaps, gamma, [number])
+        kind = TileKind(int(classify(tile, gamma, budget_db, peak)[0]))
         if kind == TileKind.EMPTY:
             return _Facts(kind)
         colour = tile.colour[0][:, tile.mask[0]]  # [T, K, 3], the valid texels
@@ -346,16 +349,12 @@ class SheetFit:
         largest = encode_scale(colour.max((1, 2)).astype(np.float64), gamma, up=True)
         return _Facts(kind, scale=stored, peak=largest, affine=affine)
 
-    def _store_frames(self, progress: OnProgress | None) -> None:
-        """Encodes the tiles that are stored as frames, and puts them into the model."""
-        rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
-        meter = Meter(progress, "frames", len(rows))
-        for i, row in enumerate(rows):
-            number = int(self.index[row])
-            tile, needed = split(self._lightmaps, self.profile.gamma, [number]), needed_blocks(self.model.mask, number)
-            self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0], needed)
-            if meter.due(i + 1):
-                meter.report(i + 1)
+    facts: list[_Facts] = []
+    for fact in each(look, numbers.tolist()):
+        facts.append(fact)
+        if len(facts) % _LOOK == 0 and meter.due(len(facts)):
+            meter.report(len(facts))
+    return facts
 
 
 def _constants(facts: Sequence[_Facts], times: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.texels import MOST_TEXELS
+from wlm.formats.limits import PICTURE_TEXELS
 
 VALUE_RANGES = {"radiance": (0.0, 1.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """The values that levels 0 and 1 stand for, by encoding. The levels of radiance are the values and have no upper
@@ -152,5 +152,5 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
             raise WlmError(f"{where}: atlas {atlas}: expected each channel of a layer once")
         if len(names) > MOST_CHANNELS:
             raise WlmError(f"{where}: atlas {atlas}: expected at most {MOST_CHANNELS} channels, found {len(names)}")
-    if (texels := sum(height * width for height, width in sizes.values())) > MOST_TEXELS:
-        raise WlmError(f"{where}: expected at most {MOST_TEXELS} texels of all sheets, found {texels}")
+    if (texels := sum(height * width for height, width in sizes.values())) > PICTURE_TEXELS:
+        raise WlmError(f"{where}: expected at most {PICTURE_TEXELS} texels of all sheets, found {texels}")

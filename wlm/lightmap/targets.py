@@ -30,7 +30,10 @@ class Targets:
         mask: np.ndarray,
         scale: np.ndarray,
         affine: np.ndarray,
-        profile: Profile,
+        *,
+        gamma: float,
+        metric_weight: float,
+        peak: float | None = None,
     ) -> None:
         """Normalises and weights colour.
 
@@ -40,9 +43,8 @@ class Targets:
             mask: bool [N, 128, 128], valid texels.
             scale: float32 [N, T, 3], as rounded for the file.
             affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
-            profile: The settings: `gamma`, `metric_weight` and `peak`.
+            gamma, metric_weight, peak: As in `Profile`.
         """
-        gamma, metric_weight, peak = profile.gamma, profile.metric_weight, profile.peak
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)
         self.scale = scale
@@ -100,5 +102,6 @@ class TileJob:
 
     def targets(self) -> Targets:
         """Computes the training data."""
-        tiles = self.tiles.encoded(self.profile.gamma)
-        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, self.profile)
+        tiles, settings = self.tiles.encoded(self.profile.gamma), self.profile
+        options = {"gamma": settings.gamma, "metric_weight": settings.metric_weight, "peak": settings.peak}
+        return Targets(tiles.index, tiles.colour, tiles.mask, self.scale, self.affine, **options)

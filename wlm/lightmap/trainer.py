@@ -59,8 +59,9 @@ class Trainer:
     `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
     Attributes:
-        profile: The settings.
         axis: The time axis.
+        steps: Steps of the fit.
+        frozen: The first step at which only the network is trained.
         device: As `interop.check_device` returns it.
         temporal: Whether the tiles are DYNAMIC instead of STATIC.
         numbers: int32 [N], numbers of the tiles in their grid.
@@ -96,9 +97,19 @@ class Trainer:
             track: Whether to sum the errors that `psnr` needs.
         """
         self._track = track
-        self.profile, self.axis, self.device, self.temporal = profile, axis, device, temporal_maps
+        self.axis, self.device, self.temporal = axis, device, temporal_maps
+        self.steps, self.frozen = profile.steps, round(profile.freeze_from * profile.steps)
+        self._quantised_from = round(profile.quantise_from * profile.steps)
+        self._samples, self._integers, self._name = profile.samples, profile.net_bits == 8, profile.name
+        self._first_rates, self._decay = (profile.map_rate, profile.net_rate), profile.adam_decay
         self.numbers, self.tiles = targets.number, len(targets.number)
         self.inputs = profile.inputs(temporal_maps)
+        n, r, slices = self.tiles, profile.uvt_resolution, profile.uvt_slices
+        shapes: dict[str, tuple[int, ...]] = {"uv_endpoints": (n, 32, 32, 2, 4), "uv_weights": (n, TILE, TILE)}
+        if temporal_maps:
+            plane = n, profile.plane_rows, profile.plane_columns, 2
+            shapes |= {"uvt_endpoints": (n * slices, r // 4, r // 4, 2, 4), "uvt_weights": (n * slices, r, r)}
+            shapes |= {"ut": plane, "vt": plane}
         self._cuda = device != "cpu"
         self._kernels = lightmap_step.step_kernels(
             temporal_maps, profile.hidden, profile.gelu, "cuda" if self._cuda else "cpu"
@@ -109,8 +120,9 @@ class Trainer:
             self._kernels.load(device)
             wp.load_module(gather, device)
         with interop.stream(device):
-            self._allocate()
-            self._upload(targets, seed)
+            self._allocate(shapes, profile.hidden)
+            self._upload(targets, seed, profile.gamma, slices)
+            self._schedule = self._rates_over_steps(profile.final_rate)
             self._draw(seed)
         self._stages = [
             interop.StepGraph(lambda: self._step(False, True), device, warmup=2),
@@ -118,21 +130,9 @@ class Trainer:
             interop.StepGraph(lambda: self._step(True, False), device, warmup=1),
         ]
 
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
-        p, n, r = self.profile, self.tiles, self.profile.uvt_resolution
-        shapes = {"uv_endpoints": (n, 32, 32, 2, 4), "uv_weights": (n, TILE, TILE)}
-        if self.temporal:
-            shapes |= {
-                "uvt_endpoints": (n * p.uvt_slices, r // 4, r // 4, 2, 4),
-                "uvt_weights": (n * p.uvt_slices, r, r),
-                "ut": (n, p.plane_rows, p.plane_columns, 2),
-                "vt": (n, p.plane_rows, p.plane_columns, 2),
-            }
-        return shapes
-
-    def _allocate(self) -> None:
-        shapes = self._shapes()
-        device, n, hidden = self.device, self.tiles, self.profile.hidden
+    def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
+        """Allocates maps of these shapes, networks of a width, and all that a step writes."""
+        device, n = self.device, self.tiles
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
         total = _padded(sum(lengths.values()))
 
@@ -155,7 +155,7 @@ class Trainer:
         self._maps = maps
 
         lanes = 1 if self._cuda else CPU_LANES
-        parts = self.profile.samples // lightmap_step.BLOCK if self._cuda else CPU_LANES
+        parts = self._samples // lightmap_step.BLOCK if self._cuda else CPU_LANES
         self._acc = zeros(lanes, total, dtype=torch.int64 if self._cuda else torch.float32)
         self._partial = zeros(parts, *self.hidden.shape)
         self._partial_out = zeros(parts, *self.output.shape)
@@ -212,7 +212,7 @@ class Trainer:
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns Adam on a GPU for one array of parameters, with moments of 0."""
         adam = gather.Adam()
-        adam.decay = wp.vec2(_MOMENTUM, self.profile.adam_decay)
+        adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
         for key, field in (("exp_avg", "first"), ("exp_avg_sq", "second")):
             moments = torch.zeros(values.numel(), device=self.device)
@@ -224,13 +224,12 @@ class Trainer:
         """Returns torch's Adam, for the CPU."""
         maps = self.maps.detach().requires_grad_()
         maps.grad = self.maps_grad
-        betas = (_MOMENTUM, self.profile.adam_decay)
+        betas = (_MOMENTUM, self._decay)
         options = {"lr": 1.0, "betas": betas, "eps": _ADAM_EPSILON, "fused": True}
         return {"adam_maps": torch.optim.Adam([maps], **options), "adam_net": torch.optim.Adam(nets, **options)}
 
-    def _upload(self, targets: Targets, seed: int) -> None:
+    def _upload(self, targets: Targets, seed: int, gamma: float, slices: int) -> None:
         tau, encoding = encode_time(self.axis)
-        self._schedule = self._rates_over_steps()
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
@@ -246,31 +245,30 @@ class Trainer:
         batch.shift = put(targets.shift, wp.vec3)
         batch.spread = put(targets.spread, wp.vec3)
         batch.scale = put(targets.scale, wp.vec3)
-        batch.gamma = self.profile.gamma
+        batch.gamma = gamma
         squared = np.square(targets.range, dtype=np.float32)
         batch.inverse_range = put(np.divide(1.0, squared, out=np.zeros_like(squared), where=squared > 0), wp.float32)
         self._scored = torch.from_numpy(targets.range > 0)
         batch.tracked = interop.to_warp(self._tracked)
         batch.control = interop.to_warp(self.control)
-        batch.slices = self.profile.uvt_slices
+        batch.slices = slices
         batch.seed = seed
         batch.emphasis = targets.emphasis
         batch.periodic = int(self.axis.periodic)
         batch.quantised = 0
         self.batch = batch
 
-    def _rates_over_steps(self) -> wp.array:
+    def _rates_over_steps(self, final_rate: float) -> wp.array:
         """Returns the schedule of learning rates for `gather.update_maps`."""
-        p = self.profile
-        share = np.linspace(0.0, 1.0, p.steps)
-        values = p.final_rate + (1.0 - p.final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
-        done = np.arange(1, p.steps + 1)
-        corrections = 1.0 - _MOMENTUM**done, np.sqrt(1.0 - p.adam_decay**done)
+        share = np.linspace(0.0, 1.0, self.steps)
+        values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
+        done = np.arange(1, self.steps + 1)
+        corrections = 1.0 - _MOMENTUM**done, np.sqrt(1.0 - self._decay**done)
         return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:
         """Draws the initial parameters. Each tile has its own generator, so that it is the same in any batch."""
-        hidden, inputs = self.profile.hidden, self.inputs
+        hidden, inputs = self.hidden.shape[-1], self.inputs
         maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
         w = np.zeros(tuple(self.hidden.shape), np.float32)
         o = np.zeros(tuple(self.output.shape), np.float32)
@@ -295,13 +293,7 @@ class Trainer:
 
     def stage(self, step: int) -> int:
         """Returns the stage of a step: 0 continuous maps with noise, 1 maps on their exact levels, 2 maps frozen."""
-        p = self.profile
-        return int(step >= round(p.quantise_from * p.steps)) + int(step >= self.frozen)
-
-    @property
-    def frozen(self) -> int:
-        """The first step at which only the network is trained."""
-        return round(self.profile.freeze_from * self.profile.steps)
+        return int(step >= self._quantised_from) + int(step >= self.frozen)
 
     def run(self, steps: int) -> None:
         """Queues the next steps."""
@@ -319,7 +311,7 @@ class Trainer:
 
     def _step(self, quantised: bool, move_maps: bool) -> None:
         self.batch.quantised = int(quantised)
-        on_levels = quantised and self.profile.net_bits == 8
+        on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
         hidden, output = self._nets[on_levels]
@@ -329,16 +321,16 @@ class Trainer:
             hidden,
             output,
             self.batch,
-            self.profile.samples,
+            self._samples,
             *self._launch_sums,
         )
-        rates = (self.profile.map_rate, self.profile.net_rate)
+        rates = self._first_rates
         if self._cuda:
             self._kernels.launch(*args)
             update_maps(self._schedule, rates, self.batch.control, move_maps, *self._maps_update)
             update_net(*self._net_update)
             return
-        span = self.profile.samples // CPU_LANES
+        span = self._samples // CPU_LANES
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
         part = -(-self.maps.numel() // CPU_LANES)
         counts = [min(part, self.maps.numel() - lane * part) for lane in range(CPU_LANES)]
@@ -374,7 +366,7 @@ class Trainer:
             static tiles.
         """
         nets = self.hidden.detach(), self.output.detach()
-        if self.profile.net_bits == 8:
+        if self._integers:
             nets = self._on_levels
             with interop.stream(self.device):
                 levels.put_on_levels(*self._levels_args)
@@ -412,7 +404,7 @@ class Trainer:
         if bool(broken.any()):
             tile = self.numbers[broken.cpu().numpy()][0]
             raise WlmError(
-                f"tile {tile}: the fit diverged; expected a smaller map_rate or net_rate than {self.profile.name}'s"
+                f"tile {tile}: the fit diverged; expected a smaller map_rate or net_rate than {self._name}'s"
             )
 
     def state(self) -> dict[str, np.ndarray]:
@@ -454,7 +446,7 @@ class Trainer:
         Raises:
             ValueError: A part is missing, of another shape or out of its range; the trainer is unchanged.
         """
-        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
+        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         parts = check_parts(state, self.table(int(done[0])))
         values = {name: torch.tensor(part, device=self.device) for name, part in parts.items()}
         with interop.stream(self.device), torch.no_grad():
@@ -533,7 +525,7 @@ class Fitter:
             WlmError: The fit diverged.
         """
         trainer = self._trainer
-        chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.profile.steps
+        chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
         while step < steps:
             count = min(chunk, steps - step)

@@ -66,21 +66,6 @@ def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> fl
     return float(np.mean(np.square(ref[valid] - test[valid])))
 
 
-def max_abs_error(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Largest absolute difference over the valid texels and all channels; NaN with an empty mask.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts; None for all.
-
-    Raises:
-        WlmError: Shapes differ, or a valid texel is NaN or infinite.
-    """
-    ref, test, valid = check_pair(ref, test, mask, "max_abs_error")
-    return float(np.max(np.abs(ref[valid] - test[valid]))) if valid.any() else math.nan
-
-
 def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Maximum minus minimum over the valid texels and all channels (neural-dynamic-gi, section 10.2).
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.metrics.error import check_pair
-from wlm.texels import fill_gaps
 
 # HDR-FLIP chooses the exposures so that the reference's brightest luminance (at the first) and its median (at
 # the last) are tone mapped to 0.85. With the ACES curve, flip_evaluator's default, this is the input that
@@ -59,35 +58,6 @@ def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[flo
     return start, start + min(math.log2(bright) - math.log2(median), _MAX_SPAN)
 
 
-def flip_map(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, exposures: int = 2) -> np.ndarray:
-    """FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
-
-    Outside the mask both images take the reference's nearest valid value, so the error there is zero except
-    where the filters cross a chart's edge. Negative values count as zero. If no valid texel of the reference is
-    above zero, no exposure can be chosen: the error is zero if the test is black too, else LDR-FLIP between black
-    and the test clipped to [0, 1].
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB.
-        test: `[H, W, 3]`, linear RGB.
-        mask: `[H, W]`, true where a texel counts; None for all.
-        exposures: Number of exposures, at least 2; the time grows with it.
-
-    Returns:
-        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
-
-    Raises:
-        WlmError: Shapes differ, the images are not RGB, a valid texel is NaN or infinite, or there are fewer
-            than two exposures.
-    """
-    ref, test, valid = check_pair(ref, test, mask, "flip")
-    if not valid.any():
-        return np.zeros(valid.shape)
-    filled = fill_gaps(ref, valid)
-    same_outside = np.where(valid[..., None], test, filled)
-    return flip_filled(filled, same_outside, flip_exposures(ref, valid), exposures)
-
-
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
     """LDR-FLIP between two display images, at flip_evaluator's default of 67 pixels per degree.
 
@@ -106,8 +76,24 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
     return _ldr_flip(ref, test, srgb=True)
 
 
-def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int) -> np.ndarray:
-    """`flip_map` for images already checked and equal outside the mask; `span` is the result of `flip_exposures`."""
+def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int = 2) -> np.ndarray:
+    """FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
+
+    Negative values count as zero. If no valid texel of the reference is above zero, no exposure can be chosen: the
+    error is zero if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
+
+    Args:
+        ref: `[H, W, 3]`, linear RGB, finite; texels outside the mask hold the nearest valid value.
+        test: `[H, W, 3]`, linear RGB, equal to `ref` outside the mask.
+        span: Result of `flip_exposures`.
+        exposures: Number of exposures, at least 2; the time grows with it.
+
+    Returns:
+        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
+
+    Raises:
+        WlmError: The images are not RGB, or there are fewer than two exposures.
+    """
     import flip_evaluator  # imported here because the import is slow, like scikit-image's in structural.py
 
     _check_rgb(ref)

@@ -39,15 +39,6 @@ from wlm.probe.sphere import coefficient_bands, cosine_factor, sh_count
 CANONICAL = "threejs"
 CONVENTIONS = (CANONICAL, "godot", "unreal", "unity")
 
-THREE_GRID = "wlm-light-probe-grid"
-"""Field `format` of the index of a grid for three.js, see `wlm.probe.engines.three`."""
-
-UNREAL_LIGHT = "wlm-unreal-light"
-"""Field `format` of the index of volume textures for Unreal, see `wlm.probe.engines.unreal`."""
-
-UNITY_PROBES = "wlm-unity-probes"
-"""Field `format` of probes for Unity, see `wlm.probe.engines.unity`."""
-
 _LAST_BAND = {"unreal": 2, "unity": 2}
 
 # Constants in front of the basis' polynomials, and the clamped cosine's factors over pi; bands 0 to 2.

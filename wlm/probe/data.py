@@ -1,38 +1,8 @@
 """The input: light probes at free positions, read from `.npz`, `.json`, Godot's `.lmbake` or Unity's `.asset`.
 
-Behaviour in special cases. `ProbeSet.warnings` has a line for each kind of repair; probes are counted from 0.
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-a position NaN or infinite            error that names the probe
-positions far from the origin         kept in float64
-positions that span more than 1e150   error
-coincident positions                  accepted; a warning with the number of probes that repeat an earlier
-                                      position: Gaussians decode them to one value
-NaN, Inf in a probe                   the probe is dead and all its numbers become 0; a warning with the
-                                      number of such probes and the first one
-a probe that is all zero              dead, without a warning: engines leave such probes inside walls
-a probe whose `valid` is below 0.5    dead and zero, without a warning
-`valid` outside 0 to 1, a `normal`    error that names the field and the probe
-that is not finite
-no live probe, no probe at all        error
-negative numbers                      accepted: only the light in a direction is positive, and even that
-                                      only without ringing
-a number beyond +-1.8e19              error that names the probe: the loss is a mean of squares in
-                                      float32, where the square of a larger number is infinite
-float16, float64, integers            converted to float32; smaller numbers become 0
-other types, text, ragged lists       error that names the field
-one probe, one number per probe       accepted
-more than 16,777,216 probes, or 4,096 error; the limit on CUDA is about 1,400 numbers, checked when a fit
-numbers of a probe                    starts
-several arrays named `sh...`          error that lists them, unless `key` names one
-a convention of an engine             error if the numbers are not 1, 4 or 9 RGB coefficients (any square for
-                                      Godot's)
-a file missing or damaged             error that names the file, and the field
-====================================  ================================================================
-
 A probe holds spherical harmonics (gaussian-probe-compression, eq. 1; 3, 12 or 27 numbers there), or any other numbers.
+The table of hard cases in docs/probe.md lists what is repaired and what is refused. `ProbeSet.warnings` has a line for
+each kind of repair; probes are counted from 0.
 """
 
 import hashlib
@@ -40,9 +10,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,13 +25,10 @@ from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.conventions import (
     CANONICAL,
     CONVENTIONS,
-    THREE_GRID,
-    UNITY_PROBES,
-    UNREAL_LIGHT,
     from_canonical,
     to_canonical,
 )
-from wlm.probe.json_fields import fields_of, numbers_of, read_json, text_of
+from wlm.probe.json_fields import fields_of, kind_of, numbers_of, read_json
 from wlm.probe.sphere import sh_count
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
@@ -77,7 +42,7 @@ _NORMAL, _VALID = _BESIDE = "normal", "valid"
 
 @dataclass(frozen=True, eq=False)
 class ProbeSet:
-    """Light probes, checked and repaired as described in the module's table.
+    """Light probes, checked and repaired.
 
     Attributes:
         name: Name of the set.
@@ -133,8 +98,6 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
-    - `grid.json` with `grid.ktx2`: an export for three.js (`wlm.export.export(..., "three")`).
-    - `light.json` with its textures, `probes.json`: exports for Unreal and for Unity.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
     - `.lmbake`: a lightmap bake of Godot 4.
@@ -145,14 +108,14 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"). None takes
             the only array whose name begins with "sh".
         convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
-            own: "godot" for `.lmbake`, "unity" for `.asset`, "unreal" for its textures, otherwise the field
-            `convention`, otherwise the canonical one.
+            own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, otherwise the canonical
+            one.
 
     Returns:
-        The set, repaired as described in the module's table.
+        The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
 
     Raises:
-        WlmError: An error of the module's table, in one line that names the file and the field.
+        WlmError: The content is wrong or cannot be read; the line names the file and the field.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -160,7 +123,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
     raw = reader(path, key)
     stated = raw.convention if convention is None else convention
-    return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated, raw.beside)
+    return _check(str(path), path.stem, raw, stated)
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
@@ -184,11 +147,8 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
         position = _READERS[kind](path, None).position
     else:
         content = read_json(path)
-        export = _read_export(path, content)
         if isinstance(content, list):
             position = numbers_of(path, _POSITION, content)
-        elif export is not None:
-            position = export[0]
         else:
             position = fields_of(path, content)[1](_POSITION)
     return _check_positions(str(path), position)
@@ -216,14 +176,14 @@ def from_arrays(
         valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
 
     Returns:
-        The set, repaired as described in the module's table.
+        The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
 
     Raises:
-        WlmError: A shape is wrong, or an error of the module's table.
+        WlmError: A shape is wrong, or numbers are out of range.
     """
     beside = {_NORMAL: normal, _VALID: valid}
     beside = {field: np.asarray(array) for field, array in beside.items() if array is not None}
-    return _check(name, name, np.asarray(position), np.asarray(values), key, convention, beside)
+    return _check(name, name, _Raw(np.asarray(position), np.asarray(values), key, convention, beside), convention)
 
 
 def save_probes(
@@ -292,33 +252,13 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 def _read_json(path: Path, key: str | None) -> _Raw:
     content = read_json(path)
-    export = _read_export(path, content)
-    if export is not None:
-        position, values, convention = export
-        return _Raw(position, values, _choose(path, (_POSITION, _SH), key), convention)
     names, read = fields_of(path, content)
     name = _choose(path, names, key)
     beside = {field: read(field) for field in _BESIDE if field in names}
-    return _Raw(
-        read(_POSITION), read(name), name, text_of(path, _CONVENTION, content.get(_CONVENTION, CANONICAL)), beside
-    )
-
-
-def _read_export(path: Path, content: Any) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """Returns positions, values and convention of an export for an engine; None for other content."""
-    form = content.get("format") if isinstance(content, dict) else None
-    if not isinstance(form, str) or form not in _EXPORTS:
-        return None
-    module, function, convention = _EXPORTS[form]
-    return *getattr(import_module(module), function)(path, content), convention
-
-
-# By `format` of an index: module and function that read it, and the convention of its coefficients.
-_EXPORTS = {
-    THREE_GRID: ("wlm.probe.engines.three", "read_grid", CANONICAL),
-    UNREAL_LIGHT: ("wlm.probe.engines.unreal", "read_unreal", "unreal"),
-    UNITY_PROBES: ("wlm.probe.engines.unity", "read_unity", "unity"),
-}
+    stated = content.get(_CONVENTION, CANONICAL)
+    if not isinstance(stated, str):
+        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {kind_of(stated)}")
+    return _Raw(read(_POSITION), read(name), name, stated, beside)
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:
@@ -376,17 +316,9 @@ def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.nda
         raise WlmError(f"{where}: {error}") from error
 
 
-def _check(
-    where: str,
-    name: str,
-    position: np.ndarray,
-    values: np.ndarray,
-    key: str,
-    convention: str,
-    beside: Mapping[str, np.ndarray],
-) -> ProbeSet:
-    """Checks and repairs the content of a file as described in the module's table."""
-    position = _check_positions(where, position)
+def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
+    """Checks and repairs the content of a file."""
+    position, values, key, beside = _check_positions(where, raw.position), raw.values, raw.key, raw.beside
     count = len(position)
     if values.dtype.kind not in "iuf":
         raise WlmError(f"{where}: {key}: expected numbers, got {values.dtype}")
@@ -415,11 +347,11 @@ def _check(
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
     if _VALID in beside:
-        checked[~_check_valid(where, _VALID, beside[_VALID], count)] = 0.0
+        checked[~_check_valid(where, beside[_VALID], count)] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
-    normal = _check_normal(where, _NORMAL, beside[_NORMAL], count) if _NORMAL in beside else None
+    normal = _check_normal(where, beside[_NORMAL], count) if _NORMAL in beside else None
 
     warnings = []
     broken = np.flatnonzero(~finite)
@@ -477,22 +409,22 @@ def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _check_valid(where: str, field: str, valid: np.ndarray, count: int) -> np.ndarray:
+def _check_valid(where: str, valid: np.ndarray, count: int) -> np.ndarray:
     """Returns the valid ones of `count` probes, bool [N], for `valid` [N] of true or false or of 0 to 1."""
-    _check_field(where, field, valid, "biuf", (count,))
+    _check_field(where, _VALID, valid, "biuf", (count,))
     bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
     if len(bad):
-        raise WlmError(f"{where}: {field}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
+        raise WlmError(f"{where}: {_VALID}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
     return valid >= 0.5
 
 
-def _check_normal(where: str, field: str, normal: np.ndarray, count: int) -> np.ndarray:
+def _check_normal(where: str, normal: np.ndarray, count: int) -> np.ndarray:
     """Returns the unit normals of `count` probes, float64 [N, 3]; normals of length 0 stay 0."""
-    _check_field(where, field, normal, "iuf", (count, 3))
+    _check_field(where, _NORMAL, normal, "iuf", (count, 3))
     normal = normal.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(normal).all(1))
     if len(bad):
-        raise WlmError(f"{where}: {field}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
+        raise WlmError(f"{where}: {_NORMAL}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
     # Divided by the largest number first, since squares of very long or short vectors do not fit float64.
     normal = _divided(normal, np.abs(normal).max(1, keepdims=True))
     return _divided(normal, np.linalg.norm(normal, axis=1, keepdims=True))

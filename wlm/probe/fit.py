@@ -15,7 +15,7 @@ from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.decode import GaussianDecoder
-from wlm.probe.gaussian.model import check_outputs, predicted_bytes
+from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
@@ -115,7 +115,8 @@ def compress(
     if profile.method == "pca":
         return make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
     if profile.method == "auto":
-        budget = predicted_bytes(profile, *values.shape)
+        count = gaussian_count(profile.ratio, len(values))
+        budget = gaussian_bytes(count, profile.latent, profile.hidden, probes.outputs)
         components, error = fit_components(values, budget)
         if error <= ENOUGH and components.nbytes <= budget:
             took = (
@@ -140,8 +141,9 @@ def _fit_gaussians(
 ) -> ProbeModel:
     """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
     box = box_of(probes.position)
-    x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x[probes.live], probes.values[probes.live], profile, seed, device)
+    position, values = probes.position[probes.live], probes.values[probes.live]
+    x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
+    trainer = Trainer(x, values, profile, seed, device)
     try:
         if checkpoint is not None:
             checkpoint.restore(0, trainer.load)
@@ -158,7 +160,7 @@ def _fit_gaussians(
         content=content,
         choice="Gaussians, as the profile asks",
     )
-    return pack_model(fitted, probes.position[probes.live], probes.values[probes.live], device)
+    return pack_model(fitted, position, values, device)
 
 
 def _better(gaussians: ProbeModel, make: Callable[..., ProbeModel], probes: ProbeSet, device: str) -> ProbeModel:
@@ -182,13 +184,13 @@ def _better(gaussians: ProbeModel, make: Callable[..., ProbeModel], probes: Prob
 
 
 def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None) -> None:
-    steps, kind = trainer.profile.steps, "cpu" if trainer.device == "cpu" else "cuda"
+    steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
     meter = Meter(progress, "fit", steps)
     peak = float(np.ptp(probes.values))
     live = probes.live.mean()  # dead probes decode exactly, and count
     step = trainer.step
     while step < steps:
-        count = min(_CHUNK[kind], steps - step)
+        count = min(chunk, steps - step)
         trainer.run(count)
         step += count
         if meter.due(step):

@@ -31,13 +31,13 @@ def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.n
         WlmError: The content has neither form. The function raises it if a field is missing or is not numeric.
     """
     if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
+        raise WlmError(f"{path}: expected a JSON object, got {kind_of(content)}")
     if _PROBES not in content:
         return list(content), lambda field: numbers_of(path, field, _rows(path, content, field))
     probes = _rows(path, content, _PROBES)
     for i, probe in enumerate(probes):
         if not isinstance(probe, dict):
-            raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {_kind(probe)}")
+            raise WlmError(f"{path}: {_PROBES}[{i}]: expected an object (position, sh), got {kind_of(probe)}")
 
     def read(field: str) -> np.ndarray:
         for i, probe in enumerate(probes):
@@ -48,16 +48,9 @@ def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.n
     return list(probes[0]) if probes else ["position", "sh"], read
 
 
-def text_of(path: Path, field: str, value: object) -> str:
-    """Returns a value that must be text, or raises `WlmError`."""
-    if not isinstance(value, str):
-        raise WlmError(f"{path}: {field}: expected a name, got {_kind(value)}")
-    return value
-
-
 def _rows(path: Path, holder: dict, field: str) -> list:
     if not isinstance(holder.get(field), list):
-        raise WlmError(f"{path}: {field}: expected a list, got {_kind(holder.get(field))}")
+        raise WlmError(f"{path}: {field}: expected a list, got {kind_of(holder.get(field))}")
     return holder[field]
 
 
@@ -73,7 +66,7 @@ def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
         return array
     shapes = [None if row is None else row.shape for row in (_array(row, kinds) for row in rows)]
     odd = next((i for i, shape in enumerate(shapes) if shape is None or shape != shapes[0]), 0)
-    raise WlmError(f"{path}: {field}[{odd}]: expected numbers, as many as {field}[0] has, got {_kind(rows[odd])}")
+    raise WlmError(f"{path}: {field}[{odd}]: expected numbers, as many as {field}[0] has, got {kind_of(rows[odd])}")
 
 
 def _array(value: object, kinds: str) -> np.ndarray | None:
@@ -85,7 +78,7 @@ def _array(value: object, kinds: str) -> np.ndarray | None:
     return array if array.dtype.kind in kinds else None
 
 
-def _kind(value: object) -> str:
+def kind_of(value: object) -> str:
     """Describes a JSON value briefly."""
     if isinstance(value, dict):
         return "an object"

@@ -6,12 +6,11 @@ The method of compression is data: `ProbeModel.content` holds the light, either 
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.system import Model, Settings
 
@@ -57,6 +56,24 @@ class Profile(Settings):
     """Magnitude of the first network weights, relative to a uniform draw of variance 1 / (3 inputs)."""
 
 
+class GpuForm(NamedTuple):
+    """The part of a model's bundle that depends on the method.
+
+    Attributes:
+        shader: GLSL that decodes the buffers.
+        buffers: Arrays by name.
+        document: Entries that describe the buffers, as JSON values.
+        about: Explanations of the entries.
+        reference: Arrays by name, `values` among them.
+    """
+
+    shader: str
+    buffers: dict[str, np.ndarray]
+    document: dict[str, Any]
+    about: dict[str, str]
+    reference: dict[str, np.ndarray]
+
+
 class Content(ABC):
     """The compressed light of a model, in the form of one method.
 
@@ -76,8 +93,8 @@ class Content(ABC):
         """Loads a model with this content onto a device."""
 
     @abstractmethod
-    def bundle(self, model: "ProbeModel", decoder: Any) -> Bundle:
-        """Returns buffers, shader, document and reference of a model with this content."""
+    def gpu_form(self, model: "ProbeModel", decoder: Any) -> GpuForm:
+        """Returns the form in which a GPU holds a model with this content; `decoder` computes the reference."""
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:

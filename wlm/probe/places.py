@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
-from wlm.probe.data import load
+from wlm.probe.data import load, load_positions
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 from wlm.texels import exposure
@@ -46,15 +46,29 @@ def probes_of(model: ProbeModel, original: str | os.PathLike[str] | None, key: s
     live = model.live
     if original is not None:
         probes = load(original, key=key)
-        if len(probes.position) != model.probes or probes.values.shape[1] != model.outputs:
+        if not model.has_probes_at(probes.position) or probes.outputs != model.outputs:
             raise WlmError(
-                f"{original}: expected {model.probes} probes of {model.outputs} numbers, found "
-                f"{len(probes.position)} of {probes.values.shape[1]}"
+                f"{original}: expected the {model.probes} probes of {model.outputs} numbers of {model.name}, in their "
+                f"order, found {probes.probes} of {probes.outputs}"
             )
         return Known(probes.position, probes.values, live, probes.normal)
     if not model.has_positions:
         raise WlmError(f"{model.name}: the file stores no positions; expected --original, the file that was compressed")
     return Known(model.stored_positions(), None, live, None)
+
+
+def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
+    """Reads the positions of a model's probes from another file, float64 [N, 3]; None without a file.
+
+    Raises:
+        WlmError: The file cannot be read or has other probes.
+    """
+    if original is None:
+        return None
+    position = load_positions(original)
+    if not model.has_probes_at(position):
+        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
+    return position
 
 
 def ball_exposure(values: np.ndarray) -> float:

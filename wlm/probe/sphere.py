@@ -87,23 +87,6 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
     return result
 
 
-def radiance(values: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Computes the radiance from some directions; a truncated series can be negative.
-
-    Args:
-        values: [..., C, 3].
-        directions: [M, 3], of unit length, from the probe towards the light source.
-
-    Returns:
-        float64 [..., M, 3].
-
-    Raises:
-        ValueError: As for `basis`.
-    """
-    values = _checked(values)
-    return basis(directions, values.shape[-2]) @ values
-
-
 def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Computes the irradiance of surfaces at the probe; divided by pi, it is the radiance of a white diffuse surface.
 

@@ -1,6 +1,6 @@
 """Scoring pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
 
-50 viewers stand along the loop of `wlm probe volume`, each looking in another direction with a field of view of 90
+50 viewers stand along the loop of `wlm evaluate --volume`, each looking in another direction with a field of view of 90
 degrees. They see balls at some of the probes, and the scene's mesh if it is given, both diffuse and white. Three kinds
 of light are compared with the original probes:
 

@@ -30,7 +30,6 @@ _PLACES = {
     "read_six_way": "wlm.smoke.data",
     "simulate": "wlm.smoke.simulation",
     "train": "wlm.smoke.fit",
-    "write_flipbook": "wlm.smoke.flipbook.textures",
     "write_six_way": "wlm.smoke.data",
 }
 

@@ -10,7 +10,6 @@ from wlm.smoke.decode import Decoder as Decoder
 from wlm.smoke.evaluation import Report as Report
 from wlm.smoke.evaluation import evaluate as evaluate
 from wlm.smoke.fit import train as train
-from wlm.smoke.flipbook.textures import write_flipbook as write_flipbook
 from wlm.smoke.lightmaps import SixWay as SixWay
 from wlm.smoke.march.coarse import bake_coarse as bake_coarse
 from wlm.smoke.march.coarse import guide as guide

@@ -16,8 +16,6 @@ _ABOUT = {
     "the direction from which the light of each channel comes, as seen from the camera.",
     "motion": "Motion to the right and up until the next frame, in fractions of a frame: 127/255 + motion / (2 "
     "motion_scale).",
-    "depth": "Distance of the smoke in front of the billboard, in heights of a frame: 127/255 + depth / (2 "
-    "depth_scale).",
     "rate": "Frames per second.",
     "extent": "Width and height of the region that a frame shows, in world units.",
     "levels": "Number of mip levels; beyond them frames bleed into their neighbours.",
@@ -62,7 +60,6 @@ def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
         "rate": book.rate,
         "extent": [book.extent * width / height, book.extent],
         "motion_scale": book.scale,
-        "depth_scale": book.reach,
         "clipped": clipped,
     }
     return Bundle("smoke", name, billboard_shader(book), document, textures)

@@ -39,8 +39,6 @@ RULES = ("squared", "absolute", "normalised")
 |w_z|)."""
 
 _SHORTEST = 1e-12
-# Share of the image by which a map's centre of brightness must be farther out than its opposite's.
-_LEAST_SHIFT = 1e-3
 _MARGIN = 1.05  # image height over box height, so that no smoke touches the edge
 
 
@@ -60,8 +58,7 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
     """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
-    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights: 1.5 times too bright on average, as path
-    tracing shows. The squares sum to 1, and engines use them.
+    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights; the squares, as in engines, sum to 1.
 
     Args:
         toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.
@@ -83,42 +80,6 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
     if rule == "squared":
         return along**2
     return along / along.sum(-1, keepdims=True) if rule == "normalised" else along
-
-
-def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
-    """Checks that each lightmap is bright on the side of its name.
-
-    This requires smoke that absorbs some light: in thin smoke the maps are equal, which counts as a fault.
-
-    Args:
-        lightmaps: [..., 6, H, W], one frame or many, in the order of `DIRECTIONS`.
-
-    Returns:
-        One line per fault: the centre of "right" must be to the right of that of "left", "top" above "bottom", and
-        "front" brighter than "back". Exchanged opposites are always found; "right" exchanged with "top" may not be.
-
-    Raises:
-        ValueError: The shape is wrong.
-    """
-    lightmaps = np.asarray(lightmaps, np.float64)
-    if lightmaps.ndim < 3 or lightmaps.shape[-3] != 6:
-        raise ValueError(f"expected lightmaps [..., 6, H, W], got {lightmaps.shape}")
-    height, width = lightmaps.shape[-2:]
-    sums = lightmaps.reshape(-1, 6, height, width).sum(0)
-    total = sums.sum((1, 2))
-    if not (np.isfinite(total) & (total > 0)).all():
-        dark = [name for name, value in zip(DIRECTIONS, total, strict=True) if not value > 0]
-        return (f"no light in {', '.join(dark) or 'some lightmap'}",)
-    x = (sums.sum(1) @ (np.arange(width) + 0.5)) / total / width
-    y = 1.0 - (sums.sum(2) @ (np.arange(height) + 0.5)) / total / height
-    faults = []
-    if not x[0] > x[1] + _LEAST_SHIFT:
-        faults.append(f"right isn't brighter on the right than left: centres at {x[0]:.3f} and {x[1]:.3f} of the width")
-    if not y[2] > y[3] + _LEAST_SHIFT:
-        faults.append(f"top isn't brighter above than bottom: centres at {y[2]:.3f} and {y[3]:.3f} of the height")
-    if not total[4] > total[5]:
-        faults.append(f"front isn't brighter than back: {total[4]:.4g} and {total[5]:.4g} in all")
-    return tuple(faults)
 
 
 @dataclass(frozen=True)

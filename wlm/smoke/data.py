@@ -1,4 +1,4 @@
-"""Smoke in files: volumes and folders of frames, guiding maps and lightmaps as EXR, numbered results.
+"""Smoke in files: volumes and folders of frames, lightmaps as EXR, numbered results.
 
 The folder of a simulated scene contains `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume
 that `wlm.smoke.load` reads. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
@@ -28,7 +28,6 @@ from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import Guide
 from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
 from wlm.system import Meter, OnProgress
 
@@ -43,7 +42,6 @@ _FORMAT, _VERSION = "wlm-smoke-frames", 1
 _NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # text before the last number, the number, the suffix
 _TRANSPARENCY = "transparency"
 _DEPTH = "depth"
-_GUIDE = ("light", _TRANSPARENCY, _DEPTH)
 
 
 @dataclass(frozen=True)
@@ -179,11 +177,7 @@ def load_frames(
 
 
 def _sequence(folder: Path) -> dict[int, Path]:
-    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal.
-
-    Raises:
-        WlmError: There are no volumes, several sequences, or two volumes of one number.
-    """
+    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal."""
     found: dict[tuple[str, str], dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
         match = _NUMBERED.fullmatch(path.name)
@@ -205,9 +199,6 @@ def _sequence(folder: Path) -> dict[int, Path]:
 
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
     """Prepares a folder for the frames of a simulation.
-
-    Frames are useful separately and appear one after the other beside the checkpoint, so they are not staged by
-    `wlm.formats.folder`.
 
     Args:
         folder: The folder; created if its parent exists.
@@ -328,16 +319,6 @@ class NumberedFiles:
         return [*files, self.partial, *(self.folder / name for name in self._others)]
 
 
-def write_guide(path: str | os.PathLike[str], guide: Guide) -> None:
-    """Writes a guiding map as an EXR with the channels light, transparency and depth, all float32.
-
-    Raises:
-        WlmError: The file cannot be written.
-    """
-    planes = dict(zip(_GUIDE, guide.maps.cpu().numpy(), strict=True))
-    write_planes(path, planes, {"camera": asdict(guide.camera)}, whole=_GUIDE)
-
-
 def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
     """Writes lightmaps as an EXR of half floats: a channel per direction, `transparency`, `emission` of hot smoke, and
     `depth` as float32 if it is known; the camera and the looks are in the header.
@@ -357,7 +338,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
 
 
 def is_six_way(path: Path) -> bool:
-    """Whether a file is an EXR with a channel for each direction.
+    """Returns whether a file is an EXR with a channel for each direction.
 
     Raises:
         WlmError: The file is named .exr and cannot be read.
@@ -367,14 +348,18 @@ def is_six_way(path: Path) -> bool:
     return all(name in read_part(path).channels for name in DIRECTIONS)
 
 
-def six_way_files(folder: Path) -> list[Path]:
-    """Returns the six-way lightmaps in a folder, one file per frame, by name; none if its EXR files are something else.
+def six_way_files(folder: Path) -> dict[int, Path]:
+    """Returns the six-way lightmaps in a folder by frame number; none if its EXR files are something else.
 
     Raises:
         WlmError: The first EXR file cannot be read.
     """
-    files = sorted(path for path in folder.glob("*.exr") if path.name[0] != ".")
-    return files if files and is_six_way(files[0]) else []
+    if not folder.is_dir():
+        return {}
+    if files := numbered(folder, "six", ".exr"):
+        return files
+    others = sorted(path for path in folder.glob("*.exr") if path.name[0] != ".")
+    return dict(enumerate(others, 1)) if others and is_six_way(others[0]) else {}
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:

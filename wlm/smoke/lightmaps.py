@@ -14,15 +14,14 @@ import torch
 
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
 from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.transport.lights import checked_albedo
+from wlm.smoke.transport.lights import checked_albedo, checked_colour
 
 
 @dataclass(frozen=True)
 class StepError:
     """Change of a result when the step is halved.
 
-    It bounds the error of the finer result if the error falls at least in proportion to the step. In practice the error
-    falls with the square of the step, so that a third of this change remains.
+    The error falls with the square of the step, so that about a third of this change remains in the finer result.
 
     Attributes:
         largest: Largest difference of a pixel in any lightmap.
@@ -95,7 +94,7 @@ class SixWay:
 
         Raises:
             ValueError: The camera, or the transparency for a background, is needed and unknown; a light has no
-                direction, a negative irradiance or a visibility of another shape; or the albedo is invalid.
+                direction or a negative irradiance; or the albedo is invalid.
         """
         if self.camera is None and lights:
             raise ValueError("camera: expected that of the lightmaps, found none; give it by dataclasses.replace")
@@ -103,15 +102,9 @@ class SixWay:
         scattered = checked_albedo(albedo) / (4 * math.pi)
         image = torch.zeros((height, width, 3), dtype=torch.float32, device=self.lightmaps.device)
         for light in lights:
-            irradiance = np.asarray(light.irradiance, np.float64)
-            if irradiance.shape != (3,) or not ((irradiance >= 0) & np.isfinite(irradiance)).all():
-                raise ValueError(f"irradiance: expected three numbers of at least 0, got {light.irradiance}")
+            irradiance = checked_colour("irradiance", light.irradiance)
             share = weights(self.camera.axes @ np.asarray(light.toward, np.float64), rule)
             grey = torch.einsum("c,chw->hw", torch.tensor(share).to(self.lightmaps), self.lightmaps)
-            if light.visibility is not None:
-                if light.visibility.shape != grey.shape:
-                    raise ValueError(f"visibility: expected {tuple(grey.shape)}, got {tuple(light.visibility.shape)}")
-                grey = grey * light.visibility
             image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:
             image += self.emission[..., None] if ramp is None else ramp(self.emission)

@@ -6,32 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import warp as wp
 
-from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.smoke.camera import Camera, unit
-from wlm_kernels.smoke import shadow
-from wlm_kernels.smoke.march import View
-
-SHADOW_MAP = 512
-"""Texels along an edge of a shadow map."""
-
-_SMALLEST_MAP = 8  # texels along an edge, of which four are the empty border
+from wlm.smoke.camera import Camera
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Light:
     """A directional light.
 
     Attributes:
         toward: Direction to the light in the world, of any length except 0.
         irradiance: R, G, B on a surface that faces the light; not negative.
-        visibility: float tensor [H, W], share of the light that reaches the smoke at a pixel; None: all of it.
     """
 
     toward: tuple[float, float, float]
     irradiance: tuple[float, float, float] = (4 * math.pi,) * 3
-    visibility: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -61,78 +50,6 @@ class Ramp:
         return (1 - share) * colours[after - 1] + share * colours[after]
 
 
-def obstacle_visibility(
-    depth: torch.Tensor,
-    camera: Camera,
-    toward: Sequence[float] | np.ndarray,
-    vertices: torch.Tensor,
-    triangles: torch.Tensor,
-    *,
-    resolution: int = SHADOW_MAP,
-    bias: float | None = None,
-) -> torch.Tensor:
-    """Computes the share of a light that reaches the smoke's surface past obstacles, by a shadow map (section 4.5).
-
-    The map is rendered from the light. Each pixel is looked up only at the depth of its smoke's surface.
-
-    Args:
-        depth: float32 [H, W], distance along the ray to the smoke's surface; 0: none.
-        camera: Camera of the depths.
-        toward: [3], direction to the light in the world, of any length except 0.
-        vertices: float32 [V, 3], corners of the obstacles in the world.
-        triangles: int32 or int64 [F, 3], rows of the vertices.
-        resolution: Texels along an edge of the shadow map, at least 8.
-        bias: Distance in the world's unit by which an obstacle must be nearer to the light to shadow it, at least 0;
-            None: 1.5 texels.
-
-    Returns:
-        float32 [H, W] in [0, 1], bilinear between four texels; 1 where there is no smoke.
-
-    Raises:
-        ValueError: A shape is wrong, the direction has no length, or the map is too small.
-    """
-    size = (camera.height, camera.width)
-    if depth.shape != size:
-        raise ValueError(f"depth: expected {size}, got {tuple(depth.shape)}")
-    direction = unit(toward)
-    lit = torch.ones(size, dtype=torch.float32, device=depth.device)
-    if resolution < _SMALLEST_MAP:
-        raise ValueError(f"resolution: expected at least {_SMALLEST_MAP}, got {resolution}")
-    if bias is not None and not bias >= 0:
-        raise ValueError(f"bias: expected at least 0, got {bias}")
-    if not len(triangles):
-        return lit
-    with stream(device_name(depth.device)):
-        arrays = to_warp(vertices.float().contiguous(), wp.vec3), to_warp(triangles.int().contiguous())
-        surface = to_warp(depth.float().contiguous())
-        cast_shadow(*arrays, light_axes(direction), camera.in_world(), surface, to_warp(lit), resolution, bias)
-    return lit
-
-
 def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
     """Returns the rows of three axes, 9 numbers, of which the third points to a light."""
     return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
-
-
-def cast_shadow(
-    points: wp.array,
-    triangles: wp.array,
-    axes: Sequence[float],
-    view: View,
-    depth: wp.array,
-    out: wp.array,
-    resolution: int = SHADOW_MAP,
-    bias: float | None = None,
-) -> None:
-    """Runs `obstacle_visibility` on arrays that stay in place, without checks; a CUDA graph can capture it.
-
-    Args:
-        points, triangles: vec3 [V] and int32 [F, 3], at least one.
-        axes: Result of `light_axes`.
-        view: Result of `Camera.in_world`.
-        depth, out: float [H, W].
-        resolution, bias: As for `obstacle_visibility`.
-    """
-    options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
-    memory = torch_memory(wp.device_to_torch(depth.device))
-    shadow.visibility(points, triangles, axes, view, depth, out, **options, empty=memory)

@@ -103,66 +103,54 @@ def simulate(
             frame before the saved state is missing; or another process is writing the folder.
     """
     with locked(frames.path):
-        return _simulate(frames, solver, device, resume, checkpoint_every, velocity, progress)
-
-
-def _simulate(
-    frames: Frames,
-    solver: fluid.Solver | None,
-    device: str,
-    resume: bool,
-    checkpoint_every: float,
-    velocity: bool,
-    progress: OnProgress | None,
-) -> int:
-    """Runs `simulate` in the locked folder."""
-    scene, checkpoint = frames.scene, frames.path / CHECKPOINT
-    missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
-    saved = resume and checkpoint.exists()
-    if resume and not saved and not missing:
-        return scene.frames + 1
-    if solver is None:
-        solver = make_solver(scene, device=device)
-    per_frame = scene.steps // scene.smoke.substeps
-    begun = 0  # steps of earlier runs
-    if saved:
-        solver.load(checkpoint)
-        begun = solver.steps
-    done = begun // per_frame
-    if saved and missing and missing[0] <= done:
-        raise WlmError(
-            f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
-            " found none; start anew without --resume"
-        )
-    sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
-    pace = Pace(checkpoint_every)
-    for frame in range(done + 1, scene.frames + 1):
-        begin = time.perf_counter()
-        for step in range(solver.steps % per_frame, per_frame):
-            _step(scene, solver, sources, frame - 1 + step / per_frame)
-            last = step + 1 == per_frame
-            if last:
-                solver.check()
-                volume = volume_of(scene, solver)
-                # Written before the state: a state without its frame could not be resumed.
-                if velocity:
-                    write_velocity(velocity_file(frames.path, frame), solver.velocity, scene.grid.cell * scene.steps)
-                save_volume(frames.file(frame), volume, bricks=True)
-            if pace.due():
-                with pace.saving():
+        scene, checkpoint = frames.scene, frames.path / CHECKPOINT
+        reach = scene.grid.cell * scene.steps
+        missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
+        saved = resume and checkpoint.exists()
+        if resume and not saved and not missing:
+            return scene.frames + 1
+        if solver is None:
+            solver = make_solver(scene, device=device)
+        per_frame = scene.steps // scene.smoke.substeps
+        begun = 0  # steps of earlier runs
+        if saved:
+            solver.load(checkpoint)
+            begun = solver.steps
+        done = begun // per_frame
+        if saved and missing and missing[0] <= done:
+            raise WlmError(
+                f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
+                " found none; start anew without --resume"
+            )
+        sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
+        pace = Pace(checkpoint_every)
+        for frame in range(done + 1, scene.frames + 1):
+            begin = time.perf_counter()
+            for step in range(solver.steps % per_frame, per_frame):
+                _step(scene, solver, sources, frame - 1 + step / per_frame)
+                last = step + 1 == per_frame
+                if last:
+                    solver.check()
+                    volume = volume_of(scene, solver)
+                    # Written before the state: a state without its frame could not be resumed.
+                    if velocity:
+                        write_velocity(velocity_file(frames.path, frame), solver.velocity, reach)
+                    save_volume(frames.file(frame), volume, bricks=True)
+                if pace.due():
+                    with pace.saving():
+                        solver.save(checkpoint)
+                try:
+                    if last and progress is not None:
+                        mass = float(volume.density.double().sum()) * volume.voxel**3
+                        meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
+                    elif meter.due(frame - 1):
+                        meter.report(frame - 1)
+                except KeyboardInterrupt:
                     solver.save(checkpoint)
-            try:
-                if last and progress is not None:
-                    mass = float(volume.density.double().sum()) * volume.voxel**3
-                    meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
-                elif meter.due(frame - 1):
-                    meter.report(frame - 1)
-            except KeyboardInterrupt:
-                solver.save(checkpoint)
-                raise
-    if begun <= scene.frames * per_frame:
-        checkpoint.unlink(missing_ok=True)
-    return min(done, scene.frames) + 1
+                    raise
+        if begun <= scene.frames * per_frame:
+            checkpoint.unlink(missing_ok=True)
+        return min(done, scene.frames) + 1
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:

@@ -37,7 +37,7 @@ def open_scene(
         mesh: The scene that the light belongs to; for lightmaps with their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Array of a probe file with several.
-        walk: Viewpoints of the cascaded volume, as `wlm probe volume --path` takes.
+        walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
         block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
         extinction: Extinction of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped, although its mesh is known.

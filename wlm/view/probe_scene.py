@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
+from wlm.formats.hdr_blocks import need
 from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
@@ -21,7 +22,6 @@ from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import Light, StoredLight
 from wlm.probe.volume.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
-from wlm.view.rendering import import_pyvista
 from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import compared
 
@@ -293,7 +293,7 @@ def _mean(values: np.ndarray) -> str:
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
-    sphere = import_pyvista("view").Icosphere(nsub=subdivisions)
+    sphere = need("pyvista", "view").Icosphere(nsub=subdivisions)
     points = np.asarray(sphere.points, np.float64)
     return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
 

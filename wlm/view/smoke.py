@@ -1,4 +1,4 @@
-"""Pictures of smoke: frames under a scene's lights with its obstacles, guiding maps, lightmaps, training samples."""
+"""Pictures of smoke under lights, with the obstacles of a scene."""
 
 import math
 from collections.abc import Sequence
@@ -7,18 +7,17 @@ import numpy as np
 import torch
 import warp as wp
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.ops.raster import rasterize
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import Guide
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
+from wlm.smoke.shading import Light, Ramp, light_axes
 from wlm.smoke.transport.lighting import LitSmoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
-from wlm.view.pictures import to_bytes
 from wlm_kernels.smoke import picture as kernels
+from wlm_kernels.smoke import shadow
 
 # Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
 _AMBIENT = 0.2
@@ -55,7 +54,7 @@ class Drawing:
 
         Args:
             camera: The view.
-            lights: Any number. If there are obstacles, the lights' visibility is replaced by the obstacles' shadows.
+            lights: Any number.
             albedo: R, G, B single-scattering albedo, applied to light scattered once.
             background: A linear colour.
             ramp: Colour of the emission; None: grey.
@@ -64,31 +63,25 @@ class Drawing:
             device: A device as `wlm.interop.check_device` returns it.
 
         Raises:
-            ValueError: A light has no direction, a negative irradiance or a visibility of another shape; the albedo is
-                out of range; or the rule is unknown.
+            ValueError: A light has no direction or a negative irradiance; the albedo is out of range; or the rule is
+                unknown.
         """
         self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
         self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))
         height, width = camera.height, camera.width
-        colours, toward, shares, visible = [], [], [], []
+        colours, toward, shares = [], [], []
         for light in lights:
             if isinstance(light, Light):
                 colours.append(checked_colour("irradiance", light.irradiance))
                 toward.append(unit(light.toward))
                 shares.append(weights(camera.axes @ toward[-1], rule))
-                visible.append(light.visibility)
             else:
                 colours.append(checked_colour("intensity", light.intensity))
                 toward.append(np.zeros(3))
-                shares.append(np.zeros(6))
-                visible.append(None)
-            if visible[-1] is not None and tuple(visible[-1].shape) != (height, width):
-                raise ValueError(f"visibility: expected {(height, width)}, got {tuple(visible[-1].shape)}")
+                shares.append(np.zeros(len(DIRECTIONS)))
 
-        def put(
-            values: Sequence | np.ndarray, shape: tuple[int, ...], kind: torch.dtype = torch.float32
-        ) -> torch.Tensor:
-            return torch.tensor(np.asarray(values), dtype=kind).reshape(shape).to(device)
+        def put(values: Sequence | np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
+            return torch.tensor(np.asarray(values), dtype=torch.float32).reshape(shape).to(device)
 
         with stream(device):
             self.image = torch.zeros((height, width, 3), device=device)
@@ -96,14 +89,11 @@ class Drawing:
             self.solid_depth = torch.full((height, width), math.inf, device=device)
             self._axes = [light_axes(way) if way.any() else None for way in toward]
             self._visibility = torch.ones((len(lights), height, width), device=device)
-            for own, seen in zip(self._visibility, visible, strict=True):
-                if seen is not None:
-                    own.copy_(seen)
             # At least one row: an empty array has no memory.
             rows = max(len(lights), 1)
-            more = [np.zeros((rows - len(lights), n)) for n in (3, 3, 6)]
-            parts = zip((toward, colours, shares), more, strict=True)
-            self._lamps = tuple(put([*values, *zeros], (rows, zeros.shape[1])) for values, zeros in parts)
+            zeros = np.zeros((rows - len(lights), 3))
+            self._lamps = tuple(put([*values, *zeros], (rows, 3)) for values in (toward, colours))
+            self._shares = put(shares, (len(lights), len(DIRECTIONS)))
             self._ramp = None if ramp is None else (put(ramp.stops, (-1,)), put(ramp.colours, (-1, 3)))
             if self._obstacles:
                 points, triangles, owner = (torch.from_numpy(part).to(device) for part in obstacle_mesh(obstacles, 0.0))
@@ -157,17 +147,17 @@ class Drawing:
                 surface, mesh = to_warp(seen.depth.contiguous()), self._as_solids()
                 for axes, own in zip(self._axes, self._visibility, strict=True):
                     if axes is not None:
-                        cast_shadow(mesh.points, mesh.triangles, axes, self._camera.in_world(), surface, to_warp(own))
+                        mesh_and_light = mesh.points, mesh.triangles, axes, self._camera.in_world()
+                        shadow.visibility(*mesh_and_light, surface, to_warp(own), empty=torch_memory(own.device))
                 solids = surface, to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
             glow = self._glow_of(seen.emission, None if six is not None else seen.thrown)
             transparency = to_warp(seen.transparency.float().contiguous())
             image, common = to_warp(self.image, wp.vec3), (self._as_lamps(), self._background, solids)
             if six is not None:
-                lightmaps = to_warp(six.lightmaps.float().contiguous())
-                kernels.compose(lightmaps, transparency, glow, self._albedo, *common, image)
+                planes = self._of_albedo((self._shares[:, :, None, None] * six.lightmaps.float()).sum(1))
             else:
                 planes = smoke.planes if isinstance(smoke, ScatteredSmoke) else self._of_albedo(smoke.planes)
-                kernels.compose_lights(to_warp(planes, wp.vec3), transparency, glow, *common, image)
+            kernels.compose(to_warp(planes, wp.vec3), transparency, glow, *common, image)
         return self.image
 
     def _of_albedo(self, planes: torch.Tensor) -> torch.Tensor:
@@ -175,7 +165,7 @@ class Drawing:
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Light that the smoke emits, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
+        """Returns emitted light, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
         if emission is None:
             return None
         ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))
@@ -190,31 +180,10 @@ class Drawing:
         return kernels.Solids(to_warp(points, wp.vec3), to_warp(triangles), to_warp(owner), to_warp(tints, wp.vec3))
 
     def _as_lamps(self) -> kernels.Lamps:
-        toward, irradiance, shares = self._lamps
+        toward, irradiance = self._lamps
         visibility = self._visibility if len(self._axes) else self.solid_depth[None]
-        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(shares), to_warp(visibility)
+        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(visibility)
         return kernels.Lamps(len(self._axes), *arrays)
-
-
-def draw_obstacles(
-    obstacles: Sequence[ObstacleSettings], time: float, camera: Camera, lights: Sequence[Light], device: str = "cpu"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draws diffuse obstacles under directional lights, without shadows on each other or from the smoke.
-
-    Args:
-        obstacles: Any number.
-        time: Seconds.
-        camera: The view.
-        lights: Any number.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        Light float32 [H, W, 3], and the distance along the ray float32 [H, W], infinite where there is no obstacle.
-    """
-    drawing = Drawing(camera, lights, obstacles=obstacles, device=device)
-    drawing.move(time)
-    drawing.draw_obstacles()
-    return drawing.solid_light, drawing.solid_depth
 
 
 def picture(
@@ -251,31 +220,3 @@ def picture(
     drawing = Drawing(lit.camera, lit.lights if lights is None else lights, **options, device=device)
     drawing.move(time)
     return drawing(smoke)
-
-
-def six_pictures(six: SixWay, white: float = 1.0) -> dict[str, np.ndarray]:
-    """The lightmaps, the opacity and, for hot smoke, the emission as pictures uint8 [H, W, 3], by name."""
-    planes = {name: six[name] for name in DIRECTIONS}
-    if six.transparency is not None:
-        planes["alpha"] = 1.0 - six.transparency
-    if six.emission is not None:
-        planes["emission"] = six.emission
-    return {name: to_bytes(plane, 1.0 if name == "alpha" else white) for name, plane in planes.items()}
-
-
-def guide_pictures(guide: Guide, white: float = 2.0) -> dict[str, np.ndarray]:
-    """Light, transparency and depth as pictures uint8 [H, W, 3], by name; near is white, no smoke is black."""
-    depth = guide.depth.cpu()
-    smoke = depth > 0
-    near, far = (float(depth[smoke].min()), float(depth[smoke].max())) if smoke.any() else (0.0, 0.0)
-    grey = torch.where(smoke, 1.0 - 0.8 * (depth - near) / max(far - near, 1e-12), 0.0)
-    return {
-        "light": to_bytes(guide.light, white),
-        "transparency": to_bytes(guide.transparency),
-        "depth": _grey(grey),
-    }
-
-
-def _grey(plane: torch.Tensor) -> np.ndarray:
-    levels = (plane.float().clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
-    return np.repeat(levels[..., None], 3, axis=2)

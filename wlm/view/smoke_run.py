@@ -5,10 +5,8 @@ which has its own graph.
 """
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -16,13 +14,13 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide
+from wlm.smoke.march.coarse import bake_coarse, coarse_march, guide
 from wlm.smoke.march.launch import VolumeGraph
 from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.scene import Scene, make_camera
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lights import AnyLight
-from wlm.smoke.transport.orders import OrdersModel, ScatteredSmoke, scatter
+from wlm.smoke.transport.orders import ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
 from wlm.view.pictures import to_bytes
 from wlm.view.smoke import Drawing
@@ -31,71 +29,40 @@ from wlm_kernels.smoke.settings import March
 SIMULATION, DRAWING, GRAPH, BYTES = "simulation", "shadows and picture", "one graph", "bytes"
 """Names of the stages of a frame, besides that of the lighting. A graph covers the lighting and the picture."""
 
-MARCH = 130
-"""Default number of steps of the march along the longest edge."""
-
 _STAGED = 4  # frames whose stages are measured one by one before a graph replaces them
 _SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows fall, if a network makes the lightmaps
 
 
-class Lighting(ABC):
-    """A way to light the smoke of a frame, with the name of its stage."""
-
-    stage: ClassVar[str]
-    in_graph = True
-    """Whether it never waits for the device, so that a graph can capture it."""
-
-    @abstractmethod
-    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights the smoke on its device; the result has the depth of its surface."""
-
-
 @dataclass(frozen=True)
-class AllOrders(Lighting):
-    """Light of all orders of each light and of fire.
+class Lighting:
+    """A way to light the smoke of a frame.
 
     Attributes:
-        albedo: R, G, B single-scattering albedo.
-        model: The learned mix; None for the one that is part of the package.
-        step: Step of the march in voxels; None for that of `orders_march`.
+        albedo: R, G, B, for light of all orders of each light and of fire; None: light scattered once, by six-way
+            lightmaps, as engines show it.
+        network: Network that makes the lightmaps; None: a coarse march.
     """
 
-    albedo: Sequence[float] = (1.0, 1.0, 1.0)
-    model: OrdersModel | None = None
-    step: float | None = None
-    stage = "light of all orders"
-
-    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> ScatteredSmoke:
-        march = None if self.step is None else March(step=self.step, jitter=0.0)
-        return scatter(volume, camera, lights, self.albedo, march=march, model=self.model)
-
-
-@dataclass(frozen=True)
-class SixWays(Lighting):
-    """Light scattered once, by six-way lightmaps, as engines show it.
-
-    Attributes:
-        step: Step of the march in voxels; None for 1 / `MARCH` of the longest edge.
-        network: Network that makes the lightmaps; None for the march.
-        seed: Seed of the march's jitter.
-    """
-
-    step: float | None = None
+    albedo: Sequence[float] | None = (1.0, 1.0, 1.0)
     network: SmokePredictor | None = None
-    seed: int = 0
-    stage = "lightmaps"
 
     @property
-    def in_graph(self) -> bool:  # type: ignore[override]
+    def stage(self) -> str:
+        """Name of the stage in the table of durations."""
+        return "lightmaps" if self.albedo is None else "light of all orders"
+
+    @property
+    def in_graph(self) -> bool:
+        """Whether the lighting never waits for the device, so that a graph can capture it."""
         return self.network is None
 
-    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay:
+    def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
+        """Lights the smoke on its device; the result has the depth of its surface."""
+        if self.albedo is not None:
+            return scatter(volume, camera, lights, self.albedo)
         if self.network is None:
-            longest = max(volume.shape)
-            return bake_coarse(
-                volume, camera, March(longest / MARCH if self.step is None else self.step, seed=self.seed)
-            )
-        six = self.network(volume, camera, self.seed)
+            return bake_coarse(volume, camera, coarse_march(volume))
+        six = self.network(volume, camera)
         return replace(six, depth=guide(volume, camera, _SURFACE).depth)
 
 
@@ -126,9 +93,9 @@ def run(
 
     Args:
         scene: The scene; six-way lighting needs an orthographic camera.
-        lighting: The lighting; None for light of all orders with the scene's albedo.
-        white: The light that becomes white.
-        device: A device as `wlm.interop.check_device` returns it.
+        lighting: The lighting; None: light of all orders with the scene's albedo.
+        white: Radiance that becomes white.
+        device: Result of `wlm.interop.check_device`.
         progress: Called after each frame.
 
     Yields:
@@ -138,7 +105,7 @@ def run(
         ValueError: Six-way lighting with a perspective camera.
         WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; or the simulation diverged.
     """
-    lighting = AllOrders(scene.smoke.albedo) if lighting is None else lighting
+    lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
     camera = make_camera(scene.camera, scene.grid.origin, scene.grid.size)
     looks, lights = scene.looks(1), [light.light() for light in scene.lights]

@@ -11,10 +11,12 @@ from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.formats.hdr_blocks import need
 from wlm.system import Meter, OnProgress
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.display import TONES
-from wlm.view.rendering import import_pyvista, require_opengl
+from wlm.view.pictures import save_png
+from wlm.view.rendering import require_opengl
 from wlm.view.scene import Scene, Slider, State
 
 MOVIES = {".gif": "GIF", ".webp": "WEBP"}
@@ -63,8 +65,8 @@ class Window:
         Raises:
             WlmError: pyvista is missing, VTK finds no OpenGL, there is no display, or the scene cannot be drawn.
         """
-        pyvista = import_pyvista("view")
-        require_opengl("view")
+        pyvista = need("pyvista", "view")
+        require_opengl()
         self.scene, self.playing, self._rate = scene, False, rate
         common = [_EXPOSURE] + [_ERROR] * ("error" in scene.panels)
         self.sliders = {slider.name: slider for slider in (*scene.sliders, *common)}
@@ -188,8 +190,7 @@ class Window:
         Raises:
             WlmError: The file cannot be written.
         """
-        with atomic_path(path) as temporary:
-            Image.fromarray(self.picture()).save(temporary, format="PNG")
+        save_png(path, self.picture())
 
     def movie(
         self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None

@@ -1,7 +1,4 @@
-"""Decoding probes from principal components: a thread for each number of a probe.
-
-The reference to read first: `components64` of `wlm/probe/exact.py`.
-"""
+"""Decoding probes from principal components, one thread per number; the reference is in `wlm/probe/exact.py`."""
 
 import warp as wp
 

@@ -1,20 +1,13 @@
 """Lists of the Gaussians that may reach each cube of a grid (gaussian-probe-compression, section 3.2).
 
-Count the cubes of each Gaussian, add the counts up, write the pairs (cube, Gaussian), sort them by cube, and find where
-each cube's begin. The sort keeps equal keys in order, so a cube lists its Gaussians by rising number and a sum over a
-list adds in the same order every time, the order of a sum over all Gaussians.
+`build` counts the cubes of each Gaussian, adds the counts up, writes the pairs (cube, Gaussian), sorts them by cube,
+and finds where each cube's pairs begin. The sort is stable: a cube lists its Gaussians by rising number, so that a sum
+over a list always adds in the order of a sum over all Gaussians.
 
-Whether a cube lists a Gaussian is one of three tests:
-
-    sphere  it meets the sphere round the centre as wide as the longest axis reaches (eq. 6);
-    box     it meets the box round the ellipsoid;
-    exact   it meets the ellipsoid itself, and so passes the other two.
-
-All are made looser by more than what float32 loses, so no list lacks a Gaussian that reaches a point of its cube.
-Cubes at the border of the grid have no outer faces but go on for ever: a point outside takes the nearest cube's list,
-and that list is right for it too.
-
-The twin to read first: `reach` and `nearest` in `tests/reference/gaussians.py`.
+A cube lists a Gaussian if it meets the Gaussian's support, an ellipsoid or a sphere (eq. 6). Supports are enlarged by
+more than the rounding of float32, so that no list lacks a Gaussian that reaches a point of its cube. Cubes at the
+border of the grid extend to infinity, since a point outside uses the list of the nearest cube. The reference is `reach`
+and `nearest` in `tests/reference/gaussians.py`.
 """
 
 import math
@@ -24,25 +17,21 @@ import warp as wp
 
 from wlm_kernels.probe.gaussians import Shape
 
-TESTS = ("box", "sphere", "exact")
-
-# Sorting takes twice as many entries, and Warp counts an array's entries in 31 bits.
+# Sorting takes twice the entries, and Warp counts an array's entries in 31 bits.
 MOST_PAIRS = 2**30 - 1
 
-# A size that we choose. Finer cubes make shorter sums (a quarter of the reach against all of it: 1.2 to 1.6 times as
-# quick, measured) and more and longer work to make the lists.
+# Finer cubes make shorter sums, and lists that take longer to build. Cubes of a quarter of the reach sum 1.2 to 1.6
+# times as fast as cubes of the whole reach.
 _FIRST_SIZE = 0.25  # of the median reach
 _CUBES_EACH = 8  # cubes a Gaussian
 _PAIRS_EACH = 256  # pairs a Gaussian
 _FEW = 4096  # cubes and pairs that are always allowed
 
-# What a reach may lack by rounding, as a share of it: a Gaussian 100 times as long as wide, the most that u is computed
-# in float32 for, is off by about 1e-5.
+# Enlargement of a reach against rounding, as a share of it: u is computed in float32 for Gaussians up to 100 times as
+# long as wide, whose error is about 1e-5.
 REACH_MARGIN = wp.constant(1.0e-4)
-# And where a point or a face of a cube may be, as a share of the grid's largest coordinate: a few float32 roundings.
+# Enlargement of a cube, as a share of the grid's largest coordinate: a few float32 roundings.
 _PLACE_MARGIN = wp.constant(1.0e-6)
-
-_BOX, _SPHERE, _EXACT = (wp.constant(TESTS.index(test)) for test in ("box", "sphere", "exact"))
 
 
 @wp.struct
@@ -53,8 +42,8 @@ class Cubes:
         low: Lowest corner of the grid.
         size: Side of a cube.
         counts: Cubes along each axis; C in all.
-        start: [C + 1], where each cube's list begins in `item`; the last is the number of pairs.
-        item: [pairs], numbers of Gaussians, rising within a list.
+        start: [C + 1], index in `item` at which each cube's list begins; the last entry is the number of pairs.
+        item: [pairs], indices of Gaussians, rising within a list.
     """
 
     low: wp.vec3
@@ -67,7 +56,7 @@ class Cubes:
 @wp.func
 def _place(x: float, low: float, size: float, count: int) -> int:
     t = (x - low) / size
-    if t > 0.0:  # not where x is NaN, which no int could hold
+    if t > 0.0:  # false for NaN, which cannot be cast to int
         if t < float(count - 1):
             return int(t)
         return count - 1
@@ -103,7 +92,7 @@ def _place_margin(cubes: Cubes) -> float:
 def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
     """Returns the first and last cube along each axis that meet the box of half side `reach` around `centre`.
 
-    All cells where these aren't numbers: what can't be told here is tested again at each point.
+    If these are NaN or infinite, it returns the whole grid, since each point is tested again.
     """
     pad = _place_margin(cubes)
     wide = (1.0 + REACH_MARGIN) * reach + wp.vec3(pad, pad, pad)
@@ -154,11 +143,10 @@ def _on_face(
 def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
     """Returns the least |W d|^2 for d in a box, exact except for rounding.
 
-    A convex function's least point in a convex set, where its least point of all lies outside, is on the set's border,
-    and there on a face that has the two on different sides: were it not, a step towards the least point of all would
-    stay in the set and go down. So the faces of the box that are seen from d = 0 hold it, three at most, and on a face
-    where the least point of its plane lies outside, an edge that is seen from there, two at most, does. A face or an
-    edge at infinity is never seen.
+    The minimum of a convex function over a box that does not contain its global minimum d = 0 is on a face whose plane
+    separates the box from d = 0, of which there are at most three: otherwise a step towards d = 0 would stay in the box
+    and reduce the value. Likewise, if the minimum over the plane of that face is outside the face, the minimum over the
+    face is on one of at most two edges. A face or an edge at infinity separates nothing.
     """
     zero = wp.float64(0.0)
     best = wp.float64(wp.inf)
@@ -185,33 +173,20 @@ def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
 
 
 @wp.func
-def _limit(shape: Shape, test: int) -> float:
-    """Returns the bound of a test: the squared radius of a sphere, or the squared cut of an ellipsoid."""
+def _limit(shape: Shape) -> float:
+    """Returns the bound of the test: the squared radius of a sphere, or the squared cut of an ellipsoid."""
     if shape.radius > 0.0:
         return shape.radius
     w = shape.whiten
     scale = wp.vec3(1.0 / wp.length(w[0]), 1.0 / wp.length(w[1]), 1.0 / wp.length(w[2]))
-    # The box round an ellipsoid is as long across its corners as the box along its own axes.
-    cut = wp.length_sq(shape.reach) / wp.length_sq(scale)
-    if test == _SPHERE:
-        longest = wp.max(scale)
-        return cut * longest * longest
-    return cut
+    # The diagonal of an ellipsoid's bounding box does not depend on its rotation.
+    return wp.length_sq(shape.reach) / wp.length_sq(scale)
 
 
 @wp.func
-def _span_of(cubes: Cubes, shape: Shape, limit: float, test: int):
-    reach = shape.reach
-    if test == _SPHERE:
-        radius = wp.sqrt(limit)
-        reach = wp.vec3(radius, radius, radius)
-    return span(cubes, shape.centre, reach)
-
-
-@wp.func
-def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i, test: int) -> bool:
-    """Returns whether a cube of the span also passes the test."""
-    if test == _BOX or not wp.isfinite(shape.reach):
+def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i) -> bool:
+    """Returns whether a cube of the span meets the support itself."""
+    if not wp.isfinite(shape.reach):
         return True
     pad = _place_margin(cubes)
     low = wp.vec3()
@@ -222,7 +197,7 @@ def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i, test: int) 
         low[a] = wp.where(cell[a] == 0, -wp.inf, below)
         high[a] = wp.where(cell[a] == cubes.counts[a] - 1, wp.inf, above)
     loose = limit * (1.0 + REACH_MARGIN) * (1.0 + REACH_MARGIN)
-    if test == _SPHERE or shape.radius > 0.0:
+    if shape.radius > 0.0:
         return not wp.length_sq(wp.max(low, wp.vec3()) + wp.min(high, wp.vec3())) > loose
     whiten = wp.mat33d(shape.whiten) + wp.mat33d(shape.rest)
     return not _nearest(whiten, wp.vec3d(low), wp.vec3d(high)) > wp.float64(loose)
@@ -233,12 +208,11 @@ def _candidates(
     # in:
     shapes: wp.array1d[Shape],
     cubes: Cubes,
-    test: int,
     # out:
     counts: wp.array1d[wp.int64],
 ):
     k = wp.tid()
-    first, last = _span_of(cubes, shapes[k], _limit(shapes[k], test), test)
+    first, last = span(cubes, shapes[k].centre, shapes[k].reach)
     size = last - first + wp.vec3i(1, 1, 1)
     counts[k] = wp.int64(size[0]) * wp.int64(size[1]) * wp.int64(size[2])
 
@@ -248,19 +222,18 @@ def _count(
     # in:
     shapes: wp.array1d[Shape],
     cubes: Cubes,
-    test: int,
     # out:
     counts: wp.array1d[int],
 ):
     k = wp.tid()
     shape = shapes[k]
-    limit = _limit(shape, test)
-    first, last = _span_of(cubes, shape, limit, test)
+    limit = _limit(shape)
+    first, last = span(cubes, shape.centre, shape.reach)
     count = int(0)
     for x in range(first[0], last[0] + 1):
         for y in range(first[1], last[1] + 1):
             for z in range(first[2], last[2] + 1):
-                if _meets(cubes, shape, limit, wp.vec3i(x, y, z), test):
+                if _meets(cubes, shape, limit, wp.vec3i(x, y, z)):
                     count += 1
     counts[k] = count
 
@@ -270,7 +243,6 @@ def _emit(
     # in:
     shapes: wp.array1d[Shape],
     cubes: Cubes,
-    test: int,
     offsets: wp.array1d[int],
     # out:
     keys: wp.array1d[int],
@@ -278,14 +250,14 @@ def _emit(
 ):
     k = wp.tid()
     shape = shapes[k]
-    limit = _limit(shape, test)
-    first, last = _span_of(cubes, shape, limit, test)
+    limit = _limit(shape)
+    first, last = span(cubes, shape.centre, shape.reach)
     place = offsets[k]
     for x in range(first[0], last[0] + 1):
         for y in range(first[1], last[1] + 1):
             for z in range(first[2], last[2] + 1):
                 cell = wp.vec3i(x, y, z)
-                if _meets(cubes, shape, limit, cell, test):
+                if _meets(cubes, shape, limit, cell):
                     keys[place] = _number(cubes, cell)
                     items[place] = k
                     place += 1
@@ -300,7 +272,7 @@ def _find_starts(
     start: wp.array1d[int],
 ):
     key = wp.tid()
-    # It never answers the end that it is given; given one more it can answer `count`, and still reads no further.
+    # `lower_bound` never returns its end; with an end of count + 1 it can return `count`, and reads no entry beyond.
     start[key] = wp.lower_bound(keys, 0, count + 1, key)
 
 
@@ -308,43 +280,38 @@ def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
     """Sorts pairs by their first number, in a stable order.
 
     Args:
-        keys: int [2 * count], numbers of cubes; the second half is room to work in.
-        items: int [2 * count], what goes with them.
-        count: Pairs.
+        keys: int [2 * count], indices of cubes; the second half is scratch memory.
+        items: int [2 * count], second numbers of the pairs, likewise.
+        count: Number of pairs.
         cubes: C.
-        start: int [C + 1], written: where each cube's pairs begin.
+        start: int [C + 1], written: index at which each cube's pairs begin.
     """
     wp.utils.radix_sort_pairs(keys, items, count, end_bit=max(1, (cubes - 1).bit_length()))
     wp.launch(_find_starts, cubes + 1, inputs=[keys, count], outputs=[start], device=keys.device)
 
 
-def build(shapes, low, high, size: float | None = None, *, test: str = "box") -> Cubes:
+def build(shapes, low, high, size: float | None = None) -> Cubes:
     """Builds the lists of a grid over a box.
-
-    Without a size the cubes begin a quarter as wide as the median Gaussian reaches along its widest axis, and double
-    until there are no more than 8 cubes and 256 pairs to test a Gaussian (4,096 more of either are always allowed).
 
     Args:
         shapes: Shape [K], made for the cut and support that the sums will have.
         low, high: Three numbers each, lowest and highest corner of the points' box; it may be flat along any axis.
-        size: Side of a cube, positive, in the frame of the points; None: chosen.
-        test: "box", "sphere" or "exact", see the module. Where the Gaussians reach spheres, "exact" is "sphere".
+        size: Side of a cube, positive, in the frame of the points. None: a quarter of the median reach of the Gaussians
+            along their widest axis, doubled until there are at most 8 cubes and 256 pairs to test per Gaussian, and
+            4,096 more of either.
 
     Returns:
         The lists, on the shapes' device.
 
     Raises:
-        ValueError: A wrong argument, or more than `MOST_PAIRS` cubes, or pairs to test; nothing of that size is
-            allocated before.
+        ValueError: An argument is wrong, or there would be more than `MOST_PAIRS` cubes or pairs to test; nothing of
+            that size is allocated before.
     """
-    if test not in TESTS:
-        raise ValueError(f"test: expected one of {', '.join(TESTS)}, got {test!r}")
     corners = np.array([low, high], np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
         raise ValueError(f"low, high: expected two corners of a box, got {low} and {high}")
-    kind = TESTS.index(test)
     if size is None:
-        cubes = _chosen_grid(shapes, corners, kind)
+        cubes = _chosen_grid(shapes, corners)
     elif math.isfinite(size) and size > 0:
         cubes = _grid(corners, size)
     else:
@@ -352,22 +319,22 @@ def build(shapes, low, high, size: float | None = None, *, test: str = "box") ->
     total = math.prod(cubes.counts)
     if total > MOST_PAIRS:
         raise ValueError(f"size: {cubes.size:g} makes {total} cubes, expected at most {MOST_PAIRS}")
-    tested = _tested(shapes, cubes, kind)
+    tested = _tested(shapes, cubes)
     if tested > MOST_PAIRS:
         raise ValueError(f"size: {cubes.size:g} makes {tested} pairs to test, expected at most {MOST_PAIRS}")
 
     device, gaussians = shapes.device, shapes.shape[0]
     counts = wp.empty(gaussians, dtype=int, device=device)
-    wp.launch(_count, gaussians, inputs=[shapes, cubes, kind], outputs=[counts], device=device)
+    wp.launch(_count, gaussians, inputs=[shapes, cubes], outputs=[counts], device=device)
     pairs = int(counts.numpy().sum(dtype=np.int64))
     offsets = wp.empty_like(counts)
     wp.utils.array_scan(counts, offsets, inclusive=False)
     keys, items = (wp.empty(2 * pairs, dtype=int, device=device) for _ in range(2))
-    wp.launch(_emit, gaussians, inputs=[shapes, cubes, kind, offsets], outputs=[keys, items], device=device)
+    wp.launch(_emit, gaussians, inputs=[shapes, cubes, offsets], outputs=[keys, items], device=device)
     cubes.start = wp.empty(total + 1, dtype=int, device=device)
     sort_by_cube(keys, items, pairs, total, cubes.start)
     cubes.item = wp.empty(pairs, dtype=int, device=device)
-    if pairs:  # to `copy` a count of 0 is all
+    if pairs:  # `copy` takes a count of 0 for the whole array
         wp.copy(cubes.item, items, count=pairs)
     return cubes
 
@@ -377,7 +344,7 @@ def everything(count: int, device) -> Cubes:
 
     Args:
         count: K.
-        device: Where the list goes.
+        device: Device of the list.
     """
     cubes = _grid(np.zeros((2, 3)), 1.0)
     cubes.start = wp.array([0, count], dtype=int, device=device)
@@ -389,30 +356,29 @@ def _grid(corners: np.ndarray, size: float) -> Cubes:
     cubes = Cubes()
     cubes.low = wp.vec3(*corners[0])
     cubes.size = size
-    # One too many for a kernel's ints is refused by the caller, whatever it is.
+    # The caller refuses counts above MOST_PAIRS; the clip keeps them within a kernel's ints.
     counts = np.clip(np.ceil((corners[1] - corners[0]) / size), 1, MOST_PAIRS + 1)
     cubes.counts = wp.vec3i(*(int(count) for count in counts))
     return cubes
 
 
-def _tested(shapes, cubes: Cubes, kind: int) -> int:
+def _tested(shapes, cubes: Cubes) -> int:
     """Returns the pairs of cubes and Gaussians to test."""
     counts = wp.empty(shapes.shape[0], dtype=wp.int64, device=shapes.device)
-    wp.launch(_candidates, counts.shape, inputs=[shapes, cubes, kind], outputs=[counts], device=shapes.device)
+    wp.launch(_candidates, counts.shape, inputs=[shapes, cubes], outputs=[counts], device=shapes.device)
     return int(counts.numpy().sum())
 
 
-def _chosen_grid(shapes, corners: np.ndarray, kind: int) -> Cubes:
+def _chosen_grid(shapes, corners: np.ndarray) -> Cubes:
     reach = shapes.numpy()["reach"].max(1, initial=0.0)
     reach = reach[np.isfinite(reach) & (reach > 0)]
     extent = float((corners[1] - corners[0]).max())
-    # Without a Gaussian that reaches, or a box to divide: one cube.
+    # One cube if no Gaussian has a reach, or if the box is a point.
     size = _FIRST_SIZE * float(np.median(reach)) if len(reach) and extent > 0 else max(extent, 1.0)
     count = shapes.shape[0]
     cubes = _grid(corners, size)
     while math.prod(cubes.counts) > 1 and (
-        math.prod(cubes.counts) > _FEW + _CUBES_EACH * count
-        or _tested(shapes, cubes, kind) > _FEW + _PAIRS_EACH * count
+        math.prod(cubes.counts) > _FEW + _CUBES_EACH * count or _tested(shapes, cubes) > _FEW + _PAIRS_EACH * count
     ):
         size *= 2.0
         cubes = _grid(corners, size)

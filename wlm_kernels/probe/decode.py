@@ -1,10 +1,8 @@
 """Decoding points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
 
-On CUDA a block of 128 threads takes up to 64 points: the threads share out the Gaussians that each point's cube lists,
-the sums meet in shared memory, and the network runs on all points together (`native/layers.cuh`, then
-`native/decode.cuh`). On the CPU a thread takes one point.
-
-The twin to read first: `wlm/probe/exact.py`.
+On CUDA a block of 128 threads decodes up to 64 points: several threads share the Gaussians that a point's cube lists,
+their sums are added in shared memory, and the network runs on all points together (`native/layers.cuh`, then
+`native/decode.cuh`). On the CPU a thread decodes one point. The reference is `wlm/probe/exact.py`.
 """
 
 import functools
@@ -25,7 +23,7 @@ class DecodeKernels:
 
     Attributes:
         device_kind: "cpu" or "cuda".
-        points: Points that a block of threads takes on CUDA.
+        points: Points per block of threads on CUDA.
     """
 
     device_kind: str
@@ -37,9 +35,9 @@ class DecodeKernels:
 
         Args:
             rows: float [K, 10 + L].
-            shapes: Shape [K], made of the rows with this cut.
-            cubes: `cubes.Cubes` of the shapes; points outside take the nearest cube's list.
-            cut: How far a Gaussian reaches, in standard deviations.
+            shapes: Shape [K], made from the rows with this cut.
+            cubes: `cubes.Cubes` of the shapes; points outside use the list of the nearest cube.
+            cut: Radius of a support in standard deviations.
             net: float [P], see `network`.
             gain: Factor of the network's outputs.
             x: vec3 [M], in the normalised frame.
@@ -59,7 +57,7 @@ class DecodeKernels:
 
 @functools.cache
 def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> DecodeKernels:
-    """Builds (once) the decode.
+    """Builds the kernel of a shape, once.
 
     Args:
         latent: L >= 1.
@@ -95,7 +93,7 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
             shape = shapes[k]
             while i < end:
                 i += stride
-                # The next one's numbers are under way while this one is summed.
+                # The next Gaussian is loaded while this one is summed.
                 next_k = cubes.item[wp.min(i, end - 1)]
                 next_shape = shapes[next_k]
                 f = add(f, shape, rows, k, x, cut)
@@ -118,7 +116,7 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
     ):
         if wp.static(cuda):
             block, t = wp.tid()
-            # Threads past the end repeat the last point, so that all of a block meet.
+            # Threads past the end repeat the last point, since all threads of a block must synchronise.
             i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
             f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points))
             finish(f, x[i], net, gain, block, x.shape[0], out)

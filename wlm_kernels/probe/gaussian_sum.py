@@ -1,11 +1,9 @@
 """The Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
 
-`cubes` says which Gaussians a point looks at; without it each looks at all, with the same result. `backward` gives
-the gradient of the rows, one Gaussian per thread over the points of the cubes in its reach, `backward_points` that of
-the points, one point per thread: nothing is added by atomics. What a Gaussian reaches is a constant to both. The twin
-in torch is `wlm.ops.plain.gaussian_sum`.
-
-A training step over probes that stand still is quicker by `step`.
+With `cubes` a point only evaluates the Gaussians that its cube lists, with the same result as all. `backward` computes
+the gradient of the rows, one Gaussian per thread over the points of the cubes within its reach; `backward_points` that
+of the points, one point per thread. There are no atomic additions. The gradients treat the set of Gaussians that reach
+a point as constant. The reference is `wlm.ops.plain.gaussian_sum`; for probes that do not move, `step` trains faster.
 """
 
 import functools
@@ -117,11 +115,11 @@ def sum_kernels(latent: int) -> _Kernels:
         sums = vec_sums()
         for a in range(first[0], last[0] + 1):
             for b in range(first[1], last[1] + 1):
-                # Cubes in a row along the last axis are neighbours in memory, and so are their points.
+                # Cubes along the last axis are neighbours in memory, and so are their points.
                 row = (a * cubes.counts[1] + b) * cubes.counts[2]
                 for j in range(start[row + first[2]], start[row + last[2] + 1]):
                     i = order[j]
-                    # Most points aren't reached: look, generously, before loading their gradients.
+                    # Most points are out of reach: a loose test comes before their gradients are loaded.
                     if touches(shape, x[i], REACH_MARGIN * shape.reach):
                         g = vec_latent()
                         for c in range(wp.static(latent)):
@@ -159,51 +157,37 @@ def sum_kernels(latent: int) -> _Kernels:
     return _Kernels(forward, backward, backward_points)
 
 
-def _latent(rows) -> int:
-    latent = rows.shape[1] - LATENT
-    if latent < 1:
-        raise ValueError(f"rows: expected more than {LATENT} columns, got {rows.shape[1]}")
-    return latent
-
-
-def _sphere(support: str) -> int:
-    if support not in SUPPORTS:
-        raise ValueError(f"support: expected one of {', '.join(SUPPORTS)}, got {support!r}")
-    return SUPPORTS.index(support)
-
-
 def shapes(rows, cut: float, support: str = "ellipsoid"):
     """Builds the `Shape` of each row.
 
     Args:
         rows: float [K, 10 + L], see `gaussians`.
-        cut: How far a Gaussian reaches, in standard deviations.
-        support: "ellipsoid": as far along each axis as it is long; "sphere": everywhere as far as along the longest
-            (eq. 6).
+        cut: Radius of a support in standard deviations.
+        support: "ellipsoid", or "sphere": the sphere of the longest axis (eq. 6).
 
     Returns:
         Shape [K].
     """
     out = wp.empty(rows.shape[0], dtype=Shape, device=rows.device)
-    wp.launch(_shapes, out.shape, inputs=[rows, cut, _sphere(support)], outputs=[out], device=rows.device)
+    wp.launch(_shapes, out.shape, inputs=[rows, cut, SUPPORTS.index(support)], outputs=[out], device=rows.device)
     return out
 
 
 def sum(rows, shapes, cubes, x, f, cut: float) -> None:
-    """F(x) = sum of F_k w_k(x) over the Gaussians that reach x (eq. 5).
+    """Computes F(x) = sum of F_k w_k(x) over the Gaussians that reach x (eq. 5).
 
-    Whatever the lists, as long as they lack none that reaches a point, the result is the same to the last bit.
+    The result does not depend on the lists, bit for bit, as long as no list lacks a Gaussian that reaches its points.
 
     Args:
         rows: float [K, 10 + L].
-        shapes: Shape [K], made of the rows with this cut.
-        cubes: `gaussian_cubes.Cubes` of the shapes; None: every point looks at all Gaussians.
-        x: vec3 [N]; one that is NaN is reached by none.
+        shapes: Shape [K], made from the rows with this cut.
+        cubes: `cubes.Cubes` of the shapes; None: every point evaluates all Gaussians.
+        x: vec3 [N]; no Gaussian reaches a point that is NaN.
         f: float [L, N], written.
-        cut: How far a Gaussian reaches, in standard deviations.
+        cut: Radius of a support in standard deviations.
     """
     cubes = cubes or everything(rows.shape[0], rows.device)
-    kernel = sum_kernels(_latent(rows)).forward
+    kernel = sum_kernels(rows.shape[1] - LATENT).forward
     wp.launch(kernel, x.shape, inputs=[rows, shapes, cubes, x, cut], outputs=[f], device=rows.device)
 
 
@@ -217,7 +201,7 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
     """
     device, count = rows.device, x.shape[0]
     cubes = cubes or everything(rows.shape[0], device)
-    kernel = sum_kernels(_latent(rows)).backward
+    kernel = sum_kernels(rows.shape[1] - LATENT).backward
     total = cubes.start.shape[0] - 1
     keys, order = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
     start = wp.empty(total + 1, dtype=int, device=device)
@@ -235,5 +219,5 @@ def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
         grad: vec3 [N], written.
     """
     cubes = cubes or everything(rows.shape[0], rows.device)
-    kernel = sum_kernels(_latent(rows)).backward_points
+    kernel = sum_kernels(rows.shape[1] - LATENT).backward_points
     wp.launch(kernel, x.shape, inputs=[rows, shapes, cubes, x, cut, grad_f], outputs=[grad], device=rows.device)

@@ -5,11 +5,10 @@ S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-`Shape` is a row prepared for use. The backward pass sums, over the points, the symmetric a w u u^T and the vector
-a w u with a = dL/dF . F_k, and `chain` makes gradients of the row of them. No difference of large numbers is left in
-it. Where a Gaussian is a needle or a sheet, u itself is one: it is then computed in float64, for these Gaussians alone.
-
-The twin to read first: `tests/reference/gaussians.py`.
+`Shape` is a row prepared for use. The backward pass sums the symmetric a w u u^T and the vector a w u with
+a = dL/dF . F_k over the points; `chain` converts the sums to gradients of the row, without differences of large
+numbers. For needles and sheets u itself is such a difference: for these Gaussians alone it is computed in float64. The
+reference is `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -18,13 +17,12 @@ from typing import Any
 
 import warp as wp
 
-# Where the latent begins in a row, behind centre, log of the scale and rotation.
-LATENT = 10
+LATENT = 10  # first number of the latent in a row, after centre, log of the scale and rotation
 SHAPE_NUMBERS = 9  # sums for the gradients of centre (3), scale and rotation (6)
 
-# A quaternion shorter than this has no direction left in float32: it stands for no rotation, and gets no gradient.
+# A shorter quaternion has no direction in float32: it is no rotation, and has no gradient.
 _SHORTEST = wp.constant(1.0e-12)
-# Longest over shortest scale from which on u is computed in float64: float32 loses about 1e-7 times this.
+# Ratio of the longest to the shortest scale above which u is computed in float64; float32 loses about 1e-7 times it.
 _SLENDER = wp.constant(100.0)
 
 
@@ -35,10 +33,10 @@ class Shape:
     Attributes:
         centre: In the frame of the points.
         whiten: W = S^-1 R^T.
-        rest: What rounding took from W; zero where it isn't needed.
-        reach: Half the size, along each axis, of the box round the points that it reaches.
-        radius: Of the sphere round its centre that it reaches, squared; 0 where it reaches the ellipsoid alone.
-        slender: 1 where u needs float64.
+        rest: Rounding error of W, for slender Gaussians; else 0.
+        reach: Half the size of the support's bounding box.
+        radius: Squared radius of a spherical support; 0 for an ellipsoid.
+        slender: 1 if u needs float64.
     """
 
     centre: wp.vec3
@@ -73,8 +71,8 @@ def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere
 
     Args:
         centre, log_scale, q: The row's first ten numbers.
-        cut: How far it reaches, in standard deviations.
-        sphere: 1: in every direction as far as along its longest axis (eq. 6); 0: its own ellipsoid.
+        cut: Radius of the support in standard deviations.
+        sphere: 1: the support is the sphere of the longest axis (eq. 6); 0: the ellipsoid.
     """
     s = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     shape = Shape()
@@ -134,17 +132,17 @@ def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
 
 @dataclass(frozen=True)
 class GaussianFunctions:
-    """`wp.func`s for latents of one length. `rows` is float [K, 10 + L], `cut` in standard deviations.
+    """The `wp.func`s for latents of one length; `rows` is float [K, 10 + L], `cut` in standard deviations.
 
     Attributes:
         latent: L.
         vec_latent: vec of L floats.
-        vec_sums: vec of 9 + L floats, what `accumulate` adds up over points.
+        vec_sums: vec of 9 + L floats, sums of `accumulate` over points.
         add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
         accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums with the point x added.
-        slope: (shape, rows, k, x, grad_f, cut) -> what Gaussian k gives to the gradient of x.
-        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; that of the latent is the
-            sums' rest.
+        slope: (shape, rows, k, x, grad_f, cut) -> contribution of Gaussian k to the gradient of x.
+        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; the other sums are that of the
+            latent.
     """
 
     latent: int
@@ -161,7 +159,7 @@ _vec10 = wp.types.vector(LATENT, float)
 
 @functools.cache
 def functions(latent: int) -> GaussianFunctions:
-    """Builds (once) the functions for latents of length L."""
+    """Builds the functions for latents of length L, once."""
     vec_latent = wp.types.vector(latent, float)
     vec_sums = wp.types.vector(SHAPE_NUMBERS + latent, float)
 
@@ -210,7 +208,7 @@ def functions(latent: int) -> GaussianFunctions:
     @wp.func
     def chain(sums: vec_sums, shape: Shape, log_scale: wp.vec3, q: wp.vec4) -> _vec10:
         centre = wp.transpose(shape.whiten) * wp.vec3(sums[0], sums[1], sums[2])
-        # A turn by omega in the Gaussian's own axes moves u by -S^-1 [omega] S u.
+        # A rotation by omega in the Gaussian's own axes changes u by -S^-1 [omega] S u.
         xy = wp.exp(log_scale[0] - log_scale[1])
         yz = wp.exp(log_scale[1] - log_scale[2])
         zx = wp.exp(log_scale[2] - log_scale[0])
@@ -218,7 +216,7 @@ def functions(latent: int) -> GaussianFunctions:
         n = wp.length(q)
         dq = wp.vec4()
         if n >= _SHORTEST:
-            # A unit q turns by dq = q (0, omega) / 2; the gradient has no part along q.
+            # For a unit q, dq = q (0, omega) / 2; the gradient has no component along q.
             h = q / n
             v = wp.vec3(h[1], h[2], h[3])
             vector = h[0] * turn + wp.cross(v, turn)

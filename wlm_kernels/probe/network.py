@@ -1,14 +1,12 @@
-"""The probes' network, forward and backward (gaussian-probe-compression, eq. 7 and 8): loss, and every gradient.
+"""The probes' network, forward and backward (gaussian-probe-compression, eq. 7 and 8): loss and all gradients.
 
-L + 3 inputs, two hidden layers of H units, D outputs. Its weights are one array: for each layer a row for every
-input, then the biases; a row of the last layer is padded to a multiple of four numbers.
+The network has L + 3 inputs, two hidden layers of H units and D outputs. Its weights are one array: for each layer a
+row for every input, then the biases; a row of the last layer is padded to a multiple of four numbers.
 
-On CUDA a block of threads takes up to 64 probes through all layers in shared memory, each thread a piece of 4 probes by
-8 units at a time: fourteen small matrix products, for which one probe per thread would spill its registers. That is
-CUDA C++, in `native/layers.cuh` and `native/network.cuh`. On the CPU a thread takes one probe. Parts of the
-gradient of the weights are written by block, to be added in a fixed order.
-
-The twin to read first: `tests/reference/probe_network.py`.
+On CUDA a block of threads evaluates all layers for up to 64 probes in shared memory; a thread computes 4 probes by 8
+units at a time, since one probe per thread would spill registers. This is CUDA C++, in `native/layers.cuh` and
+`native/network.cuh`. On the CPU a thread evaluates one probe. Each block writes a partial gradient of the weights; the
+partial gradients are added in a fixed order. The reference is `tests/reference/probe_network.py`.
 """
 
 import functools
@@ -21,7 +19,7 @@ from wlm_kernels.native import native_source
 
 THREADS = 128
 _AT_ONCE = (64, 32, 16, 8, 4)
-_SHARED = 47 * 1024  # bytes of shared memory that a block can have without asking for more
+_SHARED = 47 * 1024  # bytes of shared memory that a block has by default, less a reserve
 CPU_LANES = 2
 
 
@@ -31,22 +29,22 @@ def padded(outputs: int) -> int:
 
 
 def most_outputs(latent: int, hidden: int) -> int:
-    """Returns the most outputs with which the fewest probes of a block still fit its shared memory on CUDA."""
+    """Returns the largest number of outputs with which a block of the fewest probes fits its shared memory on CUDA."""
     rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
     return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
 
 
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
-    """Returns the probes per block of threads on CUDA: as many as fit its shared memory, 64 at most.
+    """Returns the probes per block of threads on CUDA that fit its shared memory, 64 at most.
 
-    Above `most_outputs` none fit: the kernels then run on the CPU only, where the number has no meaning.
+    Above `most_outputs` none fit: the kernels then run on the CPU only, where the number has no effect.
     """
     rows = latent + 3 + 2 * hidden + padded(outputs)
     return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns CUDA code for the forward pass of a block of `THREADS` threads: the start of a body, see its file."""
+    """Returns CUDA code of the forward pass of a block, the beginning of a function's body (`native/layers.cuh`)."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
@@ -56,24 +54,13 @@ class NetworkKernels:
     """The network of one shape on one kind of device.
 
     Attributes:
-        latent: L.
-        hidden: H, units of both hidden layers.
-        outputs: D.
         device_kind: "cpu" or "cuda".
-        probes: Probes that a block of threads takes on CUDA.
+        probes: Probes per block of threads on CUDA.
     """
 
-    latent: int
-    hidden: int
-    outputs: int
     device_kind: str
     probes: int
     _kernel: Any
-
-    @property
-    def size(self) -> int:
-        """Length of the array of weights."""
-        return (self.latent + 4) * self.hidden + (self.hidden + 1) * (self.hidden + padded(self.outputs))
 
     def parts(self, probes: int) -> int:
         """Returns the number of partial gradients that a launch over a number of probes writes."""
@@ -84,18 +71,18 @@ class NetworkKernels:
         self._kernel.module.load(wp.get_device(device))
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
-        """Computes the loss, the sum over live probes and numbers of weight * error^2, and its gradients.
+        """Computes the loss, the sum of weight * error^2 over probes and numbers, and its gradients.
 
         Args:
             groups: `step.Groups`.
-            f: float [S, L, N], the Gaussians' sums in S parts.
+            f: float [S, L, N], the Gaussians' sums as S partial sums.
             target: float [D, N].
             weight: float [D].
             net: float [P].
             grad_f: float [L, N], written.
             partial: float [B, P], B = `parts(N)`: written on CUDA, added to on the CPU.
             loss: float [B], likewise.
-            base, count: On the CPU, the probes from `base` on; one lane has base 0.
+            base, count: On the CPU, first probe and number of probes of this launch; one lane has base 0.
         """
         probes = groups.x.shape[0]
         if self.device_kind == "cuda":
@@ -114,7 +101,7 @@ class NetworkKernels:
 
 @functools.cache
 def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> NetworkKernels:
-    """Builds (once) the network.
+    """Builds the network of a shape, once.
 
     Args:
         latent: L >= 1.
@@ -161,17 +148,17 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
 
     else:
         kernel = _cpu_kernel(latent, hidden, outputs)
-    return NetworkKernels(latent, hidden, outputs, device_kind, probes, kernel)
+    return NetworkKernels(device_kind, probes, kernel)
 
 
 @dataclass(frozen=True)
 class CpuNetwork:
-    """The network's `wp.func`s of a CPU thread; vectors of inputs, of units and of padded outputs.
+    """The `wp.func`s of the network of a CPU thread.
 
     Attributes:
-        vec_in, vec_hidden, vec_out: The types.
+        vec_in, vec_hidden, vec_out: Vectors of the inputs, of the units of a layer, and of the padded outputs.
         forward: (net, inputs) -> both hidden layers and the outputs.
-        hidden_row, output_row: (net, at) -> the numbers of the array from `at` on.
+        hidden_row, output_row: (net, at) -> the row of weights that begins at index `at`.
     """
 
     vec_in: Any
@@ -184,7 +171,7 @@ class CpuNetwork:
 
 @functools.cache
 def cpu_network(latent: int, hidden: int, outputs: int) -> CpuNetwork:
-    """Builds (once) the functions of one shape."""
+    """Builds the functions of one shape, once."""
     inputs, wide = latent + 3, padded(outputs)
     second = (inputs + 1) * hidden
     third = second + (hidden + 1) * hidden

@@ -1,15 +1,13 @@
 """A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); `network` has the rest of it.
 
-Probes are sorted along a space-filling curve and taken in groups of 64 neighbours, each with a box. A step is five
-launches: which Gaussians meet which groups, as bit masks (`touch`); the Gaussians' sum at each probe (`features`);
-the network, forward and backward (`network`); the sums that the gradients of each Gaussian are made of
-(`collect`); and the optimisers (`update`). A launch runs over probes, or over Gaussians, and nothing is added up by
-atomics: one seed gives one result, on either device.
+Probes are sorted along a space-filling curve and divided into groups of 64 neighbours, each with a bounding box. A step
+has five launches: bit masks of the Gaussians that meet each group (`touch`); the Gaussians' sum at each probe
+(`features`); the network, forward and backward (`network`); the sums from which the gradients of each Gaussian follow
+(`collect`); and the optimisers (`update`), which are our own since those of libraries count steps in Python while
+a whole step must be in one CUDA graph. There are no atomic additions: a seed gives one result on each device.
 
-The masks take the place of the paper's sorted lists of cubes in training, where the probes stand still: there is
-nothing to count, scan and sort (`cubes` does, for points at any place).
-
-The twin to read first: `tests/reference/gaussians.py`.
+The masks replace the paper's sorted lists of cubes, since probes do not move in training: nothing has to be counted,
+scanned and sorted. The reference is `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -20,11 +18,18 @@ import warp as wp
 
 from wlm_kernels.native import native_source
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
-from wlm_kernels.probe.optimiser import update_kernel
 
 GROUP = 64  # probes
-SPLITS = 4  # threads that share a probe's sum on CUDA, where 15,000 probes alone leave most of a GPU idle
-_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA: the widest one sets the pace
+SPLITS = 4  # threads that share a probe's sum on CUDA; one thread for each of 15,000 probes leaves most of a GPU idle
+_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA
+
+# Range of the logarithm of a scale, in the normalised frame.
+LOG_SCALES = wp.constant(wp.vec2(-9.21, 1.39))  # 1e-4 to 4
+ADAM = wp.constant(wp.vec2(0.9, 0.999))
+ADAN = wp.constant(wp.vec3(0.98, 0.92, 0.99))  # as Xie et al. and pytorch-optimizer have them
+EPSILON = wp.constant(1.0e-8)
+
+_vec8 = wp.types.vector(8, float)
 
 
 @wp.struct
@@ -32,15 +37,40 @@ class Groups:
     """Probes in groups; N is a multiple of `GROUP`, G = N / GROUP.
 
     Attributes:
-        x: [N], positions in the normalised frame; those behind `count` only fill the last group.
-        middle, half: [G], the groups' boxes.
-        count: Probes.
+        x: [N], positions in the normalised frame; positions after `count` only fill the last group.
+        middle, half: [G], centres and half sizes of the groups' boxes.
+        count: Number of probes.
     """
 
     x: wp.array1d[wp.vec3]
     middle: wp.array1d[wp.vec3]
     half: wp.array1d[wp.vec3]
     count: int
+
+
+@wp.struct
+class Optimiser:
+    """Settings of the two optimisers.
+
+    Attributes:
+        control: int [1], number of the step, from 1.
+        schedule: float [steps], factor of all rates at each step.
+        rates: float [10 + L], of each channel of a Gaussian.
+        net_rate: Rate of the network.
+        bounds: float [2, 10 + L], lowest and highest value of each channel.
+        keep: 1 to clamp the rows to `bounds`.
+        move: 0 to leave the Gaussians unchanged.
+        adan: 1 to train the Gaussians by Adan (Xie et al. 2024), 0 by Adam; the network is always trained by Adam.
+    """
+
+    control: wp.array1d[int]
+    schedule: wp.array1d[float]
+    rates: wp.array1d[float]
+    net_rate: float
+    bounds: wp.array2d[float]
+    keep: int
+    move: int
+    adan: int
 
 
 @wp.func_native("""
@@ -73,7 +103,9 @@ def _count_step(control: wp.array1d[int]):
 
 
 @wp.func
-def _meet(groups: Groups, shapes: wp.array1d[Shape], g: int, k: int) -> int:
+def _meet(groups: Groups, shapes: wp.array1d[Shape], transposed: int, row: int, column: int) -> int:
+    g = wp.where(transposed != 0, column, row)
+    k = wp.where(transposed != 0, row, column)
     if g < groups.middle.shape[0] and k < shapes.shape[0]:
         if touches(shapes[k], groups.middle[g], groups.half[g]):
             return 1
@@ -92,12 +124,7 @@ def _touch_cpu(
     row, word = wp.tid()
     word_bits = wp.uint32(0)
     for b in range(32):
-        column = word * 32 + b
-        met = int(0)
-        if transposed == 0:
-            met = _meet(groups, shapes, row, column)
-        else:
-            met = _meet(groups, shapes, column, row)
+        met = _meet(groups, shapes, transposed, row, word * 32 + b)
         word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
     bits[row, word] = word_bits
 
@@ -112,14 +139,8 @@ def _touch_cuda(
     bits: wp.array2d[wp.uint32],
 ):
     row, word, b = wp.tid()
-    column = word * 32 + b
-    met = int(0)
-    if transposed == 0:
-        met = _meet(groups, shapes, row, column)
-    else:
-        met = _meet(groups, shapes, column, row)
-    # Threads 0 to 31 of the last dimension are one warp, whole in every launch.
-    word_bits = _ballot(met)
+    # The last dimension has 32 threads, which are one warp in every launch.
+    word_bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + b))
     if b == 0:
         bits[row, word] = word_bits
 
@@ -163,13 +184,13 @@ class StepKernels:
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
-        """Prepares the parameters for a step: rounded to the file's levels if asked for, and as shapes.
+        """Rounds the parameters to codes, if asked for, and converts them to shapes.
 
         Args:
             rows: float [K, 10 + L], the parameters.
             bounds: float [2, 10 + L], lowest and highest value of each channel.
-            quantised: 1 to round to the levels of the file (eq. 13 and 14), 0 to use the rows as they are.
-            levels: float [10 + L], each channel's highest code.
+            quantised: 1 to round to codes (eq. 13 and 14), 0 to use the rows unchanged.
+            levels: float [10 + L], highest code of each channel.
             cut, sphere: As for `gaussians.shape_of`.
             used: float [K, 10 + L], written.
             shapes: Shape [K], written.
@@ -188,7 +209,7 @@ class StepKernels:
         Args:
             groups, shapes, used, by_group, cut: As above.
             f: float [S, L, N], written: S parts of the sum, S = `SPLITS` on CUDA and 1 on the CPU.
-            base, count: On the CPU, the probes from `base` on.
+            base, count: On the CPU, first probe and number of probes of this launch.
         """
         probes = groups.x.shape[0]
         dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
@@ -202,13 +223,13 @@ class StepKernels:
         )
 
     def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
-        """Sums over the probes the terms of each Gaussian's gradient.
+        """Sums the terms of each Gaussian's gradient over the probes.
 
         Args:
             groups, shapes, used, by_gaussian, cut: As above.
-            grad_f: float [L, N], the gradient of the sum; 0 behind `groups.count`.
+            grad_f: float [L, N], the gradient of the sum; 0 after `groups.count`.
             sums: float [K, 9 + L], written.
-            base, count: On the CPU, the Gaussians from `base` on.
+            base, count: On the CPU, first Gaussian and number of Gaussians of this launch.
         """
         gaussians = used.shape[0]
         dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
@@ -225,15 +246,15 @@ class StepKernels:
         """Takes a step of Adan or Adam for the Gaussians and of Adam for the network.
 
         Args:
-            optimiser: `optimiser.Optimiser`.
+            optimiser: The settings.
             rows: float [K, 10 + L], updated.
-            used: float [K, 10 + L], what the gradients were taken at.
+            used: float [K, 10 + L], values at which the gradients were taken.
             shapes: Shape [K].
             sums: float [K, 9 + L], of `collect`.
             moments: float [4, K, 10 + L], updated.
             net: float [P], updated.
             net_moments: float [2, P], updated.
-            partial: float [B, P], parts of the network's gradient.
+            partial: float [B, P], partial gradients of the network.
         """
         wp.launch(
             self._update,
@@ -246,7 +267,7 @@ class StepKernels:
 
 @functools.cache
 def step_kernels(latent: int, device_kind: str) -> StepKernels:
-    """Builds (once) the launches.
+    """Builds the launches, once.
 
     Args:
         latent: L.
@@ -337,13 +358,13 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
             while bits != wp.uint32(0):
                 g = w * 32 + next_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
-                # The groups go round among those who share the Gaussian.
+                # The threads that share the Gaussian take the groups in turn.
                 turn += 1
                 if turn % stride != first:
                     continue
                 for j in range(lane, GROUP, lanes):
                     i = g * GROUP + j
-                    # A group that is met at a corner is hardly reached: test before loading gradients.
+                    # Most probes of a group may be out of reach: the test comes before their gradients are loaded.
                     if not touches(shape, groups.x[i], wp.vec3()):
                         continue
                     gradient = vec_latent()
@@ -411,3 +432,91 @@ def _block_sum(vec_sums, numbers: int):
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 
     return block_sum
+
+
+@functools.cache
+def update_kernel(latent: int):
+    """Builds the kernel of `step.StepKernels.update` for latents of length L, once."""
+    fn = functions(latent)
+    vec_sums, chain = fn.vec_sums, fn.chain
+    channels = LATENT + latent
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "max_unroll": 32})
+    def update(
+        # in:
+        o: Optimiser,
+        used: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        sums: wp.array2d[float],
+        partial: wp.array2d[float],
+        # out:
+        rows: wp.array2d[float],
+        moments: wp.array3d[float],
+        net: wp.array1d[float],
+        net_moments: wp.array2d[float],
+    ):
+        i = wp.tid()
+        t = o.control[0]
+        rate = o.schedule[t - 1]
+        if i < net.shape[0]:
+            g = float(0.0)
+            whole = partial.shape[0] // 8 * 8
+            for b in range(0, whole, 8):
+                # Eight loads are in flight at once.
+                part = _vec8()
+                for u in range(8):
+                    part[u] = partial[b + u, i]
+                for u in range(8):
+                    g += part[u]
+            for b in range(whole, partial.shape[0]):
+                g += partial[b, i]
+            m = ADAM[0] * net_moments[0, i] + (1.0 - ADAM[0]) * g
+            v = ADAM[1] * net_moments[1, i] + (1.0 - ADAM[1]) * g * g
+            net_moments[0, i] = m
+            net_moments[1, i] = v
+            mean = m / (1.0 - wp.pow(ADAM[0], float(t)))
+            spread = wp.sqrt(v / (1.0 - wp.pow(ADAM[1], float(t))))
+            net[i] = net[i] - rate * o.net_rate * mean / (spread + EPSILON)
+        else:
+            k = (i - net.shape[0]) // wp.static(channels)
+            c = (i - net.shape[0]) % wp.static(channels)
+            g = float(0.0)
+            if c < LATENT:
+                # The values that the step used, since other threads are changing the rows.
+                s = vec_sums()
+                for a in range(SHAPE_NUMBERS):
+                    s[a] = sums[k, a]
+                gradient = chain(
+                    s,
+                    shapes[k],
+                    wp.vec3(used[k, 3], used[k, 4], used[k, 5]),
+                    wp.vec4(used[k, 6], used[k, 7], used[k, 8], used[k, 9]),
+                )
+                g = gradient[c]
+            else:
+                g = sums[k, SHAPE_NUMBERS + c - LATENT]
+            beta1 = wp.where(o.adan != 0, ADAN[0], ADAM[0])
+            beta2 = ADAN[1]
+            beta3 = wp.where(o.adan != 0, ADAN[2], ADAM[1])
+            # Adam is Adan without the change of the gradient.
+            change = float(0.0)
+            if o.adan != 0 and t > 1:
+                change = g - moments[3, k, c]
+            look = g + beta2 * change
+            m = beta1 * moments[0, k, c] + (1.0 - beta1) * g
+            v = beta2 * moments[1, k, c] + (1.0 - beta2) * change
+            n = beta3 * moments[2, k, c] + (1.0 - beta3) * look * look
+            moments[0, k, c] = m
+            moments[1, k, c] = v
+            moments[2, k, c] = n
+            moments[3, k, c] = g
+            mean = m / (1.0 - wp.pow(beta1, float(t))) + beta2 * v / (1.0 - wp.pow(beta2, float(t)))
+            spread = wp.sqrt(n / (1.0 - wp.pow(beta3, float(t))))
+            value = rows[k, c] - rate * o.rates[c] * mean / (spread + EPSILON)
+            if o.keep != 0:
+                value = wp.clamp(value, o.bounds[0, c], o.bounds[1, c])
+            elif c >= 3 and c < 6:
+                value = wp.clamp(value, LOG_SCALES[0], LOG_SCALES[1])
+            rows[k, c] = value
+
+    return update

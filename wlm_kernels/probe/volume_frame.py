@@ -5,8 +5,7 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 1. `look` takes the new windows; `scroll` finds for each slot its block, whether a probe is near that block, and whether
    the pool still has it. Other blocks wait, and are counted by their distance to the viewer.
 2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
-   decoded, by distances in units of their own side, doubled behind the viewer; of two equal ones the finer block, then
-   the one of the lower slot.
+   decoded, by distances in units of their own side; of two equal ones the finer block, then the one of the lower slot.
 3. `allocate` gives each block a row of the pool: the least recently used row of a group that no other block takes from.
    Groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
@@ -33,7 +32,7 @@ _QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
 )
 _BINS = wp.constant(BINS)
 _SIXTEENS = wp.constant(BINS + BINS // 16)
-_BEYOND = wp.constant(0.5)
+_BEYOND = wp.constant(0.5)  # share of the probes' range by which light is extrapolated at most
 _LIMIT = wp.constant(1 << 20)  # blocks along an axis of the finest level
 # Morton keys: steps that spread 21 bits out to every third one.
 _M0, _M1, _M2, _M3, _M4 = (
@@ -59,7 +58,7 @@ class Index:
         number: [N].
         cell: [N].
         place: [N].
-        normal: [N], of the surface that each lies on, of unit length; 0: it lies on none, or none is known.
+        normal: [N], unit normal of each probe's surface; 0 for a probe on no surface, or if it is unknown.
         block: [W], rising within a level.
         level_start: [L + 1].
         ratios: [L], sides of the levels over the finest.
@@ -82,11 +81,10 @@ class Windows:
     Attributes:
         bases: [L].
         views: [L], see `wlm_kernels.probe.volume`.
-        held: [S], the block that a slot stands for.
-        wanted: [S], its number among the index's blocks, -1 where no probe is near.
+        held: [S], the block of each slot.
+        wanted: [S], its number among the index's blocks, -1 if no probe is near.
         pages: [S], its row of the pool, or -1.
-        away: [S], how far blocks that wait are, see `_rank_of`; else -1.
-        forward: [1], where the viewer looks, of unit length, or 0.
+        away: [S], squared distance of a waiting block from the viewer, in sides; -1 for other blocks.
     """
 
     bases: wp.array1d[wp.vec3i]
@@ -95,7 +93,6 @@ class Windows:
     wanted: wp.array1d[int]
     pages: wp.array1d[int]
     away: wp.array1d[float]
-    forward: wp.array1d[wp.vec3]
 
 
 @wp.struct
@@ -103,7 +100,7 @@ class Pool:
     """The R rows of the pool, in use or cached.
 
     Attributes:
-        stamp: [R], the last frame in which the row's block was in a window; -1 for a row without one.
+        stamp: [R], last frame in which the row's block was in a window; -1 for an empty row.
         owner: [R], its block's number in the index, or -1.
         rows: [W], the row of each block of the index, or -1.
     """
@@ -120,19 +117,19 @@ class Work:
     Attributes:
         clock: [1], the frame's number.
         counters: [7].
-        histogram: [TOTALS], blocks that wait by distance.
+        histogram: [TOTALS], number of waiting blocks by distance.
         limit: [1], the last bin that is gathered.
         gathered: [MOST], slots.
-        distance: [MOST], how far away each is.
+        distance: [MOST], distance of each, as in `Windows.away`.
         chosen: [B], slots, or -1.
         taken: [B], rows of the pool, or -1.
         begin, count: [B, 64], ranges of the index.
-        picked: [B], how many probes decide a block, 16 at most.
-        noise: [B], variance of what each of them says.
-        places: [B, 16], of the probes, in sides from the block's centre, and the noise that each has beyond that.
-        rows: [B, 16], covariance of each with those before it and itself, then 0.
-        hats: [B, 16], its covariance with the block.
-        numbers: [B * 16], probes.
+        picked: [B], number of probes that contribute to a block, 16 at most.
+        noise: [B], variance of the noise of each of them.
+        places: [B, 16], positions of the probes from the block's centre, in sides, and the additional noise of each.
+        rows: [B, 16], covariance of each probe with the probes before it and with itself, then 0.
+        hats: [B, 16], covariance of each probe with the block.
+        numbers: [B * 16], indices of the probes.
         weights: [B, 16].
     """
 
@@ -198,30 +195,19 @@ def _find(index: Index, level: int, block: wp.vec3i) -> int:
 
 
 @wp.func
-def _rank_of(away: wp.vec3, forward: wp.vec3) -> float:
-    """Returns the squared distance in sides, of a block behind the viewer as if it were twice as far."""
-    squared = wp.length_sq(away)
-    if squared > 0.0:
-        squared += 1.5 * squared * (wp.length(forward) - wp.dot(away, forward) / wp.sqrt(squared))
-    return squared
-
-
-@wp.func
-def _bin(away: float, side: int, forward: wp.vec3) -> int:
+def _bin(away: float, side: int) -> int:
     half = 0.5 * float(side) + 1.0
-    most = 3.0 * half * half * (1.0 + 3.0 * wp.length(forward))
-    return wp.min(int(away * float(_BINS) / most), _BINS - 1)
+    return wp.min(int(away * float(_BINS) / (3.0 * half * half)), _BINS - 1)
 
 
 @wp.kernel(enable_backward=False)
-def _look(bases: Bases, views: Views, forward: wp.vec3, frame: int, windows: Windows, work: Work):
+def _look(bases: Bases, views: Views, frame: int, windows: Windows, work: Work):
     i = wp.tid()
     if i < windows.bases.shape[0]:
         windows.bases[i] = wp.vec3i(bases[i, 0], bases[i, 1], bases[i, 2])
         windows.views[i] = wp.vec4(views[i, 0], views[i, 1], views[i, 2], views[i, 3])
     if i == 0:
         work.clock[0] = frame
-        windows.forward[0] = forward
     if i < work.counters.shape[0]:
         work.counters[i] = 0
     if i < work.chosen.shape[0]:
@@ -256,14 +242,14 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
             pool.stamp[row] = work.clock[0]
         else:
             view = windows.views[level]
-            # From the viewer, whom the view puts at -(x, y, z) of the window's middle.
+            # The viewer is at -view of the window's middle.
             d = wp.vec3(
                 float(local[0] - side // 2) - view[0],
                 float(local[1] - side // 2) - view[1],
                 float(local[2] - side // 2) - view[2],
             )
-            away = _rank_of(d, windows.forward[0])
-            bin = _bin(away, side, windows.forward[0])
+            away = wp.length_sq(d)
+            bin = _bin(away, side)
             wp.atomic_add(work.histogram, bin, 1)
             wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
             wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
@@ -273,9 +259,9 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
 
 @wp.func
 def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
-    """Returns the first of 16 counts with which a sum reaches the budget, or the last one; and the sum before it."""
+    """Returns the first of 16 counts at which the sum reaches the budget, or the last one; and the sum before it."""
     counts = vec16i()
-    for i in range(16):  # unrolled, so that all are under way at once
+    for i in range(16):  # unrolled, so that all loads are in flight at once
         counts[i] = histogram[first + i]
     at = int(15)
     sum_before = before
@@ -308,7 +294,7 @@ def _gather(windows: Windows, side: int, work: Work):
     s = wp.tid()
     away = windows.away[s]
     if away >= 0.0:
-        if _bin(away, side, windows.forward[0]) <= work.limit[0]:
+        if _bin(away, side) <= work.limit[0]:
             i = wp.atomic_add(work.counters, _GATHERED, 1)
             if i < work.gathered.shape[0]:
                 work.gathered[i] = s
@@ -341,7 +327,7 @@ def _allocate(windows: Windows, pool: Pool, size: int, work: Work):
     if slot >= 0:
         frame = work.clock[0]
         groups = pool.stamp.shape[0] // size
-        # Of one frame no two blocks look in one group: there are as many groups as blocks, or more.
+        # There are at least as many groups as blocks, so that no two blocks of a frame take from one group.
         first = (frame % groups * work.chosen.shape[0] + k) % groups * size
         oldest = frame
         for i in range(size):
@@ -370,12 +356,12 @@ def _find_ranges(index: Index, windows: Windows, side: int, work: Work):
     if work.taken[k] >= 0:
         slot = work.chosen[k]
         ratio = index.ratios[slot // (side * side * side)]
-        # In half sides of the block, each of which is `ratio` cells wide and a cell of the octree.
+        # Coordinates in half sides of the block; a half side is `ratio` cells wide, and a cell of the octree.
         half = 2 * windows.held[slot] + wp.vec3i(j // 16 - 1, j // 4 % 4 - 1, j % 4 - 1)
         if wp.min(wp.min(half[0], half[1]), half[2]) >= 0:
             last = index.key.shape[0]
             begin = _lower(index.key, 0, last, morton(ratio * half))
-            # Of the last cell in it; the cells of one half are neighbours in the list.
+            # The cells of one half are neighbours in the list; this is the end of the last one.
             end = _lower(index.key, begin, last, morton(ratio * half + wp.vec3i(ratio - 1)) + wp.int64(1))
             work.begin[k, j] = begin
             count = end - begin
@@ -397,7 +383,6 @@ def _combine(work: Work, light: wp.array2d[float], pool: wp.array2d[float]):
                 s += w * value
                 low = wp.min(low, value)
                 high = wp.max(high, value)
-        # What a block guesses beyond its probes ends at half of their range.
         room = _BEYOND * (high - low)
         pool[row, c] = wp.clamp(s, low - room, high + room)
 
@@ -417,7 +402,7 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
 class Look:
     """Takes the windows and the index of a frame; only the arguments of this launch change from frame to frame.
 
-    Made once for a volume, since packing all arguments anew takes longer than the launch.
+    A volume makes it once, since packing all arguments anew takes longer than the launch.
 
     Args:
         windows, work: Written by every launch.
@@ -426,24 +411,22 @@ class Look:
     def __init__(self, windows: Windows, work: Work) -> None:
         count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
         self._bases, self._views = np.zeros((LEVELS, 3), np.int32), np.zeros((LEVELS, 4), np.float32)
-        # The launch's arguments are these arrays' memory: making them of 56 numbers would take 20 microseconds a frame.
-        first = [Bases.from_buffer(self._bases), Views.from_buffer(self._views), wp.vec3(), 0]
+        # The launch's arguments use these arrays' memory: building them from 56 numbers takes 20 microseconds a frame.
+        first = [Bases.from_buffer(self._bases), Views.from_buffer(self._views), 0]
         self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
 
-    def __call__(self, bases: np.ndarray, views: np.ndarray, forward: np.ndarray, frame: int) -> None:
+    def __call__(self, bases: np.ndarray, views: np.ndarray, frame: int) -> None:
         """Launches the kernel on the current stream.
 
         Args:
-            bases: Whole numbers [L, 3], first block of each window, in the index's numbers.
+            bases: Integers [L, 3], first block of each window, as the index numbers blocks.
             views: [L, 4], see `Windows`.
-            forward: [3], where the viewer looks, of unit length; 0: nowhere.
-            frame: The frame's number, rising.
+            frame: Number of the frame, rising.
         """
         self._bases[: len(bases)], self._views[: len(views)] = bases, views
         self._launch.set_param_at_index(0, Bases.from_buffer(self._bases))
         self._launch.set_param_at_index(1, Views.from_buffer(self._views))
-        self._launch.set_param_at_index(2, wp.vec3(*forward.tolist()))
-        self._launch.set_param_at_index(3, frame)
+        self._launch.set_param_at_index(2, frame)
         self._launch.launch()
 
 
@@ -462,7 +445,7 @@ def choose(windows: Windows, side: int, work: Work) -> None:
 
 
 def allocate(windows: Windows, pool: Pool, work: Work) -> None:
-    """Gives the chosen blocks their rows; a block whose group has no free row goes on waiting."""
+    """Gives the chosen blocks their rows; a block whose group has no free row keeps waiting."""
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
     wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
 

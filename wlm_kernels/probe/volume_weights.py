@@ -1,17 +1,16 @@
 """The weights of a block's probes in a frame of the cascaded volume.
 
-Reading is trilinear: at x it is A(x) g, the hats of the lattice of blocks times their light. What 16 probes
-say of a block at c is taken as the best linear unbiased guess (ordinary kriging) if the blocks' light were white noise
-on the lattice over a smooth part, so that the covariance of the light at x and y is
+Reading is trilinear: the light at x is A(x) g, the hat functions of the lattice of blocks times the blocks' light g.
+The light of a block follows from up to 16 probes as the best linear unbiased estimate (ordinary kriging), under the
+assumption that g is white noise on the lattice plus a smooth part, so that the covariance of the light at x and y is
 
     k(x, y) = A(x) A(y)^T + 0.3 exp(-|x - y| / (3 s)),
 
-and each probe has noise of variance 0.03, or up to 0.3 where 16 stand for many more. The first part is what makes the
-light that is read at a probe that probe's own light, where a weighted mean would blur it: the volume as a whole nearly
-interpolates its probes.
+and each probe has noise of variance 0.03, or up to 0.3 where 16 probes represent many more. Because of the first part
+the light that is read at a probe is nearly that probe's own, which a weighted mean would blur.
 
-Where normals are known, a probe whose surface has the block's centre behind it, by d sides, says less of that block:
-its noise is 3 d^2 more. So a block takes the probes on its own side of a wall, where there are any.
+If normals are known and the block's centre is d sides behind a probe's surface, the noise of that probe is larger by
+3 d^2. A block thus takes its light from probes on its own side of a wall, if there are any.
 """
 
 import warp as wp
@@ -27,7 +26,7 @@ _DOUBT = wp.constant(3.0)
 _SMOOTH = wp.constant(0.3)
 _LENGTH = wp.constant(3.0)
 _NOISE = wp.constant(0.03)
-_MOST_NOISE = wp.constant(10.0)  # times as much
+_MOST_NOISE = wp.constant(10.0)  # largest factor of the noise
 
 _Square = wp.types.matrix(shape=(PROBES, PROBES), dtype=float)
 
@@ -62,7 +61,7 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
         work.noise[k] = _NOISE * wp.clamp(float(total) / float(_PROBES), 1.0, _MOST_NOISE)
     number = int(0)
     if i < count:
-        # Every n-th of all, so that a block with many is decided by some from all over it.
+        # Every n-th probe is taken, so that they are spread over the whole block.
         at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))
         p = int(-1)
         passed = int(0)
@@ -147,7 +146,7 @@ def _weigh(work: Work):
 def weigh(index: Index, windows: Windows, side: int, work: Work) -> None:
     """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found.
 
-    In three launches, of which only the last has one thread a block: it is what the frame waits for.
+    There are three launches, since only the last one, the longest, is limited to one thread per block.
     """
     device = work.clock.device
     wp.launch(_pick, work.weights.shape, inputs=[index, windows, side, work], block_dim=32, device=device)

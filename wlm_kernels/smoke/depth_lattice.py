@@ -10,15 +10,13 @@ no two of its rays are parallel.
 Units and sampling are those of `march`.
 """
 
-import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, sample, size_of
+from wlm_kernels.smoke.march import OPTIONS, Medium, between_nodes, clip, for_smoke, sample, size_of
 from wlm_kernels.smoke.settings import March
 
 MOST_NODES = 2**28
@@ -104,18 +102,10 @@ def _add_up(
                 nodes[wp.where(first, o, line), wp.where(first, line, o), k, pair][0] = ahead
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    measure: wp.Kernel
-    reach: wp.Kernel
-
-
-@functools.cache
-def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
-    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`, and a number of pairs of lights."""
-
+@for_smoke
+def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def measure(
+    def kernel(
         # in:
         smoke: smoke_type,
         lattice: Lattice,
@@ -140,8 +130,13 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
                         tau += d * sample(smoke, p)
             gaps[i, j, k, pair] = smoke.extinction * tau
 
+    return kernel
+
+
+@for_smoke
+def _reach(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def reach(
+    def kernel(
         # in:
         smoke: smoke_type,
         lattice: Lattice,
@@ -165,7 +160,7 @@ def depth_kernels(smoke_type: Any, pairs: int) -> _Kernels:
                 tau += d * sample(smoke, p + (first + (float(n) + 0.5) * d) * toward)
         nodes[i, j, k] = wp.vec2(smoke.extinction * tau, 0.0)
 
-    return _Kernels(measure, reach)
+    return kernel
 
 
 def parts_of(length: float, step: float) -> int:
@@ -221,8 +216,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
     gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)
-    kernel = depth_kernels(medium.smoke_type, pairs).measure
-    wp.launch(kernel, tuple(counts), [medium.smoke, lattice, parts], [gaps], device=medium.device)
+    _measure(medium, tuple(counts), [lattice, parts], [gaps], pairs)
     lines = max(counts[:2]) if pairs == 2 else counts[1]
     wp.launch(_add_up, (pairs, lines, counts[2]), [gaps], [nodes], device=medium.device)
     return nodes
@@ -255,8 +249,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
     lattice, counts = make_lattice(shape, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing, most=_MOST_MARCHING)
     lattice.place, lattice.point, lattice.radius = wp.vec3(*place), 1, float(radius)
     nodes = medium.buffer(counts, wp.vec2)
-    kernel = depth_kernels(medium.smoke_type, 1).reach
-    wp.launch(kernel, counts, [medium.smoke, lattice, step], [nodes], device=medium.device)
+    _reach(medium, counts, [lattice, step], [nodes])
     return lattice, nodes
 
 

@@ -9,9 +9,7 @@ which light spreads within the sweeps of a round; each finer grid starts from th
 Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
 
-import functools
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -25,6 +23,7 @@ from wlm_kernels.smoke.march import (
     absorbed,
     begin,
     between_nodes,
+    for_smoke,
     look,
     parameters,
     pass_step,
@@ -273,19 +272,10 @@ def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
         wp.atomic_add(out, a, b, c, share * light)
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    shoot: wp.Kernel
-    stop: wp.Kernel
-    gather: wp.Kernel
-
-
-@functools.cache
-def light_kernels(smoke_type: Any) -> _Kernels:
-    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
-
+@for_smoke
+def _shoot(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def shoot(
+    def kernel(
         # in:
         smoke: smoke_type,
         place: wp.vec3,
@@ -332,8 +322,13 @@ def light_kernels(smoke_type: Any) -> _Kernels:
         if pending > 0.0:
             _splat(moment / pending, cell, pending, out)
 
+    return kernel
+
+
+@for_smoke
+def _stop(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def stop(
+    def kernel(
         # in:
         smoke: smoke_type,
         nodes: wp.array3d[wp.vec2],
@@ -358,8 +353,13 @@ def light_kernels(smoke_type: Any) -> _Kernels:
                         total += sigma * wp.exp(-depths_at(nodes, lattice, p)[0])
         out[i, j, k] = 4.0 * wp.pi * total / float(parts[0] * parts[1] * parts[2])
 
+    return kernel
+
+
+@for_smoke
+def _gather(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def gather(
+    def kernel(
         # in:
         smoke: smoke_type,
         view: View,
@@ -391,7 +391,7 @@ def light_kernels(smoke_type: Any) -> _Kernels:
         if n == 0:
             thin[row, column] = opacity
 
-    return _Kernels(shoot, stop, gather)
+    return kernel
 
 
 def shoot(
@@ -408,8 +408,7 @@ def shoot(
         power: Power of the light.
         out: float [X, Y, Z], cells.
     """
-    inputs = [medium.smoke, place, radius, step, cell, power / _RAYS]
-    wp.launch(light_kernels(medium.smoke_type).shoot, _RAYS, inputs, [out], device=medium.device)
+    _shoot(medium, _RAYS, [place, radius, step, cell, power / _RAYS], [out])
 
 
 def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array) -> None:
@@ -424,8 +423,7 @@ def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: 
     """
     lattice, nodes = depths
     parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))
-    inputs = [medium.smoke, nodes, lattice, cell, parts]
-    wp.launch(light_kernels(medium.smoke_type).stop, out.shape, inputs, [out], device=medium.device)
+    _stop(medium, out.shape, [nodes, lattice, cell, parts], [out])
 
 
 def gather(
@@ -442,5 +440,4 @@ def gather(
             transparency of a cell of smoke of its density.
         thin: float [H, W], written: the opacity of thin smoke, weighted alike.
     """
-    inputs = [medium.smoke, view, parameters(march), cell, light]
-    wp.launch(light_kernels(medium.smoke_type).gather, out.shape[1:], inputs, [out, thin], device=medium.device)
+    _gather(medium, out.shape[1:], [view, parameters(march), cell, light], [out, thin])

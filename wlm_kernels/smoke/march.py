@@ -118,6 +118,29 @@ class Medium:
         return smoke
 
 
+def for_smoke(build: Callable[..., wp.Kernel]) -> Callable[..., None]:
+    """Turns a function that builds a kernel for a type of smoke into the function that launches it.
+
+    The kernel and its first argument, the smoke, come from the same medium: Warp does not check the type of a struct,
+    and a kernel for another type of smoke would read other memory.
+
+    Args:
+        build: Builds a kernel for `Medium.smoke_type` and further variants; called once for each.
+
+    Returns:
+        A function of the medium, the size of the launch, the arguments after the smoke, the outputs, and the variants.
+        Its attribute `build` is the cached function.
+    """
+    build = functools.cache(build)
+
+    def launch(medium: Medium, size: int | tuple[int, ...], inputs: list, outputs: list, *variants: Any) -> None:
+        kernel = build(medium.smoke_type, *variants)
+        wp.launch(kernel, size, [medium.smoke, *inputs], outputs, device=medium.device)
+
+    launch.build = build  # type: ignore[attr-defined]
+    return launch
+
+
 @wp.struct
 class View:
     """A camera, in voxels. Row 0 is the top row; rays go through pixel centres.

@@ -10,10 +10,7 @@ The planes are processed in slabs, which bounds the buffers. Units and sampling 
 `tests/reference/marching.py` first: the same samples without shared work.
 """
 
-import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -24,14 +21,11 @@ from wlm_kernels.smoke.march import (
     Medium,
     View,
     absorbed,
-    begin,
     clip,
     density_at,
-    look,
+    for_smoke,
     mean_transparency,
-    optical_depth,
     parameters,
-    pass_step,
     phase,
     ray,
     require_orthographic,
@@ -69,14 +63,6 @@ class _Depths:
     ahead: wp.array2d[float]
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    column: wp.Kernel
-    sweep: wp.Kernel
-    gather: wp.Kernel
-    lit: wp.Kernel
-
-
 @wp.func
 def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: float, h: float) -> float:
     """Computes the optical depth of a step of length h with its sample at distance s, 0 outside the smoke's span."""
@@ -85,12 +71,10 @@ def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: flo
     return 0.0
 
 
-@functools.cache
-def six_kernels(smoke_type: Any) -> _Kernels:
-    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`."""
-
+@for_smoke
+def _column(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def column(
+    def kernel(
         # in:
         smoke: smoke_type,
         view: View,
@@ -107,8 +91,13 @@ def six_kernels(smoke_type: Any) -> _Kernels:
             total += _thickness(smoke, span, r.origin, r.direction, s, slab.gap)
         tau[row, col] = total
 
+    return kernel
+
+
+@for_smoke
+def _sweep(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def sweep(
+    def kernel(
         # in:
         smoke: smoke_type,
         view: View,
@@ -161,8 +150,13 @@ def six_kernels(smoke_type: Any) -> _Kernels:
             else:
                 tau[plane, count - 1 - k, line] = total
 
+    return kernel
+
+
+@for_smoke
+def _gather(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def gather(
+    def kernel(
         # in:
         smoke: smoke_type,
         view: View,
@@ -211,27 +205,7 @@ def six_kernels(smoke_type: Any) -> _Kernels:
         out[TRANSPARENCY, row, col] = wp.exp(-tau)
         out[EMISSION, row, col] = out[EMISSION, row, col] + b[2]
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def lit(
-        # in:
-        smoke: smoke_type,
-        view: View,
-        toward: wp.vec3,
-        march: MarchParameters,
-        # out:
-        out: wp.array2d[float],
-    ):
-        row, col = wp.tid()
-        r = begin(view, row, col, smoke, march.step, 0.5)
-        light = float(0.0)
-        while r.done < r.count:
-            r = look(r, smoke)
-            if r.x > 0.0:
-                light += wp.exp(-r.tau - optical_depth(smoke, r.place, toward, march.step)) * absorbed(r.x)
-            r = pass_step(r, 0.0)
-        out[row, col] = light * phase(march.g, wp.dot(toward, r.direction))
-
-    return _Kernels(column, sweep, gather, lit)
+    return kernel
 
 
 def _extent(shape, origin, direction) -> tuple[float, float]:
@@ -259,9 +233,8 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
         ValueError: The camera is in perspective.
     """
     require_orthographic(view, "six-way lightmaps")
-    medium, device = medium.in_bricks(), medium.device
+    medium = medium.in_bricks()
     height, width = view.height, view.width
-    kernels = six_kernels(medium.smoke_type)
     out.zero_()
     near, far = _extent(medium.density.shape, view.origin, view.forward)
     start = max(near, 0.0)
@@ -273,8 +246,7 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     def column(first: float, last: float, tau: wp.array) -> tuple[float, int]:
         planes = max(math.ceil((last - first) / march.step), 0)
         gap = (last - first) / max(planes, 1)
-        inputs = [medium.smoke, view, _slab(first, gap, planes)]
-        wp.launch(kernels.column, (height, width), inputs, [tau], device=device)
+        _column(medium, (height, width), [view, _slab(first, gap, planes)], [tau])
         return gap, planes
 
     column(near, min(far, 0.0), depths.behind)
@@ -289,29 +261,11 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
         slab = _slab(start + first * gap, gap, count)
         for along, tau in enumerate(sides):
             lines = height if along < 2 else width
-            wp.launch(kernels.sweep, (count, lines), [medium.smoke, view, slab, along, parts], [tau], device=device)
-        inputs = [medium.smoke, view, slab, parameters(march), depths]
-        wp.launch(kernels.gather, (height, width), inputs, [passed, out], device=device)
+            _sweep(medium, (count, lines), [view, slab, along, parts], [tau])
+        _gather(medium, (height, width), [view, slab, parameters(march), depths], [passed, out])
 
 
 def _slab(start: float, gap: float, planes: int) -> _Slab:
     slab = _Slab()
     slab.start, slab.gap, slab.planes = start, gap, planes
     return slab
-
-
-def lit(medium: Medium, view: View, toward: Sequence[float], march: March, out: wp.array) -> None:
-    """Computes smoke under one light from any direction; every sample of a ray marches to the light.
-
-    The six lightmaps approximate this for a light between their axes (eq. 5). Along an axis it verifies them.
-
-    Args:
-        medium: The smoke, of albedo 1.
-        view: The camera, [H, W] pixels.
-        toward: Direction to the light, of length 1; its irradiance is 4 pi.
-        march: Its g and its step, along rays and to the light; samples lie in the middles of the steps.
-        out: float [H, W], written.
-    """
-    medium = medium.in_bricks()
-    inputs = [medium.smoke, view, wp.vec3(*map(float, toward)), parameters(march)]
-    wp.launch(six_kernels(medium.smoke_type).lit, out.shape, inputs, [out], device=medium.device)

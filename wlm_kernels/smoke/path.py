@@ -4,16 +4,14 @@ Free paths are sampled by delta tracking, transmittances by ratio tracking (Nova
 volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick, and spend an optical depth
 that is drawn once over the bricks of a ray. Where a density is needed, one of the eight voxels around the position is
 drawn by its weight: both kinds of tracking need only the mean, which is that of `density_at`. At each scattering every
-light is sampled (next event estimation). The environment is sampled too, and is also reached by paths that leave the
-smoke; the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
+light is sampled (next event estimation). The sky is sampled too, and is also reached by paths that leave the smoke;
+the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
 for e / majorant.
 
-Units are those of `march`. Light of order n has been scattered n times. Random numbers belong to a pixel, so that the
-result depends on the seed alone. Read `scattered_twice` of `tests/reference/transport.py` first: the second order by
-quadrature.
+Units are those of `march`. Random numbers belong to a pixel, so that the result depends on the seed alone. Read
+`scattered_twice` of `tests/reference/transport.py` first: the second order by quadrature.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +20,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, phase, ray
+from wlm_kernels.smoke.march import BRICK, OPTIONS, Medium, View, clip, density_at, for_smoke, phase, ray
 
 _NEVER = wp.constant(1.0e30)
 _GLOW = 1.0 / BRICK  # least majorant of hot smoke, which gives about one sample of its emission per brick
@@ -52,29 +50,16 @@ class PathLight:
 
 @wp.struct
 class PathSettings:
-    """`albedo` R, G, B; paths end after `highest` scatterings; the first `kept` orders have separate planes."""
+    """`albedo` R, G, B; radiance of the `sky`, the same from all directions; paths end after `highest` scatterings; the
+    first `kept` orders have separate planes."""
 
     albedo: wp.vec3
+    sky: wp.vec3
     g: float
     highest: int
     kept: int
     samples: int
     key: wp.uint64
-
-
-@wp.struct
-class Sky:
-    """Light from infinity in all directions, a map of texels of constant radiance.
-
-    Row 0 is around +y; column 0 begins at +x and columns proceed towards +z. `rows` and `columns` are cumulative
-    probabilities of a row, and of a column within its row. `total` is the integral of the mean radiance over the
-    sphere; 0: there is no sky.
-    """
-
-    radiance: wp.array2d[wp.vec3]
-    rows: wp.array1d[float]
-    columns: wp.array2d[float]
-    total: float
 
 
 @wp.struct
@@ -102,15 +87,6 @@ class _Passed:
     """Share of light that passes, and the next random state."""
 
     share: float
-    random: wp.uint64
-
-
-@wp.struct
-class _Way:
-    """A direction, its probability per solid angle, and the next random state."""
-
-    direction: wp.vec3
-    chance: float
     random: wp.uint64
 
 
@@ -176,68 +152,6 @@ def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
     beside = wp.vec3(b, sign + d[1] * d[1] * a, -d[1])
     angle = _TWO_PI * v
     return wp.normalize(cosine * d + sine * (wp.cos(angle) * across + wp.sin(angle) * beside))
-
-
-@wp.func
-def texel(sky: Sky, d: wp.vec3) -> wp.vec3:
-    """Returns the radiance of the sky in a direction."""
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    row = int(wp.acos(wp.clamp(d[1], -1.0, 1.0)) / (0.5 * _TWO_PI) * float(rows))
-    turn = wp.atan2(d[2], d[0])
-    if turn < 0.0:
-        turn += _TWO_PI
-    column = int(turn / _TWO_PI * float(columns))
-    return sky.radiance[wp.clamp(row, 0, rows - 1), wp.clamp(column, 0, columns - 1)]
-
-
-@wp.func
-def chance_of(sky: Sky, radiance: wp.vec3) -> float:
-    """Returns the probability per solid angle of a direction in a texel of a given radiance."""
-    return (radiance[0] + radiance[1] + radiance[2]) / (3.0 * sky.total)
-
-
-@wp.func
-def toward_sky(sky: Sky, random: wp.uint64) -> _Way:
-    """Samples a direction by the brightness of the sky."""
-    way = _Way()
-    rows = sky.radiance.shape[0]
-    columns = sky.radiance.shape[1]
-    random = following(random)
-    u = uniform(random)
-    row = int(0)
-    past = rows - 1
-    while row < past:
-        middle = (row + past) // 2
-        if sky.rows[middle] > u:
-            past = middle
-        else:
-            row = middle + 1
-    random = following(random)
-    u = uniform(random)
-    column = int(0)
-    past = columns - 1
-    while column < past:
-        middle = (column + past) // 2
-        if sky.columns[row, middle] > u:
-            past = middle
-        else:
-            column = middle + 1
-    top = wp.cos(0.5 * _TWO_PI * float(row) / float(rows))
-    bottom = wp.cos(0.5 * _TWO_PI * float(row + 1) / float(rows))
-    random = following(random)
-    height = wp.lerp(top, bottom, uniform(random))
-    random = following(random)
-    turn = _TWO_PI * (float(column) + uniform(random)) / float(columns)
-    across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
-    way.direction = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
-    way.chance = chance_of(sky, sky.radiance[row, column])
-    way.random = random
-    return way
-
-
-_NEVER = wp.constant(1.0e30)
-_TENTH_BIT = wp.constant(1.0 / 1024.0)
 
 
 @wp.struct
@@ -390,33 +304,21 @@ def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.
     out[plane, row, column] = out[plane, row, column] + light
 
 
-@dataclass(frozen=True)
-class _Kernels:
-    scene_type: Any
-    majorants: wp.Kernel
-    window: wp.Kernel
-    coarser: wp.Kernel
-    trace: wp.Kernel
+@wp.struct
+class _Scene:
+    """The surroundings of paths: bricks of the smoke, camera, lights, and the mesh of obstacles in voxels."""
+
+    grid: _Grid
+    view: View
+    lights: wp.array1d[PathLight]
+    mesh: wp.uint64
+    settings: PathSettings
 
 
-@functools.cache
-def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
-    """Builds (once) the kernels for a type of smoke, `Medium.smoke_type`; `solid`: with obstacles."""
-
-    @wp.struct
-    class Scene:
-        """The scene of paths: smoke, lights, the sky, and the mesh of obstacles in voxels."""
-
-        smoke: smoke_type
-        grid: _Grid
-        view: View
-        lights: wp.array1d[PathLight]
-        sky: Sky
-        mesh: wp.uint64
-        settings: PathSettings
-
+@for_smoke
+def _majorants(smoke_type: Any) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def majorants(
+    def kernel(
         # in:
         smoke: smoke_type,
         least: float,
@@ -438,31 +340,40 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
             most = wp.max(most, least)
         out[a, b, c] = most
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def window(
-        # in:
-        bounds: wp.array3d[float],
-        begin: wp.vec3i,
-        # out:
-        out: wp.array3d[float],
-    ):
-        a, b, c = wp.tid()
-        out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
+    return kernel
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def coarser(
-        # in:
-        bounds: wp.array3d[float],
-        # out:
-        out: wp.array3d[float],
-    ):
-        a, b, c = wp.tid()
-        most = float(0.0)
-        for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
-            for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
-                for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
-                    most = wp.max(most, bounds[i, j, k])
-        out[a, b, c] = most
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _window(
+    # in:
+    bounds: wp.array3d[float],
+    begin: wp.vec3i,
+    # out:
+    out: wp.array3d[float],
+):
+    a, b, c = wp.tid()
+    out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def _coarser(
+    # in:
+    bounds: wp.array3d[float],
+    # out:
+    out: wp.array3d[float],
+):
+    a, b, c = wp.tid()
+    most = float(0.0)
+    for i in range(2 * a, wp.min(2 * a + 2, bounds.shape[0])):
+        for j in range(2 * b, wp.min(2 * b + 2, bounds.shape[1])):
+            for k in range(2 * c, wp.min(2 * c + 2, bounds.shape[2])):
+                most = wp.max(most, bounds[i, j, k])
+    out[a, b, c] = most
+
+
+@for_smoke
+def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
+    """Builds the kernel; `solid`: with obstacles."""
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
@@ -473,7 +384,9 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
         return _NEVER
 
     @wp.func
-    def extend(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> _Path:
+    def extend(
+        smoke: smoke_type, s: _Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]
+    ) -> _Path:
         """Follows a path to its next scattering, or out of the smoke to the sky, where it ends."""
         planes = s.settings.kept + 2
         count = s.lights.shape[0]
@@ -483,18 +396,17 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
             limit = free(s.mesh, path.p - s.view.moved * path.d, path.d) - s.view.moved
         else:
             limit = free(s.mesh, path.p, path.d)
-        flight = _fly(s.smoke, s.grid, path.p, path.d, limit, path.random)
+        flight = _fly(smoke, s.grid, path.p, path.d, limit, path.random)
         path.random = flight.random
         plane = wp.min(path.order, planes - 1)
         if flight.glow > 0.0:
             _add(out, (base + count + 1) * planes + plane, row, column, flight.glow * path.through)
         if flight.hit == 0:
-            if s.sky.total > 0.0 and limit >= 0.5 * _NEVER:
-                light = texel(s.sky, path.d)
+            if wp.max(s.settings.sky) > 0.0 and limit >= 0.5 * _NEVER:
                 share = float(1.0)
                 if path.chance > 0.0:
-                    share = path.chance / (path.chance + chance_of(s.sky, light))
-                _add(out, (base + count) * planes + plane, row, column, share * wp.cw_mul(path.through, light))
+                    share = path.chance / (path.chance + 1.0 / _FOUR_PI)
+                _add(out, (base + count) * planes + plane, row, column, share * wp.cw_mul(path.through, s.settings.sky))
             path.alive = 0
             return path
         path.p = path.p + flight.t * path.d
@@ -513,7 +425,9 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
         return path
 
     @wp.func
-    def connect(s: Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]) -> wp.uint64:
+    def connect(
+        smoke: smoke_type, s: _Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]
+    ) -> wp.uint64:
         """Adds the light of each light and of the sky that is scattered at the end of a path; returns the next random
         state."""
         planes = s.settings.kept + 2
@@ -531,27 +445,31 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                 strength = 1.0 / wp.max(away * away, 1.0e-12)
                 way = wp.normalize(way)
             if free(s.mesh, path.p, way) >= reach:
-                got = _passed(s.smoke, s.grid, path.p, way, reach, random)
+                got = _passed(smoke, s.grid, path.p, way, reach, random)
                 random = got.random
                 strength = strength * got.share * phase(s.settings.g, wp.dot(path.d, way))
                 light = strength * wp.cw_mul(path.through, s.lights[n].colour)
                 _add(out, (base + n) * planes + plane, row, column, light)
-        if s.sky.total > 0.0:
-            far = toward_sky(s.sky, random)
-            random = far.random
-            if free(s.mesh, path.p, far.direction) >= _NEVER:
-                got = _passed(s.smoke, s.grid, path.p, far.direction, _NEVER, random)
+        if wp.max(s.settings.sky) > 0.0:
+            random = following(random)
+            height = 1.0 - 2.0 * uniform(random)
+            random = following(random)
+            turn = _TWO_PI * uniform(random)
+            across = wp.sqrt(wp.max(1.0 - height * height, 0.0))
+            way = wp.vec3(across * wp.cos(turn), height, across * wp.sin(turn))
+            if free(s.mesh, path.p, way) >= _NEVER:
+                got = _passed(smoke, s.grid, path.p, way, _NEVER, random)
                 random = got.random
-                own = phase(s.settings.g, wp.dot(path.d, far.direction)) / _FOUR_PI
-                strength = got.share * own / (own + far.chance)
-                light = strength * wp.cw_mul(path.through, texel(s.sky, far.direction))
+                own = phase(s.settings.g, wp.dot(path.d, way))
+                light = got.share * own / (own + 1.0) * wp.cw_mul(path.through, s.settings.sky)
                 _add(out, (base + count) * planes + plane, row, column, light)
         return random
 
     @wp.kernel(module="unique", module_options=OPTIONS)
-    def trace(
+    def kernel(
         # in:
-        s: Scene,
+        smoke: smoke_type,
+        s: _Scene,
         first: int,
         last: int,
         parts: int,
@@ -583,11 +501,11 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                 path.alive = 1
             if part < past:
                 base = (part - first) * (s.lights.shape[0] + 2)
-                path = extend(s, path, base, row, column, out)
+                path = extend(smoke, s, path, base, row, column, out)
                 if path.alive == 1:
-                    random = connect(s, path, base, row, column, out)
+                    random = connect(smoke, s, path, base, row, column, out)
                     # After its last order a path continues only to the sky and to emission.
-                    if path.order == s.settings.highest and s.sky.total == 0.0 and s.smoke.emission == 0.0:
+                    if path.order == s.settings.highest and wp.max(s.settings.sky) == 0.0 and smoke.emission == 0.0:
                         path.alive = 0
                     random = following(random)
                     u = uniform(random)
@@ -597,7 +515,7 @@ def path_kernels(smoke_type: Any, solid: bool) -> _Kernels:
                     path.chance = phase(s.settings.g, wp.dot(before, path.d)) / _FOUR_PI
                     path.random = random
 
-    return _Kernels(Scene, majorants, window, coarser, trace)
+    return kernel
 
 
 def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float | None]]) -> list[PathLight]:
@@ -638,18 +556,17 @@ def bounds(medium: Medium, densest: float) -> Majorants:
         densest: Its largest extinction per voxel.
     """
     density, device, edge = medium.density, medium.device, BRICK
-    kernels = path_kernels(medium.smoke_type, False)
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
-    wp.launch(kernels.majorants, most.shape, [medium.smoke, _GLOW, _SLACK], [most], device=device)
+    _majorants(medium, most.shape, [_GLOW, _SLACK], [most])
     begin, end = _filled(most.numpy() > 0.0)
     low = tuple(edge * n for n in begin)
     size = tuple(min(edge * n, most) - least for n, most, least in zip(end, density.shape, low, strict=True))
     inner = medium.buffer(tuple(b - a for a, b in zip(begin, end, strict=True)), float)
-    wp.launch(kernels.window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
+    wp.launch(_window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
     while 2 * edge * densest <= _DEEP and max(inner.shape) > 1:
         edge *= 2
         wider = medium.buffer(tuple(-(-n // 2) for n in inner.shape), float)
-        wp.launch(kernels.coarser, wider.shape, [inner], [wider], device=device)
+        wp.launch(_coarser, wider.shape, [inner], [wider], device=device)
         inner = wider
     return Majorants(inner, edge, low, size)
 
@@ -669,7 +586,6 @@ def trace(
     view: View,
     majorants: Majorants,
     lights: wp.array,
-    sky: Sky,
     mesh: wp.uint64,
     settings: PathSettings,
     first: int,
@@ -683,7 +599,6 @@ def trace(
         view: The camera, [H, W] pixels; paths go through pixel centres.
         majorants: From `bounds`.
         lights: `PathLight` [L]; L may be 0.
-        sky: The environment; total 0: none.
         mesh: Mesh of obstacles in voxels, which absorb all light; 0: none.
         settings: Settings of the paths.
         first: First part to trace.
@@ -692,16 +607,14 @@ def trace(
             emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above
             `settings.kept`. The sum over all parts is the mean over all samples.
     """
-    kernels = path_kernels(medium.smoke_type, mesh != 0)
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
     together = max(1, traced * view.height * view.width // _THREADS) if medium.device.is_cuda else 1
-    scene = kernels.scene_type()
-    scene.smoke, scene.view, scene.lights, scene.sky = medium.smoke, view, lights, sky
-    scene.mesh, scene.settings = mesh, settings
+    scene = _Scene()
+    scene.view, scene.lights, scene.mesh, scene.settings = view, lights, mesh, settings
     grid = _Grid()
     grid.bounds, grid.edge = majorants.most, float(majorants.edge)
     grid.low, grid.size = (wp.vec3(*map(float, v)) for v in (majorants.low, majorants.size))
     scene.grid = grid
     size = (-(-traced // together), view.height, view.width)
-    wp.launch(kernels.trace, size, [scene, first, first + traced, parts, together], [out], device=medium.device)
+    _trace(medium, size, [scene, first, first + traced, parts, together], [out], mesh != 0)

@@ -1,4 +1,4 @@
-"""Pictures of smoke from lightmaps, or from separate images of each light, composited over solid obstacles.
+"""Pictures of smoke from separate images of each light, composited over solid obstacles.
 
 No data is read back to the host. All light is linear. `wlm.smoke.lightmaps.SixWay.shade` and
 `wlm.smoke.transport.lighting.LitSmoke.compose` are the same in torch, without obstacles.
@@ -39,14 +39,12 @@ class Lamps:
         toward: vec3 [L], directions to the lights in the world, of length 1; 0 for a point light, which does not light
             obstacles.
         irradiance: vec3 [L]; the intensity of a point light.
-        weights: float [L, 6], weights of the lightmaps; 0 for a point light.
         visibility: float [L, H, W], share of each light that reaches the smoke.
     """
 
     count: int
     toward: wp.array
     irradiance: wp.array
-    weights: wp.array
     visibility: wp.array
 
 
@@ -160,43 +158,6 @@ def _behind(
 @wp.kernel
 def _compose(
     # in:
-    lightmaps: wp.array3d(dtype=float),
-    transparency: wp.array2d(dtype=float),
-    glow: wp.array2d(dtype=wp.vec3),
-    hot: int,
-    lights: int,
-    irradiance: wp.array(dtype=wp.vec3),
-    weights: wp.array2d(dtype=float),
-    visibility: wp.array3d(dtype=float),
-    albedo: wp.vec3,
-    background: wp.vec3,
-    solids: int,
-    surface: wp.array2d(dtype=float),
-    solid_light: wp.array2d(dtype=wp.vec3),
-    solid_depth: wp.array2d(dtype=float),
-    # out:
-    image: wp.array2d(dtype=wp.vec3),
-):
-    i, j = wp.tid()
-    behind = _behind(i, j, background, solids, surface, solid_light, solid_depth)
-    if behind[3] > 0.0:
-        image[i, j] = wp.vec3(behind[0], behind[1], behind[2])
-        return
-    scattered = wp.vec3(0.0, 0.0, 0.0)
-    for lamp in range(lights):
-        grey = float(0.0)
-        for way in range(6):
-            grey += weights[lamp, way] * lightmaps[way, i, j]
-        scattered += (grey * visibility[lamp, i, j] / (4.0 * wp.pi)) * irradiance[lamp]
-    total = transparency[i, j] * wp.vec3(behind[0], behind[1], behind[2]) + wp.cw_mul(albedo, scattered)
-    if hot != 0:
-        total += glow[i, j]
-    image[i, j] = total
-
-
-@wp.kernel
-def _compose_lights(
-    # in:
     planes: wp.array3d(dtype=wp.vec3),
     transparency: wp.array2d(dtype=float),
     glow: wp.array2d(dtype=wp.vec3),
@@ -270,34 +231,6 @@ def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp
 
 
 def compose(
-    lightmaps: wp.array,
-    transparency: wp.array,
-    glow: wp.array | None,
-    albedo: tuple[float, float, float],
-    lamps: Lamps,
-    background: tuple[float, float, float],
-    solids: tuple[wp.array, wp.array, wp.array] | None,
-    image: wp.array,
-) -> None:
-    """Composites the smoke's light over obstacles and a background.
-
-    Args:
-        lightmaps: float [6, H, W].
-        transparency: float [H, W].
-        glow: vec3 [H, W], light that the smoke emits; None: it is cold.
-        albedo: R, G, B.
-        lamps: The lights.
-        background: A colour.
-        solids: The smoke's surface float [H, W], and the light and depth from `light_solids`; None: no obstacles.
-        image: vec3 [H, W], written.
-    """
-    inputs = [lightmaps, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
-    inputs += [lamps.irradiance, lamps.weights, lamps.visibility, wp.vec3(*albedo), wp.vec3(*background)]
-    inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]
-    wp.launch(_compose, image.shape, inputs, [image], device=image.device)
-
-
-def compose_lights(
     planes: wp.array,
     transparency: wp.array,
     glow: wp.array | None,
@@ -306,8 +239,18 @@ def compose_lights(
     solids: tuple[wp.array, wp.array, wp.array] | None,
     image: wp.array,
 ) -> None:
-    """Runs `compose` for images vec3 [L, H, W] of each light at an irradiance, or intensity, of 4 pi."""
+    """Composites the smoke's light over obstacles and a background.
+
+    Args:
+        planes: vec3 [L, H, W], the smoke under each light at an irradiance, or intensity, of 4 pi.
+        transparency: float [H, W].
+        glow: vec3 [H, W], light that the smoke emits; None: it is cold.
+        lamps: The lights.
+        background: A colour.
+        solids: The smoke's surface float [H, W], and the light and depth from `light_solids`; None: no obstacles.
+        image: vec3 [H, W], written.
+    """
     inputs = [planes, transparency, image if glow is None else glow, int(glow is not None), lamps.count]
     inputs += [lamps.irradiance, lamps.visibility, wp.vec3(*background)]
     inputs += [int(solids is not None), *(solids or (transparency, image, transparency))]
-    wp.launch(_compose_lights, image.shape, inputs, [image], device=image.device)
+    wp.launch(_compose, image.shape, inputs, [image], device=image.device)

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke import march_coarse
+from wlm_kernels.smoke import marches
 from wlm_kernels.smoke.naf_block import lane_sum
 
 LIGHTS = 6
@@ -34,7 +34,7 @@ FOOT, FOOT_CODE = 0.0031308, 0.04045
 _OPTIONS = {"enable_backward": False}
 _BOUNDS = (256, 2)  # threads per block and blocks per multiprocessor: without it registers limit the occupancy to half
 _HALF_MAX = 65504.0
-_TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
+_TRANSPARENCY, _EMISSION = (marches.PLANES.index(name) for name in ("transparency", "emission"))
 
 
 @wp.func_native("""
@@ -101,7 +101,7 @@ def _encode_six(
         glow = _at_least_zero(planes[wp.static(_EMISSION), row, column])
     out[wp.static(LIGHTS), row, column] = _srgb(glow / (1.0 + glow))
     out[wp.static(LIGHTS + 1), row, column] = 1.0 - planes[wp.static(_TRANSPARENCY), row, column]
-    depth = planes[wp.static(march_coarse.DEPTH), row, column]
+    depth = planes[wp.static(marches.DEPTH), row, column]
     share = _at_most_one(_at_least_zero((far - depth) / length))
     out[wp.static(LIGHTS + 2), row, column] = share * float(depth > 0.0)
 
@@ -110,7 +110,7 @@ def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.arr
     """Encodes the planes of the coarse march for the network.
 
     Args:
-        planes: float [9, H, W], of `march_coarse.PLANES`.
+        planes: float [9, H, W], of `marches.PLANES`.
         near, far: Distances at which the smoke begins and ends, near < far.
         hot: Whether the smoke emits light; otherwise that plane is 0.
         out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a

@@ -18,6 +18,7 @@ from wlm.export import write_page
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.data import from_arrays
+from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TileKind
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
@@ -92,12 +93,15 @@ def _long(*values: object) -> object:
     ("unpacked", "interpolation"), [(False, "radiance"), _long(True, "radiance"), _long(False, "network")]
 )
 def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpolation):
-    assert sorted(model.kind.tolist()) == [0, 1, 2, 3]
-    model = dataclasses.replace(model, profile=model.profile.override({"interpolation": interpolation}))
+    sheet = model.sheets[LIGHT]
+    assert sorted(sheet.kind.tolist()) == [0, 1, 2, 3]
+    profile = model.profile.override({"interpolation": interpolation})
+    sheet = dataclasses.replace(sheet, profile=profile.for_sheet(LIGHT))
+    model = dataclasses.replace(model, profile=profile, sheets={LIGHT: sheet})
     model.save(tmp_path / "four.wlm")
     write_page(tmp_path / "page.html", [tmp_path / "four.wlm"])
     page = show(tmp_path / "page.html", unpacked=unpacked)
-    decoder, gamma = model.decoder(), model.profile.gamma
+    decoder, gamma = model.decoder().light, sheet.profile.gamma
     for time in TIMES:
         expected = decoder.frame(time)
         seen = numbers(page, f"kind.read({time})").reshape(256, 256, 4)[..., :3]
@@ -109,12 +113,12 @@ def test_lightmaps_decode_as_in_python(model, tmp_path, show, unpacked, interpol
 @pytest.mark.parametrize(
     ("unpacked", "interpolation"), [_long(False, "radiance"), (True, "radiance"), _long(True, "network")]
 )
-def test_frames_of_all_modes_and_video_decode_as_in_python(tmp_path, show, unpacked, interpolation):
-    model = random_model((4, 1, 2, 4, 5, 6), times=(0.0, 7.5, 19.0), interpolation=interpolation)
+def test_frames_of_all_modes_decode_as_in_python(tmp_path, show, unpacked, interpolation):
+    model = random_model((4, 4, 2, 4, 1, 4), times=(0.0, 7.5, 19.0), interpolation=interpolation)
     model.save(tmp_path / "frames.wlm")
     write_page(tmp_path / "page.html", [tmp_path / "frames.wlm"])
     page = show(tmp_path / "page.html", unpacked=unpacked)
-    decoder = model.decoder()
+    decoder = model.decoder().light
     for time in (7.5, 21.0):
         expected = decoder.frame(time)
         seen = numbers(page, f"kind.read({time})").reshape(*expected.shape[:2], 4)[..., :3]
@@ -171,7 +175,7 @@ def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, 
     write_page(tmp_path / "page.html", [tmp_path / "four.wlm"], original=tmp_path / "set", hours=5)
     page = show(tmp_path / "page.html", touch=touch)
     point = page.touchscreen.tap if touch else page.mouse.move
-    box, hour, decoder = page.locator("#view").bounding_box(), lightmaps.times[2], model.decoder()
+    box, hour, decoder = page.locator("#view").bounding_box(), lightmaps.times[2], model.decoder().light
     page.evaluate(f"wlm.then(({{kind}}) => kind.read({hour}))")
     assert told(page) == "point at the picture to read a texel"
     middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
@@ -185,12 +189,12 @@ def test_a_texel_tells_its_tile_and_its_light(model, lightmaps, tmp_path, show, 
         u, v = map(float, re.search(r"UV (\S+) (\S+)", text).groups())
         assert np.abs(np.array([u, v]) * 256 - expected).max() < 0.1
         number = row // 128 * 2 + column // 128
-        assert f"tile {number} ({kind})" in text and TileKind(model.kind[number]).name.lower() == kind
+        assert f"tile {number} ({kind})" in text and TileKind(model.light.kind[number]).name.lower() == kind
         gamma, radiance = model.profile.gamma, decoder.frame(hour)
         apart = light_of(text, "decoded") ** (1 / gamma) - radiance[row, column] ** (1 / gamma)
         assert np.abs(apart).max() < 2 / 255 * radiance.max() ** (1 / gamma)
         if kind != "empty":
-            original = lightmaps.frames[2][row, column]
+            original = lightmaps.light.frames[2][row, column]
             assert np.abs(light_of(text, "original") - original).max() <= original.max() / 400
     if not touch:
         # What is outside of the mask has no error, though the original was filled there and the decoded light is 0.
@@ -389,7 +393,7 @@ def test_probes_decode_as_in_python(outputs, tmp_path, show):
     assert picture(page).max() > 100
 
 
-def test_probes_of_a_transform_and_light_between_them_decode_as_in_python(tmp_path, show):
+def test_principal_components_and_light_between_probes_decode_as_in_python(tmp_path, show):
     probes = probe_sets.synthetic(60, dead=5)
     model = wlm.probe.compress(probes)
     model.save(tmp_path / "probe.wlm")
@@ -401,8 +405,11 @@ def test_probes_of_a_transform_and_light_between_them_decode_as_in_python(tmp_pa
     files = {"mesh": tmp_path / "triangle.glb", "original": tmp_path / "probes.npz"}
     write_page(tmp_path / "page.html", [tmp_path / "probe.wlm"], **files)
     page = show(tmp_path / "page.html")
-    decoder = model.decoder(position=probes.position)
-    for group, expected in enumerate([decoder.decode_probes()[probes.live], decoder.decode(corners)]):
+    decoded = model.decoder(position=probes.position).decode_probes()[probes.live]
+    # Between probes the page weights those within four times the least distance by 1 / distance^4.
+    square = np.square(corners[:, None].astype(np.float64) - probes.position[probes.live]).sum(-1)
+    weight = np.where(square > 16 * square.min(1, keepdims=True), 0.0, np.maximum(square * square, 1e-30) ** -1.0)
+    for group, expected in enumerate([decoded, weight @ decoded / weight.sum(1, keepdims=True)]):
         seen = numbers(page, f"kind.read({group})").reshape(-1, 27)
         # The page has half floats of them.
         assert np.abs(seen - expected).max() < 2**-10 * np.abs(expected).max()

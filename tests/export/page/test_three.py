@@ -57,7 +57,7 @@ window.ready = true;
 def site(tmp_path, serve):
     """The grid of a model and three.js."""
     model = random_model(seed=3)
-    model.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
+    model.content.net[-27:-24] = 4.0  # biases of L0: light that is nowhere below 0
     export(model, tmp_path, "three", cells=8)
     (tmp_path / "index.html").write_text(_PAGE.replace("SIZE", str(_SIZE)))
     return model, json.loads((tmp_path / "grid.json").read_text()), f"{serve(tmp_path)}/index.html"

@@ -1,6 +1,5 @@
 """Every shader that we export, in every language that runs here, beside what Python decodes."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -30,6 +29,7 @@ from wlm.errors import WlmError
 from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
 from wlm.lightmap.decode import SheetDecoder
+from wlm.probe.sphere import irradiance
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
@@ -157,15 +157,19 @@ def volume(folder) -> Subject:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = made.read(points, normals)
     head, pages, pool = (np.fromfile(folder / f"{name}.bin", kind) for name, kind in KINDS_OF_BUFFERS)
-    expected = np.column_stack([ahead.weight, ahead.values[:, [0, 5, 26]] * ahead.weight[:, None]])
+    shown = [irradiance(each.reshape(9, 3), n[None])[0, 1] for each, n in zip(ahead.values, normals, strict=True)]
+    light = np.column_stack([ahead.values[:, [0, 26]], np.array(shown) / np.pi])
+    expected = np.column_stack([ahead.weight, light * ahead.weight[:, None]])
     main = (
         POINTS
         + """uniform sampler2D u_normals;
 vec4 shown(ivec2 pixel)
 {
     float values[27];
-    float weight = wlm_volume_read(texelFetch(u_points, pixel, 0).xyz, texelFetch(u_normals, pixel, 0).xyz, values);
-    return vec4(weight, weight * values[0], weight * values[5], weight * values[26]);
+    vec3 p = texelFetch(u_points, pixel, 0).xyz;
+    vec3 n = texelFetch(u_normals, pixel, 0).xyz;
+    float weight = wlm_volume_read(p, n, values);
+    return vec4(weight, weight * values[0], weight * values[26], weight * wlm_volume_diffuse(p, n).g);
 }
 """
     )
@@ -311,15 +315,13 @@ def test_metal_as_the_cpp_that_it_is(name, tmp_path):
     np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
 
 
-def test_heads_tell_what_other_languages_hold(tmp_path):
-    """Macros are decided there, and nothing is of GLSL."""
-    for name in ("lightmap", f"atlas {MIXED}", "scene", "probes", "volume"):
-        text = SUBJECTS[name](tmp_path / name).text
-        for defined in ((), ("WLM_ATLAS_EXACT", "WLM_LIGHTMAP_EXACT")):
-            written = translate(text, "hlsl", defined)
-            assert not re.search(r"//.*(_EXACT|before this file|GLSL|#version|WLM_\w+\(\w\))", written), name
-            exact = "our texels are fetched and mixed in floats." in written
-            assert exact == (bool(defined) and name in ("lightmap", f"atlas {MIXED}"))
+def test_heads_state_language_and_macros():
+    text = "// A shader.\n#ifdef WLM_A\nconst int A = 1;\n#endif\n"
+    for defined, macros in (((), ""), (("WLM_A",), " with WLM_A defined")):
+        written = translate(text, "hlsl", defined)
+        head = "// HLSL, shader model 5 and later, translated from the GLSL that is described below"
+        assert written.startswith(f"{head}{macros}; macros are expanded.\n//\n// A shader.\n")
+        assert ("int A = 1" in written) == bool(defined)
 
 
 def test_what_is_no_shader_of_ours():

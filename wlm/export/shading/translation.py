@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from wlm.errors import WlmError
-from wlm.export.shading.heads import decided
 from wlm.export.shading.hlsl import HlslWriter
 from wlm.export.shading.metal import MetalWriter
 from wlm.export.shading.source import read_words
@@ -38,8 +37,8 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
     """Translates one of our shaders.
 
     GLSL is not changed, except for macros and precisions at its head; conditional directives are left to the including
-    shader. In the other languages macros are expanded. They have functions of the same names, textures of the same
-    names, and one sampler, linear and clamped to the edge.
+    shader. In the other languages macros are expanded, which a comment at the head states. They have functions of the
+    same names, textures of the same names, and one sampler, linear and clamped to the edge.
 
     Args:
         text: GLSL of this package, in the subset of the language that `wlm.export.shading.tree` parses.
@@ -53,7 +52,10 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
     check_language(language)
     if not language.startswith("glsl"):
         defined = tuple(defined)
-        text = decided(text, _VERSIONS[language], defined)
-        return _WRITERS[language](read_shader(read_words(text, defined))).text()
+        macros = f" with {', '.join(defined)} defined" if defined else ""
+        head = (
+            f"// {_VERSIONS[language]}, translated from the GLSL that is described below{macros}; macros are expanded."
+        )
+        return _WRITERS[language](read_shader(read_words(f"{head}\n//\n{text}", defined))).text()
     defines = "".join(f"#define {name}\n" for name in defined)
     return (_PRECISIONS if language == "glsl-es" else "") + defines + text

@@ -229,11 +229,13 @@ class Frames(Encoding):
         return [kept.swapaxes(0, 1).tobytes()]
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
-        needed, blocks = needed_blocks(sheet.mask, number), sheet.frames[sheet.row(number)]
-        kept = data.reshape(-1, len(sheet.times), BLOCK_BYTES).swapaxes(0, 1)
-        _check_modes(kept, number)
-        blocks[...] = _BLACK
-        blocks[:, needed] = kept
+        needed, blocks = needed_blocks(sheet.mask, number).ravel(), sheet.frames[sheet.row(number)]
+        _check_modes(data.reshape(-1, BLOCK_BYTES), number)
+        # A block is copied as two words, which is several times faster than 16 bytes.
+        times, kept = len(sheet.times), data.view("<u8")
+        out = blocks.reshape(times, -1, BLOCK_BYTES).view("<u8")
+        out[:, ~needed] = _BLACK.view("<u8")
+        out[:, needed] = kept.reshape(-1, times, 2).swapaxes(0, 1)
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
         return [FrameTiles(sheet, device)] if len(sheet.frames) else []
@@ -263,5 +265,5 @@ class Frames(Encoding):
 
 
 def _check_modes(blocks: np.ndarray, number: int) -> None:
-    if (bc7_modes.block_modes(np.ascontiguousarray(blocks)) == bc7_modes.RESERVED).any():
+    if (bc7_modes.block_modes(blocks) == bc7_modes.RESERVED).any():
         raise WlmError(f"frames: tile {number}: expected BC7 blocks of modes 0 to 7, found a reserved mode")

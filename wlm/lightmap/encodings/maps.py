@@ -40,17 +40,14 @@ _MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynam
 
 def tile_bytes(profile: Profile, temporal: bool) -> int:
     """Returns the bytes of the maps and the network of one tile before packing: the arithmetic of table 3."""
-    size = TILE * TILE + _network_bytes(profile, temporal)
+    inputs, hidden = profile.inputs(temporal), profile.hidden
+    if profile.net_bits == 16:
+        size = TILE * TILE + 2 * mlp.parameter_count(inputs, hidden)
+    else:
+        size = TILE * TILE + (inputs + hidden + 3) * hidden + 2 * 2 * (2 * hidden + 3)
     if temporal:
         size += profile.uvt_slices * profile.uvt_resolution**2 + 2 * 2 * profile.plane_rows * profile.plane_columns
     return size
-
-
-def _network_bytes(profile: Profile, temporal: bool) -> int:
-    inputs, hidden = profile.inputs(temporal), profile.hidden
-    if profile.net_bits == 16:
-        return 2 * mlp.parameter_count(inputs, hidden)
-    return (inputs + hidden + 3) * hidden + 2 * 2 * (2 * hidden + 3)
 
 
 # ---- texels that decoding reads ----
@@ -73,27 +70,28 @@ class Reads:
     columns: np.ndarray
 
     @classmethod
-    def of(cls, used: np.ndarray, profile: Profile, axis: TimeAxis) -> Reads:
+    def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
         """Finds the reads of a tile.
 
         Args:
             used: bool [128, 128], the valid texels of the tile.
-            profile: The settings.
             axis: The time axis. Only stored times are evaluated if light between them is mixed as radiance.
+            resolution, slices: Size of F_uvt.
+            columns, rows: Size of F_ut and F_vt.
         """
         centres = (np.arange(TILE) + 0.5) / TILE
-        across = _cells(centres, profile.uvt_resolution).astype(np.int64)
-        along = _cells(centres, profile.plane_columns)
-        slices, rows = (
+        across = _cells(centres, resolution).astype(np.int64)
+        along = _cells(centres, columns)
+        read_slices, read_rows = (
             _cells(encode_time(axis)[0], count, axis.periodic).any(0)
             if axis.interpolation == "radiance"
             else np.ones(count, bool)
-            for count in (profile.uvt_slices, profile.plane_rows)
+            for count in (slices, rows)
         )
         return cls(
-            slices,
+            read_slices,
             across.T @ used @ across > 0,
-            rows,
+            read_rows,
             np.stack([along[used.any(axis)].any(0) for axis in (0, 1)]),
         )
 

@@ -19,8 +19,8 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.godot import lmbake_bytes, relit
 from wlm.probe.conventions import from_canonical
-from wlm.probe.data import load_positions
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of, positions_of
+from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.places import positions_of
 
 BAKE_FILE = "light.lmbake"
 _MOST_CELLS = 64
@@ -49,20 +49,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model's light as a bake of Godot 4, `light.lmbake`.
+    """Writes a model of L2 in RGB as a bake of Godot 4, `light.lmbake`.
 
-    Args:
-        bundle: The bundle of a model of L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        cells: Cells along the longest side of the box, 1 to 64, without a bake; None: 24.
-        original: The `.lmbake` that was compressed, whose light is replaced. Otherwise the bake has probes at the
-            corners of cubic cells that fill the probes' box, with the decoded light there; another file that was
-            compressed gives the positions, if the method needs them and the model stores none.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index, and entries that describe the lattice.
+    If `original` is the `.lmbake` that was compressed, its light is replaced. Otherwise the bake has probes at the
+    corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24), and another
+    `original` gives the positions, if the method needs them and the model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range or given with a bake, the bake has
@@ -91,9 +82,7 @@ def write_kit(
             raise WlmError(f"cells: expected none with {bake}, whose probes have positions")
         if model.outputs != NUMBERS:
             raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers per probe, got {model.outputs}")
-        places = load_positions(bake)
-        if not model.has_probes_at(places):
-            raise WlmError(f"{bake}: expected the {model.probes} probes of {model.name}, in their order")
+        places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
     (folder / BAKE_FILE).write_bytes(content)
     return {"about": _ABOUT} | info

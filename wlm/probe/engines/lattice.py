@@ -1,14 +1,10 @@
 """The light of a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.probe.data import load_positions
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
 
@@ -19,7 +15,6 @@ NUMBERS = 27
 """Numbers of a probe with L2 spherical harmonics in RGB."""
 
 _ROWS = 65536  # points decoded at a time
-_FARTHEST = 1e100
 
 
 @dataclass(frozen=True)
@@ -56,20 +51,6 @@ class Lattice:
         return np.stack([x, y, z], -1).reshape(-1, 3)
 
 
-def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
-    """Returns the positions of a model's probes in another file, float64 [N, 3]; None without a file.
-
-    Raises:
-        WlmError: The file cannot be read or has other probes.
-    """
-    if original is None:
-        return None
-    position = load_positions(original)
-    if not model.has_probes_at(position):
-        raise WlmError(f"{original}: expected the {model.probes} probes of {model.name}, in their order")
-    return position
-
-
 def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | None, device: str) -> Lattice:
     """Fills the box of a model's probes with cells, centred where they do not fit it exactly.
 
@@ -92,40 +73,3 @@ def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | 
     size = float(span.max()) / cells or 1.0  # one cell if all probes coincide
     count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
     return Lattice(model.decoder(device, position=position), model.origin + span / 2 - count * size / 2, size, count)
-
-
-def read_cells(path: Path, document: dict[str, Any], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the lattice of an export: `box`, its two corners, and `resolution`, the cells along x, y and z.
-
-    Args:
-        path: Path of the document, for messages.
-        document: Its content.
-        most: Largest number of cells along an axis.
-
-    Returns:
-        float64 [2, 3] and int [3].
-
-    Raises:
-        WlmError: A field is missing or wrong.
-    """
-    try:
-        box, cells = np.array(document.get("box"), np.float64), np.array(document.get("resolution"))
-    except (TypeError, ValueError, OverflowError) as error:
-        raise WlmError(f"{path}: box, resolution: expected numbers, got others") from error
-    if box.shape != (2, 3) or not (np.abs(box) < _FARTHEST).all() or not (box[1] > box[0]).all():
-        raise WlmError(f"{path}: box: expected two corners, the lower first")
-    if cells.shape != (3,) or cells.dtype.kind != "i" or not ((cells >= 1) & (cells <= most)).all():
-        raise WlmError(f"{path}: resolution: expected three numbers of 1 to {most}")
-    return box, cells
-
-
-def grid_places(box: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Returns the centres of cells, float64 [nz * ny * nx, 3], x fastest.
-
-    Args:
-        box: [2, 3], lowest and highest corner.
-        count: [3], cells along x, y and z.
-    """
-    axes = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(*box, count, strict=True)]
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.stack([x, y, z], -1).reshape(-1, 3)

@@ -17,11 +17,11 @@ import numpy as np
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import write_index
-from wlm.formats.ktx2 import read_half_volume, write_ktx2
-from wlm.formats.reading import named_file
-from wlm.probe.conventions import THREE_GRID as FORMAT
-from wlm.probe.engines.lattice import CELLS, NUMBERS, grid_places, lattice_of, positions_of, read_cells
+from wlm.formats.ktx2 import write_ktx2
+from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.places import positions_of
 
+FORMAT = "wlm-light-probe-grid"
 _VERSION = 1
 INFO_FILE = "grid.json"
 TEXTURE_FILE = "grid.ktx2"
@@ -72,21 +72,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
+    """Writes a model of L2 in RGB as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
 
-    The grid's probes are at the centres of cubic cells that fill the probes' box, with the decoded light there in half
-    floats.
-
-    Args:
-        bundle: The bundle of a model of L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        cells: Cells along the longest side of the box, 1 to 256.
-        original: The file that was compressed, if the method needs positions and the model stores none.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index.
+    The grid's probes are at the centres of cubic cells that fill the probes' box, 1 to 256 `cells` along its longest
+    side, with the light there in half floats. `original` is the file that was compressed, if the method needs
+    positions and the model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the
@@ -117,41 +107,10 @@ def write_kit(
     return {"about": _ABOUT}
 
 
-def read_grid(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a grid that `write_kit` wrote.
-
-    Args:
-        path: Path of `grid.json`.
-        document: Its content.
-
-    Returns:
-        float64 [N, 3], positions; float32 [N, 9, 3], values.
-
-    Raises:
-        WlmError: A field is missing or wrong, or the texture cannot be read or has another size.
-    """
-    name = document.get("texture")
-    corners, cells = read_cells(path, document, _MOST_CELLS)
-    if not isinstance(name, str):
-        raise WlmError(f"{path}: texture: expected the name of a file")
-    texels = read_half_volume(named_file(path, name, f"{path}: texture"))
-    expected = (_PARTS * (int(cells[2]) + 2), int(cells[1]), int(cells[0]))
-    if texels.shape[:3] != expected:
-        raise WlmError(f"{path}: texture: expected {expected} slices, rows and texels, got {texels.shape[:3]}")
-    return grid_places(corners, cells), unpack(texels).reshape(-1, 9, 3)
-
-
 def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Packs probes [nz * ny * nx, 27] in the order of `grid_places` as a texture, float16 [7 (nz + 2), ny, nx, 4]."""
+    """Packs probes [nz * ny * nx, 27] in the order of `Lattice.centres` into float16 [7 (nz + 2), ny, nx, 4]."""
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
     padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)
     parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
     return np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1).reshape(-1, ny, nx, 4)
-
-
-def unpack(texels: np.ndarray) -> np.ndarray:
-    """Returns the probes, float32 [nz * ny * nx, 27], of a texture that `pack` made."""
-    _, ny, nx, _ = texels.shape
-    parts = texels.reshape(_PARTS, -1, ny, nx, 4)[:, 1:-1]
-    return np.moveaxis(parts, 0, 3).reshape(-1, 4 * _PARTS)[:, :NUMBERS].astype(np.float32)

@@ -14,12 +14,11 @@ import numpy as np
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import compact_json, rounded
-from wlm.probe.conventions import UNITY_PROBES as FORMAT
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import positions_of
-from wlm.probe.json_fields import fields_of
+from wlm.probe.places import positions_of
 from wlm.probe.sphere import sh_count
 
+FORMAT = "wlm-unity-probes"
 _VERSION = 1
 INFO_FILE = "probes.json"
 SCRIPT_FILE = "WlmLightProbes.cs"
@@ -177,17 +176,8 @@ def write_kit(
 ) -> dict[str, Any]:
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
-    Args:
-        bundle: The bundle of a model of L0, L1 or L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        mirror: Axis to mirror, "x", "y" or "z". Unity is left-handed: importers mirror a glTF scene along x or along z;
-            a scene that came from Unity needs no mirroring.
-        original: The file that was compressed, for its positions; None: those stored with the model.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index.
+    Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is that axis; a scene that came from
+    Unity needs none. `original` is the file that was compressed, for its positions; None: those stored with the model.
 
     Raises:
         WlmError: The numbers are not spherical harmonics of up to L2, there are more than 131,072 probes, the axis does
@@ -223,25 +213,3 @@ def write_kit(
     (folder / SCRIPT_FILE).write_text(_SCRIPT, encoding="utf-8")
     (folder / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
     return {"about": _ABOUT}
-
-
-def read_unity(path: Path, document: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads probes that `write_kit` wrote.
-
-    Args:
-        path: Path of `probes.json`.
-        document: Its content.
-
-    Returns:
-        Positions [N, 3], in Unity's axes; values [N, 9, 3], in the convention "unity".
-
-    Raises:
-        WlmError: A field is missing, is not numeric, or has another length.
-    """
-    position, sh = (fields_of(path, document)[1](field) for field in ("position", "sh"))
-    if position.ndim != 1 or len(position) % 3 or sh.shape != (3 * _L2 * (len(position) // 3),):
-        raise WlmError(
-            f"{path}: position, sh: expected 3 and {3 * _L2} numbers of each probe in two lists, "
-            f"got {position.shape} and {sh.shape}"
-        )
-    return position.reshape(-1, 3), sh.reshape(-1, 3, _L2).swapaxes(1, 2)

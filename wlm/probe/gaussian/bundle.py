@@ -5,19 +5,14 @@ The paper's numbers are half floats. Here those of the Gaussians are the fit's o
 decode to exactly what was trained, whereas a half float can move a centre by a 4096th of the box.
 """
 
-from typing import Any
-
 import numpy as np
 
-from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import rounded
-from wlm.probe.conventions import CANONICAL
 from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.model import CENTRE, CUT, SCALE, Gaussians
 from wlm.probe.gaussian.shader import HEAD_WORDS, gaussian_words, probe_glsl
-from wlm.probe.model import ProbeModel
-from wlm.probe.sphere import sh_count
+from wlm.probe.model import GpuForm, ProbeModel
 
 _REFERENCES = 64  # positions of the reference, and one outside the box
 _FOUR = 4
@@ -35,43 +30,40 @@ _ABOUT = {
     "along axis a is cut * sqrt(sum over b of (R_ab s_b)^2), or cut * max(s) for the support 'sphere'. Widen the cubes "
     "by a millionth for rounding. The list of the cube that contains x has all Gaussians that reach x; the shader "
     "tests each of them again.",
-    "values": "A probe has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
-    "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
-    "dead": "Probes that are zero, by index from 0 in the order of compression: engines leave them inside walls. The "
-    "Gaussians and the network do not know them.",
-    "positions": "If the buffer positions exists: 3 unsigned 16-bit codes per probe, position = origin + extent * size "
-    "* code / 65535.",
     "reference": "position: points of the scene, the last one outside the box; values: the light there.",
     "precision": "The shader computes in floats. For Gaussians far longer than thin the reference uses doubles in "
     "some places: slenderness is the largest ratio of a Gaussian's scales, and about 1e-7 times it is the error of u.",
 }
 
 
-def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
-    """Returns what a GPU holds of a model of Gaussians.
-
-    Args:
-        model: The model.
-        decoder: Its decoder, for the reference.
+def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
+    """Returns the GPU form of a model of Gaussians; `decoder` computes the reference.
 
     Raises:
-        WlmError: The probes' box does not fit floats, or the light is not finite.
+        WlmError: The probes' box does not fit floats.
     """
     content = model.content
     position = _reference_positions(model, content)
-    values = decoder.decode(position)
-    if not np.isfinite(values).all():
-        raise WlmError(f"{model.name}: cannot export: the model decodes to NaN or infinity")
-    buffers = {"gaussians": _gaussian_words(model, content), "network": _network_words(content)}
-    if model.has_positions:
-        buffers["positions"] = np.ascontiguousarray(model.positions, "<u2")
-    return Bundle(
-        system=ProbeModel.SYSTEM,
-        name=model.name,
+    scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)
+    document = {
+        "gaussians": content.count,
+        "latent": content.latent,
+        "hidden": content.hidden,
+        "support": content.support,
+        "cut": CUT,
+        "gain": content.gain,
+        "low": rounded(content.bounds[0]),
+        "step": rounded(content.steps),
+        "first_gaussian_word": HEAD_WORDS + 2 * content.bounds.shape[1],
+        "words_per_gaussian": gaussian_words(content.latent),
+        "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
+    }
+    return GpuForm(
         shader=probe_glsl(content),
-        document=_document(model, content),
-        buffers=buffers,
-        reference={"position": position, "values": values},
+        buffers={"gaussians": _gaussian_words(model, content), "network": _network_words(content)},
+        document=document,
+        about=_ABOUT,
+        reference={"position": position, "values": decoder.decode(position)},
     )
 
 
@@ -107,31 +99,3 @@ def _reference_positions(model: ProbeModel, content: Gaussians) -> np.ndarray:
     chosen = np.unique(np.linspace(0, content.count - 1, min(content.count, _REFERENCES)).astype(int))
     inside = content.rows()[chosen, CENTRE].astype(np.float64)
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])
-
-
-def _document(model: ProbeModel, content: Gaussians) -> dict[str, Any]:
-    scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)
-    return {
-        "about": _ABOUT,
-        "source": model.source,
-        "method": model.method,
-        "probes": model.probes,
-        "outputs": model.outputs,
-        "coefficients": sh_count(model.outputs),
-        "convention": CANONICAL,
-        "gaussians": content.count,
-        "latent": content.latent,
-        "hidden": content.hidden,
-        "support": content.support,
-        "cut": CUT,
-        "origin": model.origin.tolist(),
-        "extent": model.extent,
-        "size": model.size.tolist(),
-        "gain": content.gain,
-        "low": rounded(content.bounds[0]),
-        "step": rounded(content.steps),
-        "first_gaussian_word": HEAD_WORDS + 2 * content.bounds.shape[1],
-        "words_per_gaussian": gaussian_words(content.latent),
-        "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
-        "dead": np.flatnonzero(model.dead).tolist(),
-    }

@@ -25,10 +25,9 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.probe.decode import Decoder
-from wlm.probe.model import CODES, Content, ProbeModel, Profile
+from wlm.probe.model import CODES, Content, GpuForm, ProbeModel
 from wlm_kernels.probe.network import most_outputs
 
 # Channels of a Gaussian as a GPU holds it: centre, logarithm of the scale, quaternion, latent.
@@ -161,8 +160,8 @@ class Gaussians(Content):
     def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
         return import_module("wlm.probe.gaussian.decode").GaussianDecoder(model, device, **options)
 
-    def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
-        return import_module("wlm.probe.gaussian.bundle").gaussian_bundle(model, decoder)
+    def gpu_form(self, model: ProbeModel, decoder: Decoder) -> GpuForm:
+        return import_module("wlm.probe.gaussian.bundle").gaussian_form(model, decoder)
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
@@ -197,10 +196,9 @@ def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str
         )
 
 
-def predicted_bytes(profile: Profile, live: int, outputs: int) -> int:
-    """Returns the GPU bytes of a fit with this profile to `live` probes, if it drops no Gaussian."""
-    count = max(1, round(profile.ratio * live))
-    return gaussian_bytes(count, profile.latent, profile.hidden, outputs)
+def gaussian_count(ratio: float, live: int) -> int:
+    """Returns the number of Gaussians that a fit to `live` probes begins with."""
+    return max(1, round(ratio * live))
 
 
 def least_turned(rows: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ of the groups of numbers are such that a bit is worth about as much in each grou
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -61,24 +61,22 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     Returns:
         The coarsest model found that loses at most `DROP`, or a model with fine steps if there is none.
     """
+    content = model.content
+    assert isinstance(content, Gaussians)
     many = slice(None, None, -(-len(position) // _MANY))
     faint = _FAINT * max(float(np.ptp(values)), float(np.abs(values).max())) ** 2
-    search = _Search(model, position[many], values[many], faint, device)
+    search = _Search(content, model.normalise(position[many]), values[many], faint, device)
     growth = 10.0 ** (DROP / 10.0) - 1.0
     most = (1.0 + growth) * (_error(model, position, values, device) + faint)
     for _ in range(_AGAIN):
         whole = search.within(growth)
         if whole is None:
             break
-        found = _with_numbers(model, whole)
+        found = replace(model, content=replace(content, whole=whole, **whole.codes()))
         if _error(found, position, values, device) <= most:
             return found
         growth *= _LESS
-    return _with_numbers(model, search.finest())
-
-
-def _with_numbers(model: ProbeModel, whole: WholeNumbers) -> ProbeModel:
-    content: Any = model.content
+    whole = search.finest()
     return replace(model, content=replace(content, whole=whole, **whole.codes()))
 
 
@@ -108,29 +106,22 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Weights of Gaussians at the probes.
-
-    Attributes:
-        rows: float64 [K, 9], the Gaussians without their latents.
-        weight: float64 [N, K] on the device; None where there are too many of them.
-        square: weight^T weight; None with `weight`.
-        feed: `_feed` of `square`; None with `weight`.
-    """
+    """Weights of Gaussians [K, 9] at the probes, float64 [N, K]; None with more than `_TOGETHER` Gaussians."""
 
     rows: np.ndarray
-    weight: torch.Tensor | None
-    square: np.ndarray | None
-    feed: np.ndarray | None
+    weight: torch.Tensor | None = None
+    square: np.ndarray | None = None
+    """weight^T weight."""
+    feed: np.ndarray | None = None
+    """`_feed` of `square`."""
 
 
 class _Search:
     """Finds integers of a model at given steps, and the error that they leave."""
 
-    def __init__(self, model: ProbeModel, position: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
-        content = model.content
-        assert isinstance(content, Gaussians)
+    def __init__(self, content: Gaussians, x: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
         self._gain, self._sphere = content.gain, content.support == "sphere"
-        self._x = torch.from_numpy(model.normalise(position).astype(np.float64)).to(device)
+        self._x = torch.from_numpy(x.astype(np.float64)).to(device)
         self._wanted = self._put(values.astype(np.float64) / self._gain)
         rows = least_turned(content.rows())
         centre = rows[:, STORED_CENTRE]
@@ -222,7 +213,7 @@ class _Search:
 
     def _sums(self, rows: np.ndarray) -> _Sums:
         if len(rows) > _TOGETHER:
-            return _Sums(rows, None, None, None)
+            return _Sums(rows)
         weight = torch.cat(list(self._weights(rows)))
         square = (weight.T @ weight).cpu().numpy()
         return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))

@@ -6,20 +6,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.parts import Part, all_finite, check_part, check_parts
-from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, ROTATION, SCALE, Gaussians, layer_shapes
-from wlm.probe.gaussian.start import first_gaussians
+from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, ROTATION, SCALE, Gaussians, gaussian_count, layer_shapes
 from wlm.probe.model import Profile
 from wlm.probe.morton import morton_order
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
 from wlm_kernels.probe.network import CPU_LANES
-from wlm_kernels.probe.optimiser import Optimiser
-from wlm_kernels.probe.step import GROUP
+from wlm_kernels.probe.step import GROUP, Optimiser
 
 CODE_BITS, CENTRE_BITS = 10, 16
 """Bits of a code in training: of scale, rotation and latent, and of a centre."""
@@ -31,6 +30,12 @@ _QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the
 _FIRST_LATENT = 0.1  # standard deviation of the first latents
 _PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
+_NEIGHBOURS = 9  # probes whose spread is the local spread of one of them
+_PIECE = 4096  # probes per piece
+_ROUNDS = 4  # of k-means where the draw follows detail, which more rounds would undo
+_PLAIN_ROUNDS = 20  # of k-means where the draw is uniform
+_FLOOR = 0.05  # smallest local spread, as a share of the mean
+_SMALLEST = 1e-4  # smallest first scale, as a share of the box
 _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe at the edge of its group's box
 
 
@@ -41,6 +46,8 @@ class Trainer:
     to codes in each step (section 3.3); then they are fixed, and only the network is trained.
 
     Attributes:
+        device: "cpu" or "cuda:N".
+        steps: Number of steps of the whole fit.
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
         dropped_change: Largest change of a probe's number that dropping causes.
@@ -56,18 +63,29 @@ class Trainer:
             seed: One seed gives one result on one device.
             device: "cpu" or "cuda:N".
         """
-        self.profile, self.device = profile, device
-        self._cuda = device != "cpu"
+        self.device, self._cuda = device, device != "cpu"
+        self.steps, self._name, self._support = profile.steps, profile.name, profile.support
+        self._probes, self._outputs = values.shape
+        self._latent, self._hidden = profile.latent, profile.hidden
+        self._layers = layer_shapes(self._latent, self._hidden, probe_network.padded(self._outputs))
         kind = "cuda" if self._cuda else "cpu"
-        self._step_kernels = probe_step.step_kernels(profile.latent, kind)
-        self._network = probe_network.network_kernels(profile.latent, profile.hidden, values.shape[1], kind)
-        random = np.random.default_rng(seed)
+        self._step_kernels = probe_step.step_kernels(self._latent, kind)
+        self._network = probe_network.network_kernels(self._latent, self._hidden, self._outputs, kind)
         order = morton_order(x)
         x, values = x[order], values[order]
-        self._probes, self._outputs = values.shape
         self._upload(x, values)
-        self._allocate(*self._first(x, values, random))
-        self._optimiser = self._settings()
+        self._allocate(*_first_numbers(x, values, profile, np.random.default_rng(seed)))
+        rates = np.empty(LATENT.start + self._latent)
+        rates[CENTRE], rates[SCALE], rates[ROTATION] = profile.centre_rate, profile.scale_rate, profile.rotation_rate
+        rates[LATENT] = profile.latent_rate
+        share = np.linspace(0.0, 1.0, self.steps)
+        self._optimiser = Optimiser()
+        self._optimiser.control = self._arrays["control"]
+        self._optimiser.schedule = self._put(FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + np.cos(np.pi * share)), float)
+        self._optimiser.rates = self._put(rates, float)
+        self._optimiser.net_rate = profile.net_rate
+        self._optimiser.bounds = self._arrays["bounds"]
+        self._optimiser.adan = int(profile.optimiser == "adan")
         self.needed = np.ones(self.count, bool)
         self.dropped_change = 0.0
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
@@ -99,34 +117,11 @@ class Trainer:
         self._unit = float(max(spread.max() ** 2, np.finfo(np.float64).tiny))
         self._weight = self._put(spread**2 / self._unit / (n * d), float)
 
-    def _first(self, x: np.ndarray, values: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the first Gaussians and network."""
-        p = self.profile
-        count = max(1, round(p.ratio * len(x)))
-        centre, scale = first_gaussians(x, values, count, p.detail, p.first_scale, random)
-        rows = np.zeros((len(centre), LATENT.start + p.latent), np.float32)
-        rows[:, CENTRE] = centre
-        rows[:, SCALE] = np.log(scale)[:, None]
-        rows[:, ROTATION.start] = 1.0
-        rows[:, LATENT] = random.normal(size=(len(centre), p.latent)) * _FIRST_LATENT
-        inputs, hidden, wide = p.latent + 3, p.hidden, probe_network.padded(self._outputs)
-        first = random.uniform(-1, 1, (inputs + 1, hidden)) * p.gain / math.sqrt(inputs)
-        first[inputs] /= p.gain
-        first[inputs] -= x.mean(0) @ first[p.latent : inputs]
-        second = np.zeros((hidden + 1, hidden))
-        second[:hidden] = random.uniform(-1, 1, (hidden, hidden)) * p.gain / math.sqrt(hidden)
-        third = np.zeros((hidden + 1, wide))
-        third[:hidden, : self._outputs] = random.uniform(-1, 1, (hidden, self._outputs)) / math.sqrt(hidden)
-        # A sigmoid is 1/2 on average; the biases make each layer's inputs 0 on average.
-        second[hidden] = -0.5 * second[:hidden].sum(0)
-        third[hidden] = -0.5 * third[:hidden].sum(0)
-        return rows, np.concatenate([first.ravel(), second.ravel(), third.ravel()]).astype(np.float32)
-
     def _allocate(self, rows: np.ndarray, net: np.ndarray) -> None:
         count, channels = rows.shape
         padded = self._groups.x.shape[0]
         groups, parts = padded // GROUP, self._network.parts(padded)
-        latent = self.profile.latent
+        latent = self._latent
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, device=self.device)
@@ -150,22 +145,8 @@ class Trainer:
         self._shapes = wp.zeros(count, dtype=Shape, device=self.device)
         self._by_group = wp.zeros((groups, -(-count // 32)), dtype=wp.uint32, device=self.device)
         self._by_gaussian = wp.zeros((count, -(-groups // 32)), dtype=wp.uint32, device=self.device)
-        self._levels = self._put(self._largest_codes(), float)
-
-    def _settings(self) -> Optimiser:
-        p = self.profile
-        share = np.linspace(0.0, 1.0, p.steps)
-        rates = np.empty(LATENT.start + p.latent)
-        rates[CENTRE], rates[SCALE], rates[ROTATION] = p.centre_rate, p.scale_rate, p.rotation_rate
-        rates[LATENT] = p.latent_rate
-        optimiser = Optimiser()
-        optimiser.control = self._arrays["control"]
-        optimiser.schedule = self._put(FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + np.cos(np.pi * share)), float)
-        optimiser.rates = self._put(rates, float)
-        optimiser.net_rate = p.net_rate
-        optimiser.bounds = self._arrays["bounds"]
-        optimiser.adan = int(p.optimiser == "adan")
-        return optimiser
+        self._codes = 2 ** np.array([CENTRE_BITS] * 3 + [CODE_BITS] * (7 + latent)) - 1
+        self._levels = self._put(self._codes, float)
 
     def _put(self, values: np.ndarray, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=dtype, device=self.device)
@@ -177,8 +158,7 @@ class Trainer:
 
     def stage(self, step: int) -> int:
         """Stage of a step: 0 with free Gaussians, 1 with rounded ones, 2 with fixed ones."""
-        steps = self.profile.steps
-        return int(step >= round(_QUANTISE_FROM * steps)) + int(step >= round(_FREEZE_FROM * steps))
+        return int(step >= round(_QUANTISE_FROM * self.steps)) + int(step >= round(_FREEZE_FROM * self.steps))
 
     def run(self, steps: int) -> None:
         """Runs the next steps; on CUDA they are queued, not awaited."""
@@ -207,14 +187,14 @@ class Trainer:
                 self._enter(self._entered + 1)
 
     def _make_shapes(self, quantised: bool) -> None:
-        p, a = self.profile, self._arrays
+        a = self._arrays
         self._step_kernels.shapes(
             a["rows"],
             a["bounds"],
             int(quantised),
             self._levels,
             CUT,
-            int(p.support == "sphere"),
+            int(self._support == "sphere"),
             a["used"],
             self._shapes,
         )
@@ -305,15 +285,13 @@ class Trainer:
 
     def _decoded(self) -> torch.Tensor:
         """Returns the network's normalised output for the features, float32 [N, D]."""
-        p, d = self.profile, self._outputs
-        shapes = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
-        parts = self._tensors["net"].split([rows * columns for rows, columns in shapes])
-        first, second, third = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
+        parts = self._tensors["net"].split([rows * columns for rows, columns in self._layers])
+        first, second, third = (part.view(shape) for part, shape in zip(parts, self._layers, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
         h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
         h = torch.sigmoid(h @ first[:-1] + first[-1])
         h = torch.sigmoid(h @ second[:-1] + second[-1])
-        return (h @ third[:-1] + third[-1])[:, :d]
+        return (h @ third[:-1] + third[-1])[:, : self._outputs]
 
     def mse(self) -> float:
         """Returns the mean squared error of the live probes' numbers at the last step; NaN before the first."""
@@ -324,34 +302,30 @@ class Trainer:
 
         The network's last layer yields the probes' numbers over `gain`, the largest weight of that layer.
         """
-        p, d = self.profile, self._outputs
+        d = self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
         low, high = t["bounds"]
         span = np.where(high > low, high - low, 1.0)
         code = np.rint((t["used"][self.needed] - low) / span * self._levels.numpy())
         code = np.where(high > low, code, 0).astype(np.uint16)
-        *others, last = layer_shapes(p.latent, p.hidden, probe_network.padded(d))
+        *others, last = self._layers
         before = sum(rows * columns for rows, columns in others)
         third = t["net"][before:].reshape(last)[:, :d] * self.spread
         third[-1] += self.mean
         gain = float(np.abs(third).max()) or 1.0
         net = np.concatenate([t["net"][:before], (third / gain).ravel()])
         return Gaussians(
-            latent=p.latent,
-            hidden=p.hidden,
+            latent=self._latent,
+            hidden=self._hidden,
             outputs=d,
-            support=p.support,
+            support=self._support,
             gain=gain,
             code=code,
-            levels=self._largest_codes(),
+            levels=self._codes,
             bounds=t["bounds"].astype(np.float32),
             net=np.clip(net, -65504, 65504).astype(np.float16),
             dropped=int((~self.needed).sum()),
         )
-
-    def _largest_codes(self) -> np.ndarray:
-        """Returns the largest code of each channel, int64 [10 + L]."""
-        return 2 ** np.array([CENTRE_BITS] * 3 + [CODE_BITS] * (7 + self.profile.latent)) - 1
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns everything that later steps depend on.
@@ -361,7 +335,7 @@ class Trainer:
         """
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
         if not all(map(all_finite, result.values())):
-            raise WlmError(f"the fit diverged; expected smaller rates than those of {self.profile.name}")
+            raise WlmError(f"the fit diverged; expected smaller rates than those of {self._name}")
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def table(self, step: int) -> dict[str, Part]:
@@ -380,7 +354,7 @@ class Trainer:
         Raises:
             ValueError: A part is missing, has another shape or is out of its range; the trainer is unchanged.
         """
-        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.profile.steps))
+        done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
             raise ValueError("parts kept, bounds: expected a Gaussian, and no lowest value above its highest")
@@ -398,3 +372,86 @@ class Trainer:
         self._stages = []
         if self._pool is not None:
             self._pool.shutdown()
+
+
+def _first_numbers(
+    x: np.ndarray, values: np.ndarray, profile: Profile, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the first Gaussians, float32 [K, 10 + L], and the first weights of the network, float32 [P]."""
+    latent, hidden, outputs = profile.latent, profile.hidden, values.shape[1]
+    count = gaussian_count(profile.ratio, len(x))
+    centre, scale = first_gaussians(x, values, count, profile.detail, profile.first_scale, random)
+    rows = np.zeros((len(centre), LATENT.start + latent), np.float32)
+    rows[:, CENTRE] = centre
+    rows[:, SCALE] = np.log(scale)[:, None]
+    rows[:, ROTATION.start] = 1.0
+    rows[:, LATENT] = random.normal(size=(len(centre), latent)) * _FIRST_LATENT
+    inputs, gain = latent + 3, profile.gain
+    first = random.uniform(-1, 1, (inputs + 1, hidden)) * gain / math.sqrt(inputs)
+    first[inputs] /= gain
+    first[inputs] -= x.mean(0) @ first[latent:inputs]
+    second = np.zeros((hidden + 1, hidden))
+    second[:hidden] = random.uniform(-1, 1, (hidden, hidden)) * gain / math.sqrt(hidden)
+    third = np.zeros((hidden + 1, probe_network.padded(outputs)))
+    third[:hidden, :outputs] = random.uniform(-1, 1, (hidden, outputs)) / math.sqrt(hidden)
+    # A sigmoid is 1/2 on average; the biases make each layer's inputs 0 on average.
+    second[hidden] = -0.5 * second[:hidden].sum(0)
+    third[hidden] = -0.5 * third[:hidden].sum(0)
+    return rows, np.concatenate([first.ravel(), second.ravel(), third.ravel()]).astype(np.float32)
+
+
+def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Measures how much the light varies around each probe.
+
+    Args:
+        x: [N, 3].
+        values: [N, D].
+
+    Returns:
+        float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
+    """
+    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)))[1].reshape(len(x), -1)
+    # In pieces: all neighbours' numbers at once would be nine times the set.
+    pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))
+    spread = np.concatenate([np.sqrt(values[piece].astype(np.float64).var(1).sum(1)) for piece in pieces])
+    floor = _FLOOR * spread.mean()
+    return spread + (floor if floor > 0 else 1.0)
+
+
+def first_gaussians(
+    x: np.ndarray, values: np.ndarray, count: int, detail: float, first_scale: float, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places centres by k-means that starts where the light varies, with scales from the nearest other centre.
+
+    Args:
+        x: float32 [N, 3], normalised positions.
+        values: float32 [N, D].
+        count: Number of Gaussians; there are never more than distinct positions.
+        detail, first_scale: See `wlm.probe.model.Profile`.
+        random: Source of the draw.
+
+    Returns:
+        Centres, float64 [K, 3], and scales, float64 [K].
+    """
+    distinct, index = np.unique(x, axis=0, return_index=True)
+    count = min(count, len(distinct))
+    if count == len(distinct):
+        centre = distinct.astype(np.float64)
+    else:
+        weight = local_spread(x, values)[index] ** detail
+        centre = distinct[random.choice(len(distinct), count, replace=False, p=weight / weight.sum())]
+        centre = _kmeans(x.astype(np.float64), centre.astype(np.float64), _ROUNDS if detail > 0 else _PLAIN_ROUNDS)
+    if count == 1:
+        return centre, np.array([max(np.linalg.norm(x - centre, axis=1).max(), _SMALLEST)])
+    nearest = cKDTree(centre).query(centre, k=2)[0][:, 1]
+    return centre, np.maximum(first_scale * nearest, _SMALLEST)
+
+
+def _kmeans(x: np.ndarray, centre: np.ndarray, rounds: int) -> np.ndarray:
+    for _ in range(rounds):
+        label = cKDTree(centre).query(x)[1]
+        size = np.bincount(label, minlength=len(centre))
+        total = np.stack([np.bincount(label, x[:, axis], len(centre)) for axis in range(3)], 1)
+        # A centre that is nearest to no probe keeps its position.
+        centre = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], centre)
+    return centre

@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from wlm.bundle import Bundle
-from wlm.errors import WlmError
-from wlm.probe.conventions import CANONICAL
 from wlm.probe.decode import Decoder
-from wlm.probe.model import ProbeModel
+from wlm.probe.glsl import buffer_glsl
+from wlm.probe.model import GpuForm, ProbeModel
 from wlm.probe.sphere import sh_count
 
 _REFERENCES = 64
@@ -18,9 +16,6 @@ _ABOUT = {
     "live": "The buffer probes holds live probes only, in the order of compression: live probe i is probe i of the set "
     "less the dead probes before it.",
     "between": "To read light between probes, fill a volume from them, or take the nearest probes.",
-    "values": "A probe has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
-    "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
-    "dead": "Probes that are zero, by index from 0 in the order of compression: engines leave them inside walls.",
     "reference": "live: indices of some live probes; values: their light.",
 }
 
@@ -37,17 +32,7 @@ _TEMPLATE = """\
 //
 // It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
 
-#ifndef WLM_PROBE_PROBES
-#ifndef WLM_PROBE_PROBES_BINDING
-#define WLM_PROBE_PROBES_BINDING 0
-#endif
-layout(std430, binding = WLM_PROBE_PROBES_BINDING) readonly buffer WlmProbeProbes
-{{
-    uint wlm_probe_probes[];
-}};
-#define WLM_PROBE_PROBES(i) wlm_probe_probes[i]
-#endif
-
+{buffers}
 const int WLM_PROBE_OUTPUTS = {outputs};
 const int WLM_PROBE_COLUMNS = {columns};
 
@@ -101,20 +86,10 @@ void wlm_probe_sh(int probe, out vec3 sh[{coefficients}])
 """
 
 
-def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
-    """Returns what a GPU holds of a model of principal components.
-
-    Args:
-        model: The model.
-        decoder: Its decoder, for the reference.
-
-    Raises:
-        WlmError: The light is not finite.
-    """
+def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
+    """Returns the GPU form of a model of principal components; `decoder` computes the reference."""
     content = model.content
     values = decoder.decode_probes()[model.live]
-    if not np.isfinite(values).all():
-        raise WlmError(f"{model.name}: cannot export: the model decodes to NaN or infinity")
     chosen = np.unique(np.linspace(0, len(values) - 1, min(len(values), _REFERENCES)).astype(int))
     halves = np.zeros((len(content.basis), -(-model.outputs // 2) * 2), "<f2")
     halves[:, : model.outputs] = content.basis
@@ -123,33 +98,15 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     words = [
         np.array([len(content.code)], "<u4"),
         np.ascontiguousarray(content.bounds.T, "<f2").reshape(-1).view("<u4"),
+        halves.reshape(-1).view("<u4"),
+        codes.view("<u4"),
     ]
-    words += [halves.reshape(-1).view("<u4"), codes.view("<u4")]
-    document = {
-        "about": _ABOUT,
-        "source": model.source,
-        "method": model.method,
-        "probes": model.probes,
-        "live": len(values),
-        "outputs": model.outputs,
-        "coefficients": sh_count(model.outputs),
-        "convention": CANONICAL,
-        "components": content.count,
-        "basis": bool(len(content.basis)),
-        "origin": model.origin.tolist(),
-        "extent": model.extent,
-        "size": model.size.tolist(),
-        "dead": np.flatnonzero(model.dead).tolist(),
-    }
-    buffers = {"probes": np.concatenate(words)}
-    if model.has_positions:
-        buffers["positions"] = np.ascontiguousarray(model.positions, "<u2")
-    return Bundle(
-        system=ProbeModel.SYSTEM,
-        name=model.name,
-        shader=component_glsl(content.count, model.outputs, bool(len(content.basis))),
-        document=document,
-        buffers=buffers,
+    has_basis = bool(len(content.basis))
+    return GpuForm(
+        shader=component_glsl(content.count, model.outputs, has_basis),
+        buffers={"probes": np.concatenate(words)},
+        document={"live": len(values), "components": content.count, "basis": has_basis},
+        about=_ABOUT,
         reference={"live": chosen.astype(np.int32), "values": values[chosen]},
     )
 
@@ -169,6 +126,7 @@ def component_glsl(count: int, outputs: int, basis: bool) -> str:
     first = 1 + columns
     layout = {"first": first, "words": words, "codes": first + (count * words if basis else 0)}
     text = _TEMPLATE.format(
+        buffers=buffer_glsl("probe", "probes", 0),
         outputs=outputs,
         count=count,
         columns=columns,

@@ -16,7 +16,12 @@ _BUDGET = 1024  # blocks that the volume decodes per frame; it is awaited
 
 
 class ComponentDecoder(Decoder):
-    """A model of principal components on a device, where it stays packed."""
+    """A model of principal components on a device, where it stays packed; it is a `wlm.probe.volume.light.Light` too.
+
+    Attributes:
+        count: N.
+        channels: D.
+    """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
         """Loads a model.
@@ -38,6 +43,7 @@ class ComponentDecoder(Decoder):
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
         self._row = wp.array(row.astype(np.int32), dtype=int, device=self.device)
+        self.count, self.channels = model.probes, model.outputs
         self._volume: Volume | None = None
 
     @property
@@ -69,39 +75,15 @@ class ComponentDecoder(Decoder):
         if not covered.all():
             live = np.flatnonzero(model.live)
             nearest = live[cKDTree(own[live]).query(points[~covered])[1]]
-            values[~covered] = at_probes(ComponentLight(self), nearest)
+            values[~covered] = at_probes(self, nearest)
         return values
 
-    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
-        if position is not None:
-            self.check_own(position)
-        return at_probes(ComponentLight(self), np.arange(self.model.probes))
+    def decode_probes(self) -> np.ndarray:
+        return at_probes(self, np.arange(self.model.probes))
 
-    def light(self, position: np.ndarray) -> "ComponentLight":
+    def light(self, position: np.ndarray) -> "ComponentDecoder":
         self.check_own(position)
-        return ComponentLight(self)
+        return self
 
-    def run(self, numbers: wp.array, values: wp.array) -> None:
-        """Decodes probes int [M] into float [M, D]; on CUDA the work is queued, not awaited."""
+    def read(self, numbers: wp.array, values: wp.array) -> None:
         decode_components(self._code, self._bounds, self._basis, self._row, numbers, values)
-
-
-class ComponentLight:
-    """Light of probes that is decoded where and when a volume asks for it; a `wlm.probe.volume.light.Light`."""
-
-    def __init__(self, decoder: ComponentDecoder) -> None:
-        self._decoder = decoder
-        self.device, self.channels, self.count = decoder.device, decoder.model.outputs, decoder.model.probes
-
-    def reader(self, count: int) -> "_ComponentReader":
-        return _ComponentReader(self._decoder, count)
-
-
-class _ComponentReader:
-    def __init__(self, decoder: ComponentDecoder, count: int) -> None:
-        self._decoder = decoder
-        self.numbers = wp.zeros(count, dtype=int, device=decoder.device)
-        self.values = wp.zeros((count, decoder.model.outputs), dtype=float, device=decoder.device)
-
-    def run(self) -> None:
-        self._decoder.run(self.numbers, self.values)

@@ -14,9 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from wlm.bundle import Bundle
 from wlm.probe.decode import Decoder
-from wlm.probe.model import Content, ProbeModel
+from wlm.probe.model import Content, GpuForm, ProbeModel
 
 ENOUGH = 0.02
 """Error that needs no further component: RMS over the probes of the error over the probe's own norm."""
@@ -54,8 +53,8 @@ class Components(Content):
     def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
         return import_module("wlm.probe.pca.decode").ComponentDecoder(model, device, **options)
 
-    def bundle(self, model: ProbeModel, decoder: Decoder) -> Bundle:
-        return import_module("wlm.probe.pca.bundle").component_bundle(model, decoder)
+    def gpu_form(self, model: ProbeModel, decoder: Decoder) -> GpuForm:
+        return import_module("wlm.probe.pca.bundle").component_form(model, decoder)
 
     def facts(self) -> dict[str, Any]:
         return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}

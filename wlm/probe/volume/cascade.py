@@ -1,26 +1,11 @@
 """The cascaded lighting volume: nested grids of blocks around the viewer, filled from the probes as the viewer moves.
 
-Follows gaussian-probe-compression, section 3.4: four levels whose blocks are 1, 2, 4 and 16 times as wide as the finest
-(2, 4, 8 and 32 m in the paper), and at most 64 blocks decoded per frame. Where the paper leaves a choice, or we depart:
+It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are rows of a pool,
+which is also the cache: a block that left its window stays until its row is needed. A block without a probe near it is
+never queued, takes no memory and is missing for a read. The finest level that has a point answers, as
+`wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
 
-- The finest block is 1.25 times as wide as the probes' spacing (`wlm.probe.volume.index.finest_side`), in any unit.
-  Windows have 32 blocks along an axis where the paper has 16, since most are empty and empty blocks take no memory.
-- A level's window has the blocks whose centres are nearest to the viewpoint along each axis, so it depends on the
-  viewpoint alone.
-- A block's light comes from up to 16 probes within one side of its centre along each axis, weighted so that a read at a
-  probe is nearly that probe's light (`wlm_kernels.probe.volume_weights`). The paper takes the probes inside the block
-  and names no weights; a mean weighted by distance blurs differences between probes.
-- A block without a probe that near is empty: it is never queued, takes no budget and is missing for a read.
-- Blocks are rows of a pool, which is also the cache: a block that left its window stays until its row is needed. If it
-  is still there when it enters the window again, it is available in the same frame at no cost.
-- Blocks wait in the order of their distance to the viewpoint in units of their own side, so that all levels grow
-  outwards together. After a teleport the first frame covers the surroundings coarsely; filling the finest level first
-  would leave the rest of the scene black until that level was complete.
-- A point is answered by the finest level that has it, as `wlm_kernels.probe.volume.read` describes. With all blocks
-  present this is the paper's choice by the distance to the viewer.
-
-Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
-graph.
+Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is a graph.
 """
 
 import itertools
@@ -194,8 +179,7 @@ class Volume:
         device, levels, budget = self.device, len(self.sizes), self.budget
         slots = levels * self.side**3
 
-        reader = self.light.reader(budget * frame_kernels.PROBES)
-        self._arrays = [reader.numbers, reader.values]
+        self._arrays: list[wp.array] = []
 
         def full(shape: int | tuple[int, ...], dtype: type, value: object) -> wp.array:
             self._arrays.append(wp.full(shape, value, dtype=dtype, device=device))
@@ -215,7 +199,7 @@ class Volume:
         windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
         windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
         windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
-        windows.away, windows.forward = full(slots, float, -1.0), full(1, wp.vec3, wp.vec3())
+        windows.away = full(slots, float, -1.0)
         pool = frame_kernels.Pool()
         pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
         pool.rows = full(len(host.block), int, -1)
@@ -230,8 +214,9 @@ class Volume:
         block = (budget, frame_kernels.PROBES)
         work.places, work.hats = full(block, wp.vec4, wp.vec4()), full(block, float, 0.0)
         work.rows = full(block, frame_kernels.Row, frame_kernels.Row())
-        work.numbers, work.weights = reader.numbers, full(block, float, 0.0)
-        self._index, self._windows, self._pool_rows, self._reader, self._frame_work = index, windows, pool, reader, work
+        work.numbers, work.weights = full(math.prod(block), int, 0), full(block, float, 0.0)
+        self._read_light = full((math.prod(block), self.channels), float, 0.0)
+        self._index, self._windows, self._pool_rows, self._frame_work = index, windows, pool, work
         self._look = frame_kernels.Look(windows, work)
         self._nowhere = full(0, wp.vec3, wp.vec3())
         self._pool = full((rows, self.channels), float, 0.0)
@@ -257,47 +242,23 @@ class Volume:
         """Coordinates of the first block of each window, int64 [L, 3]; block b spans [b, b + 1) times its side."""
         return self._base + self.index.start.astype(np.int64)
 
-    def update(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> FrameStats:
+    def update(self, viewpoint: np.ndarray) -> FrameStats:
         """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
 
         Args:
             viewpoint: [3], in the unit of the positions.
-            forward: [3], viewing direction, of any length: blocks behind the viewer wait as if they were twice as far
-                away. None: all directions are alike.
 
         Returns:
             The work of the frame.
 
         Raises:
-            WlmError: The viewpoint or the direction is not three finite numbers, or the viewpoint is so far away that
-                the coordinates of its block overflow.
+            WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block
+                overflow.
         """
         start = time.perf_counter()
-        entered = self.advance(viewpoint, forward)
-        counters = self._frame_work.counters.numpy()
-        seconds = time.perf_counter() - start
-        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
-        return FrameStats(entered, queued, dropped, updated, cached, left, probes, seconds)
-
-    def advance(self, viewpoint: np.ndarray, forward: np.ndarray | None = None) -> int:
-        """Does the work of `update`; on CUDA the frame is queued, not awaited, as a renderer needs it.
-
-        Args:
-            viewpoint, forward: As for `update`.
-
-        Returns:
-            Number of blocks that entered a window.
-
-        Raises:
-            WlmError: As for `update`.
-        """
         viewpoint = np.array(viewpoint, np.float64)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise WlmError(f"viewpoint: expected three finite numbers, got {viewpoint.tolist()}")
-        ahead = np.zeros(3) if forward is None else np.array(forward, np.float64)
-        if ahead.shape != (3,) or not np.isfinite(ahead).all():
-            raise WlmError(f"forward: expected three finite numbers, got {ahead.tolist()}")
-        ahead = _unit(ahead[None], (1, 3))[0]
         at = viewpoint / self._size[:, None] - self.index.start
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
@@ -308,9 +269,12 @@ class Volume:
         self._frame += 1
         views = np.column_stack([at - (base + self.side // 2) - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            self._look(base, views, ahead, self._frame)
+            self._look(base, views, self._frame)
             self._step()
-        return len(self.sizes) * self.side**3 - int(kept)
+        counters = self._frame_work.counters.numpy()
+        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        entered = len(self.sizes) * self.side**3 - int(kept)
+        return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
         """Runs the part of a frame that a CUDA graph contains."""
@@ -322,8 +286,8 @@ class Volume:
             return
         frame_kernels.search(self._index, windows, self.side, work)
         volume_weights.weigh(self._index, windows, self.side, work)
-        self._reader.run()
-        frame_kernels.combine(work, self._reader.values, self._pool)
+        self.light.read(work.numbers, self._read_light)
+        frame_kernels.combine(work, self._read_light, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Reads the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
@@ -350,27 +314,13 @@ class Volume:
             values = wp.empty((len(points), self.channels), dtype=float, device=self.device)
             level = wp.empty(len(points), dtype=int, device=self.device)
             weight = wp.empty(len(points), dtype=float, device=self.device)
-            ahead = None
+            ahead = self._nowhere
             if normals is not None:
                 ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
-            self.read_into(on_device, values, level, weight, ahead)
+            windows = self._windows
+            place = (windows.pages, windows.bases, windows.views, self.side, on_device)
+            kernels.read(self._pool, *place, ahead, values, level, weight)
             return Reading(values.numpy(), level.numpy(), weight.numpy())
-
-    def read_into(
-        self, points: wp.array, values: wp.array, level: wp.array, weight: wp.array, normals: wp.array | None = None
-    ) -> None:
-        """Reads the light at points that are on the device, without a copy, as a renderer needs it.
-
-        Args:
-            points: vec3 [M], relative to the viewpoint of the last update.
-            values: float [M, D], written; this and the next two as in `Reading`.
-            level: int [M], written.
-            weight: float [M], written.
-            normals: vec3 [M], unit normals, as for `read`.
-        """
-        windows = self._windows
-        place = (windows.pages, windows.bases, windows.views, self.side, points)
-        kernels.read(self._pool, *place, self._nowhere if normals is None else normals, values, level, weight)
 
     def state(self) -> State:
         """Copies the arrays that a shader reads to the host."""
@@ -385,12 +335,12 @@ class Volume:
             float32 [L, side, side, side, D], by level, x, y and z, 0 where a block is missing; and bool
             [L, side, side, side], true where it is present. The first block of each level is that of `base`.
         """
-        shape = (len(self.sizes), self.side, self.side, self.side)
-        with interop.stream(self.device):
-            out = wp.empty((math.prod(shape), self.channels), dtype=float, device=self.device)
-            valid = wp.empty(math.prod(shape), dtype=wp.uint8, device=self.device)
-            kernels.unscroll(self._pool, self._windows.pages, self._windows.bases, self.side, out, valid)
-            return out.numpy().reshape(*shape, self.channels), valid.numpy().astype(bool).reshape(shape)
+        state, side = self.state(), self.side
+        pages = state.pages.reshape(-1, side, side, side)
+        # A block's slot is its coordinates modulo the side of the window.
+        rows = np.stack([np.roll(page, -base, (0, 1, 2)) for page, base in zip(pages, state.bases, strict=True)])
+        valid = rows >= 0
+        return np.where(valid[..., None], state.pool[rows], np.float32(0.0)), valid
 
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -10,21 +10,6 @@ from wlm.errors import WlmError
 from wlm_kernels.probe import volume_frame as kernels
 
 
-class Reader(Protocol):
-    """A reader of M probes at a time, in place, so that a CUDA graph can contain a reading.
-
-    Attributes:
-        numbers: int [M], indices of the probes to read; written by the caller.
-        values: float [M, D], written by `run`.
-    """
-
-    numbers: wp.array
-    values: wp.array
-
-    def run(self) -> None:
-        """Reads the probes; on CUDA the work is queued, not awaited."""
-
-
 class Light(Protocol):
     """The light of N probes.
 
@@ -38,8 +23,15 @@ class Light(Protocol):
     count: int
     channels: int
 
-    def reader(self, count: int) -> Reader:
-        """Returns a reader of `count` probes at a time."""
+    def read(self, numbers: wp.array, values: wp.array) -> None:
+        """Reads probes; on CUDA the work is queued, not awaited.
+
+        The first reading of M probes may allocate memory, so that a CUDA graph may only capture a later one.
+
+        Args:
+            numbers: int [M], indices of probes.
+            values: float [M, D], written.
+        """
 
 
 class StoredLight:
@@ -68,18 +60,8 @@ class StoredLight:
         self.count, self.channels = values.shape
         self._values = wp.array(values, dtype=float, device=self.device)
 
-    def reader(self, count: int) -> Reader:
-        return _StoredReader(self._values, count)
-
-
-class _StoredReader:
-    def __init__(self, stored: wp.array, count: int) -> None:
-        self._stored = stored
-        self.numbers = wp.zeros(count, dtype=int, device=stored.device)
-        self.values = wp.zeros((count, stored.shape[1]), dtype=float, device=stored.device)
-
-    def run(self) -> None:
-        kernels.take_rows(self._stored, self.numbers, self.values)
+    def read(self, numbers: wp.array, values: wp.array) -> None:
+        kernels.take_rows(self._values, numbers, values)
 
 
 def at_probes(light: Light, numbers: np.ndarray) -> np.ndarray:
@@ -91,8 +73,8 @@ def at_probes(light: Light, numbers: np.ndarray) -> np.ndarray:
     """
     if len(numbers) == 0:
         return np.zeros((0, light.channels), np.float32)
-    reader = light.reader(len(numbers))
     with interop.stream(light.device):
-        reader.numbers.assign(np.asarray(numbers, np.int32))
-        reader.run()
-        return reader.values.numpy()
+        on_device = wp.array(np.asarray(numbers, np.int32), dtype=int, device=light.device)
+        values = wp.empty((len(numbers), light.channels), dtype=float, device=light.device)
+        light.read(on_device, values)
+        return values.numpy()

@@ -1,21 +1,77 @@
-"""A flip book: textures of six-way lightmaps, and the facts that an engine needs to read them."""
+"""Flip books: textures of six-way lightmaps with the frames in rows of cells from the top left.
 
-from collections.abc import Sequence
+EXR stores half floats. PNG and TGA store 8 bits per channel, linear in 0 to 1: import them without sRGB decoding. Light
+is premultiplied by the opacity: it is added to the background times 1 - alpha.
+`wlm.smoke.camera.LAYOUTS` lists the channels.
+"""
+
+import io
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
+from PIL import Image
 
-from wlm.smoke.camera import LAYOUTS
-from wlm.smoke.data import Frames
-from wlm.smoke.flipbook.depth import encoded_depth, frames_depth
+from wlm.errors import WlmError
+from wlm.formats.atomic import atomic_path
+from wlm.formats.exr import read_exr, write_exr
+from wlm.formats.limits import IMAGE_BYTES, PICTURE_GROWTH, check_growth
+from wlm.formats.mask import DAMAGED_PICTURE
+from wlm.formats.reading import read_file
+from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS, Camera
+from wlm.smoke.data import Frames, read_shaded, spread
 from wlm.smoke.flipbook.motion import ZERO, encoded, frames_motion, mip_levels, scale_of
-from wlm.smoke.flipbook.shots import Shot
-from wlm.smoke.flipbook.textures import brightest_gain, cells, lay_out, pack
+from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.scene import Looks
 from wlm.smoke.shading import Ramp
-from wlm.system import OnProgress
+from wlm.system import Meter, OnProgress
 
 RATE = 25.0
 """Frames per second if the smoke has no rate."""
+
+_SUFFIXES = (".exr", ".png", ".tga")
+_MODES, _GREY = ("RGB", "RGBA"), ("L", "LA")
+_BARE, _LIT = 0.999, 0.05  # least transparency without smoke; largest mean light there
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame to render.
+
+    Attributes:
+        number: Number of the frame.
+        six: Lightmaps with their camera; if there are obstacles, also with their depth.
+        looks: Lights, colours and obstacles of the scene; None: there is no scene.
+    """
+
+    number: int
+    six: SixWay
+    looks: Looks | None = None
+
+
+def read_shots(
+    files: Mapping[int, Path], device: str = "cpu", count: int | None = None, progress: OnProgress | None = None
+) -> Iterator[Shot]:
+    """Reads lightmaps that `bake` or `predict` wrote, one frame after the other.
+
+    Args:
+        files: EXR files by number.
+        device: Device of the lightmaps.
+        count: Largest number of frames, evenly spread; None: all.
+        progress: Called after each frame.
+
+    Raises:
+        WlmError: A file is damaged or of another kind.
+    """
+    numbers = spread(tuple(files), count)
+    meter = Meter(progress, "read", len(numbers))
+    for done, number in enumerate(numbers, 1):
+        yield Shot(number, *read_shaded(files[number], device))
+        meter.report(done)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +79,8 @@ class Book:
     """A flip book.
 
     Attributes:
-        first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4], see
-            `wlm.smoke.flipbook.textures`.
+        first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
         motion: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; or None.
-        depth: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.depth`; or None.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
         rows, columns, count: Numbers of rows and columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
@@ -34,7 +88,6 @@ class Book:
         gain: Factor of the light in the textures.
         hot: Whether there is a channel of emission.
         scale: Range of the motion in shares of a frame; None: no motion.
-        reach: Range of the depth in heights of a frame; None: no depth.
         rate: Frames per second.
         extent: Height of the view in the world's unit.
         ramp: Colour of the emission; None: grey.
@@ -43,7 +96,6 @@ class Book:
     first: np.ndarray
     second: np.ndarray
     motion: np.ndarray | None
-    depth: np.ndarray | None
     layout: str
     rows: int
     columns: int
@@ -53,7 +105,6 @@ class Book:
     gain: float
     hot: bool
     scale: float | None
-    reach: float | None
     rate: float
     extent: float
     ramp: Ramp | None
@@ -61,14 +112,14 @@ class Book:
     @property
     def pages(self) -> dict[str, np.ndarray]:
         """Textures by name."""
-        pages = {"first": self.first, "second": self.second, "motion": self.motion, "depth": self.depth}
+        pages = {"first": self.first, "second": self.second, "motion": self.motion}
         return {name: page for name, page in pages.items() if page is not None}
 
     @property
     def channels(self) -> dict[str, tuple[str, ...]]:
         """Content of each texture's channels."""
         first, second = LAYOUTS[self.layout]
-        named = {"first": first, "second": second, "motion": ("right", "up"), "depth": ("depth",)}
+        named = {"first": first, "second": second, "motion": ("right", "up")}
         return {name: named[name][: page.shape[2]] for name, page in self.pages.items()}
 
     @property
@@ -85,59 +136,64 @@ def pack_book(
     gain: float | None = None,
     padding: int = 0,
     air: Frames | None = None,
-    volumes: Frames | None = None,
     rate: float | None = None,
     progress: OnProgress | None = None,
 ) -> Book:
     """Packs frames into textures.
+
+    A last channel that no frame has is omitted: the second texture of cold smoke has three. Cells without a frame are
+    black, with alpha 0.
 
     Args:
         shots: The frames, at least one, of one size.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
         columns: Largest number of columns; None: nearest to a square.
         gain: Factor of the light; None: the largest without clipping in 8 bits.
-        padding: Pixels around each frame that repeat its border.
+        padding: Pixels around each frame that repeat its border, so that filters and mips do not show neighbours.
         air: Frames from `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: no motion.
-        volumes: The smoke of the frames, for a texture of depth; None: no depth.
         rate: Frames per second; None: that of the scene, or `RATE`.
-        progress: Called after each frame of motion and depth.
+        progress: Called after each frame of motion.
 
     Raises:
-        ValueError: The frames have several sizes, or as for `pack`.
-        WlmError: As for `frames_motion` and `frames_depth`.
+        ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
+        WlmError: As for `frames_motion`.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
         raise ValueError("expected lightmaps of one size")
-    rows, columns = cells(len(frames), columns)
-    gain = brightest_gain(frames) if gain is None else gain
-    first, second = pack(frames, layout, rows=rows, columns=columns, gain=gain, padding=padding)
-    numbers, scale, reach, motion, depth = [shot.number for shot in shots], None, None, None, None
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+    if padding < 0:
+        raise ValueError(f"padding: expected at least 0, got {padding}")
+    gain = _brightest_gain(frames) if gain is None else gain
+    if not 0 < gain < np.inf:
+        raise ValueError(f"gain: expected a number above 0, got {gain}")
+    columns = min(columns or math.ceil(len(frames) ** 0.5), len(frames))
+    rows = -(-len(frames) // columns)
+    size = (frames[0].lightmaps.shape[1], frames[0].lightmaps.shape[2])
+    pages = []
+    for names in _channels(frames, layout):
+        planes = [[np.broadcast_to(_plane(frame, name, gain), size) for name in names] for frame in frames]
+        pages.append(lay_out(np.moveaxis(np.array(planes, np.float32), 1, -1), rows, columns, padding))
+    scale, motion = None, None
     if air is not None:
-        moved = frames_motion(air, numbers, frames, progress)
+        moved = frames_motion(air, [shot.number for shot in shots], frames, progress)
         scale = scale_of(moved)
         motion = lay_out(encoded(moved, scale), rows, columns, padding, ZERO)
-    if volumes is not None:
-        away = frames_depth(volumes, numbers, frames, progress)
-        reach = scale_of(away)
-        depth = lay_out(encoded_depth(away, reach), rows, columns, padding, ZERO)
-    looks = shots[0].looks
-    camera = frames[0].camera
+    looks, camera = shots[0].looks, frames[0].camera
     return Book(
-        first=first,
-        second=second,
+        first=pages[0],
+        second=pages[1],
         motion=motion,
-        depth=depth,
         layout=layout,
         rows=rows,
         columns=columns,
         count=len(frames),
-        size=(frames[0].lightmaps.shape[1], frames[0].lightmaps.shape[2]),
+        size=size,
         padding=padding,
         gain=gain,
         hot=any(frame.emission is not None for frame in frames),
         scale=scale,
-        reach=reach,
         rate=_rate(shots) if rate is None else rate,
         extent=1.0 if camera is None else camera.extent,
         ramp=None if looks is None else looks.ramp,
@@ -150,3 +206,163 @@ def _rate(shots: Sequence[Shot]) -> float:
     if first is None or last is None or not last.time > first.time:
         return RATE
     return (len(shots) - 1) / (last.time - first.time)
+
+
+def _brightest_gain(frames: Sequence[SixWay]) -> float:
+    """Returns the gain that scales the brightest light of the frames to 1; 1 if all frames are black."""
+    planes = [plane for six in frames for plane in (six.lightmaps, six.emission) if plane is not None]
+    brightest = max(float(plane.max()) for plane in planes)
+    return 1.0 / brightest if brightest > 0 else 1.0
+
+
+def _channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
+    """Returns the channels of the two textures, without a last channel that no frame has."""
+    planes = {ALPHA: "transparency", EMISSION: "emission"}
+    absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
+    return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])
+
+
+def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
+    if name == ALPHA:
+        # A frame without transparency among others that have it counts as transparent.
+        return 0.0 if frame.transparency is None else 1.0 - frame.transparency.cpu().numpy()
+    if name == EMISSION:
+        return 0.0 if frame.emission is None else gain * frame.emission.cpu().numpy()
+    return gain * frame[name].cpu().numpy()
+
+
+def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
+    """Lays pictures [N, H, W, C] out in cells of one texture, each with `padding` pixels that repeat its border."""
+    _count, height, width, channels = frames.shape
+    page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
+    around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
+    for i, cell in enumerate(np.pad(frames, around, mode="edge")):
+        page[i // columns, :, i % columns] = cell
+    return page.reshape(rows * page.shape[1], columns * page.shape[3], channels)
+
+
+def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
+    """Writes the textures of a flip book beside `output`: NAME_1, NAME_2 and NAME_motion, each atomically.
+
+    Args:
+        book: The flip book.
+        output: A path that ends in .exr, .png or .tga; its folder must exist.
+
+    Returns:
+        The channels of each file, and the number of values above the range of the files, which were clipped.
+
+    Raises:
+        WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
+    """
+    output = Path(output)
+    endings = {"first": "1", "second": "2", "motion": "motion"}
+    paths = {name: output.with_name(f"{output.stem}_{endings[name]}{output.suffix}") for name in book.pages}
+    clipped = sum(_write_page(path, book.pages[name]) for name, path in paths.items())
+    return {path: book.channels[name] for name, path in paths.items()}, clipped
+
+
+def _write_page(path: Path, page: np.ndarray) -> int:
+    """Writes a texture [H, W, 3 or 4] and returns the number of clipped values."""
+    if not np.isfinite(page).all():
+        raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
+    if _suffix(path) == ".exr":
+        write_exr(path, page)
+        return int((page > 65504.0).sum())
+    image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
+    with atomic_path(path) as temporary:
+        image.save(temporary, format=_suffix(path)[1:].upper())
+    return int((page > 1.0).sum())
+
+
+def read_flipbook(
+    paths: Sequence[str | os.PathLike[str]],
+    layout: str,
+    *,
+    rows: int,
+    columns: int,
+    straight: bool = False,
+    device: str = "cpu",
+) -> list[SixWay]:
+    """Reads the frames of a flip book of any program; their camera is unknown and taken to be in front.
+
+    Args:
+        paths: The files, .exr, .png or .tga (8 bits per channel, linear): two of the layout, and optionally one with
+            the opacity in its alpha or first channel.
+        layout: One of `LAYOUTS`.
+        rows, columns: Numbers of rows and columns of cells, all of which are read.
+        straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.
+        device: Device of the frames.
+
+    Returns:
+        The frames, float32; None for a plane without a channel.
+
+    Raises:
+        WlmError: There are not two or three files; one is missing, damaged, of another kind or size, has numbers that
+            are not finite, or lacks a channel of the layout; or alpha is straight and there is no opacity.
+    """
+    where = ", ".join(map(str, paths))
+    if len(paths) not in (2, 3):
+        raise WlmError(f"{where}: expected two textures, and possibly one of opacity, got {len(paths)}")
+    pages = [_read(path, grey=number == 2) for number, path in enumerate(paths)]
+    if any(page.shape[:2] != pages[0].shape[:2] for page in pages):
+        raise WlmError(f"{where}: expected textures of one size, found {[page.shape[:2] for page in pages]}")
+    height, width = pages[0].shape[0] // rows, pages[0].shape[1] // columns
+    if pages[0].shape[:2] != (rows * height, columns * width) or not (height and width):
+        size = f"{pages[0].shape[0]} x {pages[0].shape[1]}"
+        raise WlmError(f"{where}: expected {rows} x {columns} cells of whole pixels, found {size}")
+    planes: dict[str, torch.Tensor] = {}
+    named = [*LAYOUTS[layout], (ALPHA,)]
+    if len(pages) == 3:
+        pages[2] = pages[2][..., -1:] if pages[2].shape[2] in (2, 4) else pages[2][..., :1]
+    for page, names in zip(pages, named, strict=False):
+        cells = page.reshape(rows, height, columns, width, -1).transpose(4, 0, 2, 1, 3)
+        cells = torch.from_numpy(cells.reshape(-1, rows * columns, height, width).astype(np.float32)).to(device)
+        planes |= dict(zip(names, cells, strict=False))
+    missing = [name for name in DIRECTIONS if name not in planes]
+    if missing:
+        raise WlmError(f"{where}: layout {layout}: expected channels for {', '.join(missing)}")
+    camera = Camera.look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), extent=1.0, height=height, width=width)
+    maps = torch.stack([planes[name] for name in DIRECTIONS], 1)
+    alpha, glow = planes.get(ALPHA), planes.get(EMISSION)
+    if straight:
+        if alpha is None:
+            raise WlmError(f"{where}: expected opacity, in an alpha or a third texture, for light without it")
+        maps, glow = maps * alpha[:, None], None if glow is None else glow * alpha
+    absent = [None] * len(maps)
+    parts = (maps, absent if alpha is None else 1.0 - alpha, absent if glow is None else glow)
+    return [SixWay(*part, camera) for part in zip(*parts, strict=True)]
+
+
+def is_straight(frames: Sequence[SixWay]) -> bool:
+    """Returns whether there is light where there is no smoke, which suggests straight alpha; False without opacity."""
+    bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
+    light = torch.cat(bare) if bare else torch.zeros(0)
+    return len(light) > 0 and float(light.mean()) > _LIT
+
+
+def _read(path: str | os.PathLike[str], *, grey: bool) -> np.ndarray:
+    if _suffix(path) == ".exr":
+        page = read_exr(path)[0]
+        if not np.isfinite(page).all():
+            raise WlmError(f"{path}: expected finite light, found NaN or infinity")
+        return page
+    data = read_file(path, IMAGE_BYTES, "the picture")
+    try:
+        # From memory: for a file on disk Pillow would allocate as many bytes as a chunk claims.
+        with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
+            modes = (*_MODES, *_GREY) if grey else _MODES
+            if image.mode not in modes:
+                raise WlmError(f"{path}: expected {' or '.join(modes)} of 8 bits, found {image.mode}")
+            floats = 4 * image.width * image.height * len(image.getbands())
+            check_growth(str(path), len(data), floats, PICTURE_GROWTH)
+            pixels = np.asarray(image).astype(np.float32) / np.float32(255.0)
+            return pixels.reshape(*pixels.shape[:2], -1)
+    except DAMAGED_PICTURE as error:
+        raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise WlmError(f"{path}: expected a name that ends in {', '.join(_SUFFIXES)}, found {suffix or 'none'}")
+    return suffix

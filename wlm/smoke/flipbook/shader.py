@@ -5,7 +5,7 @@ import math
 from wlm.bundle import sampler
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.flipbook.book import Book
-from wlm.smoke.flipbook.motion import ZERO, mip_levels
+from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.shading import Ramp
 
 _TEXT = """\
@@ -15,12 +15,10 @@ _TEXT = """\
 // Both textures are linear, not sRGB; sample both at wlm_smoke_uv, clamped to their edge.
 //
 //     light = sum over lights of irradiance / (4 pi) * wlm_smoke_light(first, second, toward)
-//     and over lights at a point, of way = wlm_smoke_point(place, size, depth, position, radius),
-//             of intensity / (4 pi) * way.w * wlm_smoke_light(first, second, way.xyz)
 //     pixel = light + colour * wlm_smoke_emission(first, second) + behind * (1 - wlm_smoke_alpha(first, second))
 
-// The texture's coordinates of a frame, from 0 on, at a place on the billboard: (0, 0) its top left, (1, 1) its bottom
-// right.
+// Returns the texture coordinates of a frame, counted from 0, at a place on the billboard: (0, 0) is the top left,
+// (1, 1) the bottom right.
 vec2 wlm_smoke_uv(vec2 place, float frame)
 {{
     float cell = clamp(floor(frame), 0.0, {last:.1f});
@@ -31,26 +29,14 @@ vec2 wlm_smoke_uv(vec2 place, float frame)
     return vec2(x / {columns:.1f}, y / {rows:.1f});
 }}
 
-// The light of irradiance 4 pi from a direction, of length 1, from the smoke to the light: x to the billboard's right,
-// y up, z to the viewer.
+// Returns the scattered light of a light of irradiance 4 pi. The direction to it has length 1: x to the billboard's
+// right, y up, z to the viewer.
 float wlm_smoke_light(vec4 first, vec4 second, vec3 toward)
 {{
     float x = toward.x > 0.0 ? {right} : {left};
     float y = toward.y > 0.0 ? {top} : {bottom};
     float z = toward.z > 0.0 ? {front} : {back};
     return (toward.x * toward.x * x + toward.y * toward.y * y + toward.z * toward.z * z) * {factor};
-}}
-
-// Of a light at a point the direction from the smoke at a place, of length 1, and the falloff, its irradiance there
-// over its intensity: an engine's own may stand for that. The size is the billboard's width and height; the position is
-// from its middle, x to its right, y up, z to the viewer, in the unit of the size; within the radius, in that unit too,
-// the falloff is as at it. The depth is how far the smoke lies before the billboard, in its heights: 0 is flat.
-vec4 wlm_smoke_point(vec2 place, vec2 size, float depth, vec3 position, float radius)
-{{
-    vec3 smoke = vec3((place.x - 0.5) * size.x, (0.5 - place.y) * size.y, depth * size.y);
-    vec3 way = position - smoke;
-    float far = max(dot(way, way), {nearest});
-    return vec4(way / sqrt(far), 1.0 / max(far, radius * radius));
 }}
 
 float wlm_smoke_alpha(vec4 first, vec4 second)
@@ -63,7 +49,7 @@ float wlm_smoke_emission(vec4 first, vec4 second)
     return {emission};
 }}
 
-// The level for textureLod, of how many texels a pixel of the screen is wide: {levels} at most, beyond which
+// Returns the level for textureLod from the width of a screen pixel in texels. The largest is {levels}: beyond it
 // frames show their neighbours.
 float wlm_smoke_level(float texels)
 {{
@@ -71,114 +57,68 @@ float wlm_smoke_level(float texels)
 }}
 """
 
-_DEPTH = """
-// The depth for wlm_smoke_point, of the depth texture's texel at wlm_smoke_uv; that is linear too.
-float wlm_smoke_depth(vec4 texel)
-{{
-    return (texel.x - {zero}) * {reach};
-}}
-"""
-
 _MOTION = """
-// Between two frames, at a share of 0 to 1 of the way from one to the next, both textures are read twice and mixed:
+// Between two frames, at a share of 0 to 1 of the interval, both textures are read twice and mixed:
 //
 //     vec2 way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(place, frame)));
 //     way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)));
 //     first = mix(texture(first, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)),
 //                 texture(first, wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0)), share)
 //
-// The motion from a frame to the next, on the billboard, of the motion texture's texel; that is linear too.
+// Returns the motion on the billboard from a frame to the next, from a texel of the motion texture, which is linear.
 vec2 wlm_smoke_motion(vec4 texel)
 {{
     vec2 way = texel.xy - vec2({zero}, {zero});
     return vec2(way.x * {reach}, way.y * -{reach});
 }}
 
-// Where the earlier frame shows what is at a place.
+// Returns the place in the earlier frame of the smoke that is now at a place.
 vec2 wlm_smoke_before(vec2 place, vec2 motion, float share)
 {{
     return clamp(place - motion * share, vec2(0.0, 0.0), vec2(1.0, 1.0));
 }}
 
-// Where the later frame does.
+// Returns the place in the later frame of the smoke that is now at a place.
 vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
 {{
     return clamp(place + motion * (1.0 - share), vec2(0.0, 0.0), vec2(1.0, 1.0));
 }}
 """
 
-_NEAREST = 1e-12  # least squared distance to a light
 
-
-def smoke_shader(
-    layout: str,
-    *,
-    rows: int,
-    columns: int,
-    count: int,
-    size: tuple[int, int],
-    padding: int = 0,
-    gain: float = 1.0,
-    hot: bool = True,
-    motion: float | None = None,
-    depth: float | None = None,
-) -> str:
-    """Writes the shader of a flip book.
-
-    Args:
-        layout: One of `wlm.smoke.camera.LAYOUTS`.
-        rows, columns, count: Numbers of rows and columns of cells, and of frames.
-        size: Height and width of a frame in pixels, without padding.
-        padding: Pixels around a frame.
-        gain: Factor of the light in the textures.
-        hot: Whether there is a channel of emission.
-        motion, depth: Ranges of the textures of motion and depth; None: no such texture.
-
-    Raises:
-        ValueError: Unknown layout.
-    """
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
+def smoke_shader(book: Book) -> str:
+    """Writes the functions that read a flip book's textures."""
     places = {
         name: f"{texture}.{letter}"
-        for texture, names in zip(("first", "second"), LAYOUTS[layout], strict=True)
+        for texture, names in zip(("first", "second"), LAYOUTS[book.layout], strict=True)
         for name, letter in zip(names, "rgba", strict=True)
     }
-    height, width = (n + 2 * padding for n in size)
+    height, width = (n + 2 * book.padding for n in book.size)
     alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
     text = _TEXT.format(
-        layout=layout,
-        rows=rows,
-        columns=columns,
-        count=count,
-        last=count - 1,
-        inset_x=_literal(padding / width),
-        inset_y=_literal(padding / height),
-        share_x=_literal(size[1] / width),
-        share_y=_literal(size[0] / height),
-        factor=_literal(1.0 / gain),
-        nearest=_literal(_NEAREST),
-        levels=mip_levels(*size, padding),
+        layout=book.layout,
+        rows=book.rows,
+        columns=book.columns,
+        count=book.count,
+        last=book.count - 1,
+        inset_x=_number(book.padding / width),
+        inset_y=_number(book.padding / height),
+        share_x=_number(book.size[1] / width),
+        share_y=_number(book.size[0] / height),
+        factor=_number(1.0 / book.gain),
+        levels=book.levels,
         alpha=alpha,
-        emission=f"{emission} * {_literal(1.0 / gain)}" if hot else "0.0",
+        emission=f"{emission} * {_number(1.0 / book.gain)}" if book.hot else "0.0",
         **places,
     )
-    if depth is not None:
-        text += _DEPTH.format(zero=_literal(ZERO), reach=_literal(2.0 * depth))
-    if motion is not None:
-        text += _MOTION.format(zero=_literal(ZERO), reach=_literal(2.0 * motion))
+    if book.scale is not None:
+        text += _MOTION.format(zero=_number(ZERO), reach=_number(2.0 * book.scale))
     return text
 
 
-def _literal(number: float) -> str:
-    """Returns a number as a float literal of GLSL ES."""
-    text = f"{number:.9g}"
-    return text if "." in text or "e" in text else f"{text}.0"
-
-
 _READ = """
-// Both textures' texels at a place of the billboard: (0, 0) its top left, (1, 1) its bottom right. The time is in
-// frames from 0 on, between two of which both are mixed; texels: how many of a frame a pixel of the screen is wide.
+// Reads both textures at a place of the billboard: (0, 0) is the top left, (1, 1) the bottom right. The time is in
+// frames, counted from 0; between two frames both are mixed. The width of a screen pixel is given in texels.
 void wlm_smoke_texels(vec2 place, float time, float texels, out vec4 first, out vec4 second)
 {{
     float frame = clamp(floor(time), 0.0, {last:.1f});
@@ -189,13 +129,13 @@ void wlm_smoke_texels(vec2 place, float time, float texels, out vec4 first, out 
     second = mix(textureLod(WLM_SMOKE_SECOND_MAP, early, mip), textureLod(WLM_SMOKE_SECOND_MAP, late, mip), share);
 }}
 
-// The light that the smoke throws to the viewer under a light of an irradiance, as of `toward` of wlm_smoke_light.
+// Returns the light that the smoke scatters to the viewer under a light of an irradiance; see wlm_smoke_light.
 vec3 wlm_smoke_lit(vec4 first, vec4 second, vec3 toward, vec3 irradiance)
 {{
     return irradiance * (wlm_smoke_light(first, second, toward) * {share});
 }}
 
-// The same under a sky of one radiance all round: the mean of the six lightmaps.
+// Returns the scattered light under a sky of constant radiance: the mean of the six lightmaps.
 vec3 wlm_smoke_sky(vec4 first, vec4 second, vec3 radiance)
 {{
     vec3 x = vec3(1.0, 0.0, 0.0);
@@ -207,13 +147,13 @@ vec3 wlm_smoke_sky(vec4 first, vec4 second, vec3 radiance)
     return radiance * (sum / 6.0);
 }}
 
-// The light that the smoke gives off itself.
+// Returns the light that the smoke emits.
 vec3 wlm_smoke_glow(vec4 first, vec4 second)
 {{
 {glow}
 }}
 
-// All of it under one light and the sky, and in the fourth place the opacity: pixel = rgb + behind * (1 - opacity).
+// Returns all light under one light and the sky, and the opacity: pixel = rgb + behind * (1 - opacity).
 vec4 wlm_smoke_pixel(vec2 place, float time, float texels, vec3 toward, vec3 irradiance, vec3 sky)
 {{
     vec4 first;
@@ -227,7 +167,7 @@ vec4 wlm_smoke_pixel(vec2 place, float time, float texels, vec3 toward, vec3 irr
 _FADE = """\
     vec2 early = wlm_smoke_uv(place, frame);
     vec2 late = wlm_smoke_uv(place, frame + 1.0);"""
-# The motion of what is here at this time, which was elsewhere in the first frame.
+# Motion of the smoke that is at a pixel at this time, which was elsewhere in the first frame.
 _MOVE = """\
     vec4 here = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(place, frame), mip);
     vec2 start = wlm_smoke_before(place, wlm_smoke_motion(here), share);
@@ -235,13 +175,6 @@ _MOVE = """\
     vec2 way = wlm_smoke_motion(there);
     vec2 early = wlm_smoke_uv(wlm_smoke_before(place, way, share), frame);
     vec2 late = wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0);"""
-
-
-def book_functions(book: Book) -> str:
-    """Writes the functions of `smoke_shader` for a flip book."""
-    names = ("rows", "columns", "count", "size", "padding", "gain", "hot")
-    values = {name: getattr(book, name) for name in names}
-    return smoke_shader(book.layout, **values, motion=book.scale, depth=book.reach)
 
 
 def billboard_shader(book: Book) -> str:
@@ -259,7 +192,7 @@ def billboard_shader(book: Book) -> str:
         share=f"{0.25 / math.pi:.9g}",
         glow=_glow(book.ramp) if book.hot else "    return vec3(0.0, 0.0, 0.0);",
     )
-    return f"{book_functions(book)}\n{textures}{text}"
+    return f"{smoke_shader(book)}\n{textures}{text}"
 
 
 def _glow(ramp: Ramp | None) -> str:

@@ -1,13 +1,11 @@
 """Marches in large steps: the paper's guiding maps (section 4.2), and six-way lightmaps at the same cost.
 
 The paper marches in steps of 10 voxels for the sum of three lights, and a network recovers six lightmaps from it. The
-same march can compute six separate lightmaps: optical depths to the lights from the sides are computed along the lines
-of a lattice, once for all pixels; light from the front and the back follows exactly from the ray's transparency T, as
-(1 - T^2) / 2 and -T ln T. The errors are those of the steps along the rays, of the interpolation between the lattice's
-nodes, and of the steps to the lights, all of which are settings of `March`.
+same march can compute six separate lightmaps. The errors are those of the steps along the rays, of the interpolation
+between the nodes of the lattice, and of the steps to the lights, all of which are settings of `March`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -15,10 +13,13 @@ from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.launch import run
-from wlm_kernels.smoke import march_coarse, march_guide
+from wlm.smoke.scene import Looks
+from wlm_kernels.smoke import marches
 from wlm_kernels.smoke.settings import March
 
-_TRANSPARENCY, _EMISSION = (march_coarse.PLANES.index(name) for name in ("transparency", "emission"))
+_SURFACE = March(step=1.0, jitter=0.0)  # march for the depth at which obstacles and their shadows are drawn
+_STEPS = 130  # steps through the box of `coarse_march`
+_TRANSPARENCY, _EMISSION = (marches.PLANES.index(name) for name in ("transparency", "emission"))
 
 
 def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -> SixWay:
@@ -39,12 +40,17 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
     """
     planes = march_planes(volume, camera, march)
     hot = planes[_EMISSION] if volume.temperature is not None else None
-    return SixWay(planes[: len(DIRECTIONS)], planes[_TRANSPARENCY], hot, camera, planes[march_coarse.DEPTH])
+    return SixWay(planes[: len(DIRECTIONS)], planes[_TRANSPARENCY], hot, camera, planes[marches.DEPTH])
+
+
+def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
+    """Returns a march in steps of 1/130 of the smoke's longest edge."""
+    return March(max(volume.shape) / _STEPS, seed=seed)
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:
-    """Returns `bake_coarse` as float32 [9, H, W], the planes of `wlm_kernels.smoke.march_coarse.PLANES`."""
-    return run(march_coarse.coarse_six_way, volume, camera, (len(march_coarse.PLANES),), march)
+    """Returns `bake_coarse` as float32 [9, H, W], the planes of `wlm_kernels.smoke.marches.PLANES`."""
+    return run(marches.coarse_six_way, volume, camera, (len(marches.PLANES),), march)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,4 +100,10 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
     for name in ("spacing", "light_step"):
         if getattr(march, name) is not None:
             raise ValueError(f"{name}: expected none for the paper's guiding map, got {getattr(march, name)}")
-    return Guide(run(march_guide.guide, volume, camera, (3,), march, shared=shared), camera)
+    return Guide(run(marches.guide, volume, camera, (3,), march, shared=shared), camera)
+
+
+def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
+    """Returns lightmaps with the depth of the smoke's surface if a scene has obstacles, else without a depth."""
+    obstacles = looks is not None and looks.obstacles
+    return replace(six, depth=guide(volume, six.camera, _SURFACE).depth if obstacles else None)

@@ -4,14 +4,11 @@ The paper's references are single scattering by path tracing with 512 samples pe
 is an integral, which is computed here by quadrature. The camera must be orthographic.
 """
 
-from collections.abc import Sequence
-
-import numpy as np
 import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
-from wlm.smoke.camera import Camera, unit
+from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay, StepError
 from wlm.smoke.march.launch import run
 from wlm_kernels.smoke import march_six
@@ -59,34 +56,6 @@ def bake(
             )
     hot = fine[march_six.EMISSION] if volume.temperature is not None else None
     return SixWay(fine[:6], fine[march_six.TRANSPARENCY], hot, camera, error=error)
-
-
-def lit(
-    volume: DensityVolume,
-    camera: Camera,
-    toward: Sequence[float] | np.ndarray,
-    *,
-    step: float = 0.5,
-    g: float = 0.0,
-) -> torch.Tensor:
-    """Computes smoke under one light from any direction, of irradiance 4 pi, which six-way shading approximates.
-
-    Each sample of each ray marches to the light: slow, but independent of `bake`, which it verifies.
-
-    Args:
-        volume: The smoke, of albedo 1.
-        camera: Any.
-        toward: [3], direction to the light in the world, of any length except 0.
-        step: Longest step, in voxels.
-        g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
-
-    Returns:
-        float32 [H, W].
-
-    Raises:
-        ValueError: The direction has no length, or a setting is out of its range.
-    """
-    return run(march_six.lit, volume, camera, (), unit(toward), March(step=step, g=g))
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:

@@ -19,7 +19,7 @@ from wlm.formats.atomic import atomic_path
 from wlm.formats.npz import read_npz
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import run
-from wlm_kernels.smoke import march_motion
+from wlm_kernels.smoke import marches
 from wlm_kernels.smoke.settings import March
 
 _CUTOFF = 1e-3  # transparency of a ray at which it ends
@@ -31,8 +31,7 @@ def motion(
     """Projects the air's motion into the image, weighted by the visibility of the smoke that it carries.
 
     A pixel shows smoke at many depths with different motions: the result is their mean, in which hidden smoke has
-        little
-    weight. Motion of light without motion of smoke, such as that of a shadow's edge, is not included.
+    little weight. Motion of light without motion of smoke, such as that of a shadow's edge, is not included.
 
     Args:
         volume: The later frame's smoke.
@@ -55,7 +54,7 @@ def motion(
         raise ValueError(f"reach: expected a finite length, got {reach}")
     if velocity.dtype is not wp.vec3 or velocity.ndim != 3 or 0 in velocity.shape:
         raise ValueError(f"velocity: expected vec3 [A, B, C], got {velocity.dtype.__name__} {velocity.shape}")
-    return run(march_motion.motion, volume, camera, (2,), velocity, reach / volume.voxel, march)
+    return run(marches.motion, volume, camera, (2,), velocity, reach / volume.voxel, march)
 
 
 _NAME = "velocity"

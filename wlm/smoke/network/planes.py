@@ -8,7 +8,7 @@ from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import guide, march_planes
 from wlm_kernels.smoke import planes as smoke_planes
-from wlm_kernels.smoke.planes import FOOT, FOOT_CODE
+from wlm_kernels.smoke.planes import FOOT
 from wlm_kernels.smoke.settings import March
 
 PLANES = (*DIRECTIONS, "opacity", "emission")
@@ -34,12 +34,6 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
     return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)
 
 
-def from_srgb(code: torch.Tensor) -> torch.Tensor:
-    """Inverse of `to_srgb`; values below 0 count as 0."""
-    curve = ((code.clamp(min=FOOT_CODE) + 0.055) / 1.055) ** 2.4
-    return torch.where(code <= FOOT_CODE, code.clamp(min=0.0) / 12.92, curve)
-
-
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
     """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
 
@@ -59,7 +53,7 @@ def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
 
 
 def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
-    """Encodes a guiding map for the network; all three planes are 0 where there is no smoke.
+    """Encodes a guiding map of the paper's kind for the network; all planes are 0 where there is no smoke.
 
     Args:
         maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
@@ -130,7 +124,7 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """Inverse of `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
+    """Inverts `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
 
     Args:
         planes: [8, H, W].

@@ -3,7 +3,6 @@
 from wlm._facade import facade
 
 _PLACES = {
-    "Environment": "wlm.smoke.transport.lights",
     "LitSmoke": "wlm.smoke.transport.lighting",
     "OrdersModel": "wlm.smoke.transport.orders",
     "PointLight": "wlm.smoke.transport.lights",
@@ -14,6 +13,7 @@ _PLACES = {
     "light_smoke": "wlm.smoke.transport.lighting",
     "load_orders": "wlm.smoke.transport.orders",
     "scatter": "wlm.smoke.transport.orders",
+    "sky_lights": "wlm.smoke.transport.lights",
     "trace": "wlm.smoke.transport.tracing",
 }
 

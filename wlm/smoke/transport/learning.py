@@ -27,23 +27,13 @@ _THINNEST, _THICKEST = 2.0, 100.0
 _ALL_SIZES = (24, 32, 48, 64, 96)
 _PIXELS = (32, 48, 64, 96)
 _SMALL, _HAZY = 0.4, 0.4  # probabilities of smoke that fills a part of its box, and of smoke in haze
+_RIDGE = 1e-5
+_RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end outside the range, and the least range
+_CLEAR = 1e-3  # opacity below which pixels are ignored
+_CURVE = 1.16  # exponent of the light in the weight, from the slope of sRGB's curve
 
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """A view of a volume under several lights.
-
-    Attributes:
-        volume: The smoke.
-        camera: Orthographic.
-        lights: Directional lights of irradiance 4 pi.
-        light: float32 tensor [L, A, H, W], path-traced light of all orders for each light and each of `ALBEDOS`.
-    """
-
-    volume: DensityVolume
-    camera: Camera
-    lights: tuple[Light, ...]
-    light: torch.Tensor
+FAINT = 0.03
+"""Light below which errors have the same weight."""
 
 
 def draw_view(
@@ -67,8 +57,7 @@ def draw_view(
 
 
 def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolume, Camera, tuple]:
-    """Draws a view for the fit, with more kinds of smoke than `draw_view`: thin and thick, coarse and fine, plumes and
-    billows, also in haze or in a large box; arguments as there."""
+    """Draws a view for the fit, with more kinds of smoke than `draw_view`; arguments as there."""
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THINNEST), np.log(_THICKEST))))
     n, pixels = int(random.choice(_ALL_SIZES)), int(random.choice(_PIXELS))
@@ -103,41 +92,9 @@ def _seen(
     return volume, camera, tuple(Light(tuple(map(float, way))) for way in ways[1:])
 
 
-def make_sample(
-    seed: int, number: int, *, samples: int = 64, pixels: int = 64, lights: int = 6, device: str = "cpu"
-) -> Sample:
-    """Draws a view and traces it.
-
-    Args:
-        seed, number, pixels, lights: As for `draw_view`.
-        samples: Paths per pixel.
-        device: "cpu" or "cuda:N".
-    """
-    return traced(draw_view(seed, number, pixels=pixels, lights=lights), samples=samples, seed=number, device=device)
-
-
-def traced(view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu") -> Sample:
-    """Traces a view of `draw_view`; arguments as for `make_sample`."""
-    volume, camera, lamps = view
-    volume = replace(volume, density=volume.density.to(device))
-    grey = trace(volume, camera, lamps, samples=samples, orders=_ORDERS, seed=seed).planes[..., 0]
-    powers = torch.tensor(ALBEDOS, device=grey.device)[:, None] ** torch.arange(_ORDERS + 2, device=grey.device)
-    light = torch.einsum("ak,lkhw->lahw", powers, grey)
-    return Sample(volume, camera, lamps, light)
-
-
-FAINT = 0.03
-"""Light below which errors have the same weight."""
-
-_RIDGE = 1e-5
-_RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end outside the range, and the least range
-_CLEAR = 1e-3  # opacity below which pixels are ignored
-_CURVE = 1.16  # exponent of the light in the weight, from the slope of sRGB's curve
-
-
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """One light of a sample: the inputs, and its light of all orders at each of `ALBEDOS`, [A, H, W]."""
+    """A light of a view: the inputs, and its path-traced light of all orders at each of `ALBEDOS`, [A, H, W]."""
 
     inputs: Inputs
     light: torch.Tensor
@@ -155,12 +112,24 @@ class Lesson:
         return seen * albedo**4 / (near.clamp(min=0.0) + FAINT) ** _CURVE
 
 
-def make_lessons(sample: Sample) -> list[Lesson]:
-    """Computes the inputs of each light of a sample."""
-    volume = sample.volume
+def make_lessons(
+    view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu"
+) -> list[Lesson]:
+    """Traces a view, a result of `draw_view`, and computes the inputs of each of its lights.
+
+    Args:
+        view: Smoke, camera and directional lights of irradiance 4 pi.
+        samples: Paths per pixel.
+        seed: Seed of the paths.
+        device: "cpu" or "cuda:N".
+    """
+    volume, camera, lights = view
+    volume = replace(volume, density=volume.density.to(device))
+    grey = trace(volume, camera, lights, samples=samples, orders=_ORDERS, seed=seed).planes[..., 0]
+    powers = torch.tensor(ALBEDOS, device=grey.device)[:, None] ** torch.arange(_ORDERS + 2, device=grey.device)
     with stream(device_name(volume.device)):
-        _, inputs = make_inputs(volume, sample.camera, sample.lights, ALBEDOS, orders_march(volume))
-    return [Lesson(inputs.of(n), light) for n, light in enumerate(sample.light)]
+        _, inputs = make_inputs(volume, camera, lights, ALBEDOS, orders_march(volume))
+    return [Lesson(inputs.of(n), light) for n, light in enumerate(torch.einsum("ak,lkhw->lahw", powers, grey))]
 
 
 def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) -> OrdersModel:
@@ -218,7 +187,7 @@ def learn(
     for number in range(views):
         if report is not None:
             report(number)
-        lessons += make_lessons(traced(draw_lesson(seed, number), samples=samples, seed=number, device=device))
+        lessons += make_lessons(draw_lesson(seed, number), samples=samples, seed=number, device=device)
     return fit_orders(lessons)
 
 

@@ -1,8 +1,7 @@
 """Smoke under lights from any direction and point lights: one march per light, instead of weighted lightmaps.
 
-Six weighted lightmaps have an error of 30% for lights between the axes. The same march with its lattice turned towards
-a light costs as much for this light and the opposite light as for two of the six, and has only the error of its step.
-`wlm.smoke.transport.orders` computes light of all orders from such planes.
+Six weighted lightmaps have an error for lights between the axes. The same march with its lattice turned towards a light
+has only the error of its step. `wlm.smoke.transport.orders` computes light of all orders from such planes.
 """
 
 import math
@@ -20,7 +19,7 @@ from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
-from wlm_kernels.smoke import depth_lattice, march_lights
+from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March
 
@@ -73,7 +72,7 @@ class LitSmoke:
             float32 [H, W, 3].
 
         Raises:
-            ValueError: The albedo is wrong, or a light's visibility has another shape.
+            ValueError: The albedo is wrong.
         """
         planes = torch.stack([float(value) * self.planes for value in checked_albedo(albedo)], -1)
         return self.compose(planes, background=background, ramp=ramp)
@@ -89,11 +88,6 @@ class LitSmoke:
         image = torch.zeros((*self.transparency.shape, 3), dtype=torch.float32, device=planes.device)
         for light, plane in zip(self.lights, planes, strict=True):
             colour = light.irradiance if isinstance(light, Light) else light.intensity
-            visibility = light.visibility if isinstance(light, Light) else None
-            if visibility is not None:
-                if visibility.shape != image.shape[:2]:
-                    raise ValueError(f"visibility: expected {tuple(image.shape[:2])}, got {tuple(visibility.shape)}")
-                plane = plane * visibility[..., None]
             _add(image, plane, np.asarray(colour) / (4 * math.pi))
         if self.emission is not None:
             glow = self.emission[..., None] if ramp is None else ramp(self.emission)
@@ -171,18 +165,18 @@ class Marching:
     shadow: float
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
-        """Optical depths to a light, see `depth_lattice.reach`."""
+        """Computes optical depths to a light, see `depth_lattice.reach`."""
         return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
-        """Light scattered once, see `march_lights.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
-        march_lights.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
+        """Computes single scattering, see `marches.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
+        marches.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
     def unlit(self) -> torch.Tensor:
         """Returns transparency, emission and depth, [3, H, W]."""
-        size = (len(march_lights.PLANES), self.view.height, self.view.width)
+        size = (len(marches.UNLIT_PLANES), self.view.height, self.view.width)
         out = torch.empty(size, device=wp.device_to_torch(self.medium.density.device))
-        march_lights.unlit(self.medium, self.view, self.march, to_warp(out))
+        marches.unlit(self.medium, self.view, self.march, to_warp(out))
         return out
 
 

@@ -1,4 +1,4 @@
-"""Point lights and environments, in addition to the directional lights of `wlm.smoke.shading`."""
+"""Point lights and skies, in addition to the directional lights of `wlm.smoke.shading`."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import unit
 from wlm.smoke.shading import Light
 
-_PARTS = 64  # least number of rows of a map that is distributed to lights
 _BRIGHTEST = 1e12  # its products with any phase function are within float32
 
 
@@ -41,63 +40,19 @@ AnyLight = Light | PointLight
 """A light at infinity or a point light."""
 
 
-@dataclass(frozen=True, eq=False)
-class Environment:
-    """Light from all directions, a map of texels of constant radiance.
+def sky_lights(radiance: Sequence[float], count: int = 12) -> tuple[Light, ...]:
+    """Returns evenly spread directional lights that approximate a sky of constant radiance all around.
 
-    Attributes:
-        radiance: [rows, columns, 3], linear, not negative. Row 0 is around the world's +y; column 0 begins at +x, and
-            columns proceed towards +z.
+    Args:
+        radiance: R, G, B.
+        count: Number of lights, even and at least 2.
+
+    Raises:
+        ValueError: The radiance is not three numbers of at least 0.
     """
-
-    radiance: np.ndarray
-
-    def __post_init__(self) -> None:
-        values = np.asarray(self.radiance, np.float64)
-        if values.ndim != 3 or values.shape[2] != 3 or 0 in values.shape:
-            raise ValueError(f"radiance: expected [rows, columns, 3], got {values.shape}")
-        if not ((values >= 0) & (values <= _BRIGHTEST)).all():
-            raise ValueError(f"radiance: expected numbers of 0 to {_BRIGHTEST:g}")
-
-    @staticmethod
-    def even(colour: Sequence[float] = (1.0, 1.0, 1.0)) -> "Environment":
-        """Returns an environment of constant radiance."""
-        return Environment(np.asarray(colour, np.float64).reshape(1, 1, 3))
-
-    def lights(self, count: int = 12) -> tuple[Light, ...]:
-        """Returns evenly spread directional lights that approximate it; each has the light of the nearest directions.
-
-        Args:
-            count: Number of lights, even and at least 2.
-        """
-        ways = half_sphere(count // 2)
-        ways = np.concatenate([ways, -ways])
-        values = np.asarray(self.radiance, np.float64)
-        # Texels are divided, so that each belongs to the directions of about one light.
-        down, along = (-(-least // n) for least, n in zip((_PARTS, 2 * _PARTS), values.shape, strict=False))
-        values = values.repeat(down, 0).repeat(along, 1)
-        rows, columns = values.shape[:2]
-        edges = np.cos(np.pi * np.arange(rows + 1) / rows)
-        height, turn = 0.5 * (edges[:-1] + edges[1:]), 2.0 * np.pi * (np.arange(columns) + 0.5) / columns
-        across = np.sqrt(1.0 - height**2)[:, None]
-        places = np.stack(np.broadcast_arrays(across * np.cos(turn), height[:, None], across * np.sin(turn)), -1)
-        power = values * ((edges[:-1] - edges[1:]) * 2.0 * np.pi / columns)[:, None, None]
-        nearest = (places @ ways.T).argmax(-1).ravel()
-        sums = np.stack([np.bincount(nearest, power[..., c].ravel(), len(ways)) for c in range(3)], -1)
-        return tuple(Light(tuple(map(float, way)), tuple(map(float, e))) for way, e in zip(ways, sums, strict=True))
-
-    def chances(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Returns cumulative probabilities of rows [R], of columns within rows [R, C], and the integral of the mean."""
-        mean = np.asarray(self.radiance, np.float64).mean(-1)
-        edges = np.cos(np.pi * np.arange(len(mean) + 1) / len(mean))
-        solid = (edges[:-1] - edges[1:]) * 2.0 * np.pi / mean.shape[1]
-        power = mean * solid[:, None]
-        total = power.sum()
-        if total == 0.0:
-            return np.ones(len(mean)), np.ones(mean.shape), 0.0
-        row = power.sum(1)
-        along = np.cumsum(power, 1) / np.where(row > 0, row, 1.0)[:, None]
-        return np.cumsum(row) / total, along, float(total)
+    each = tuple(map(float, checked_colour("sky", radiance) * 4.0 * math.pi / count))
+    ways = half_sphere(count // 2)
+    return tuple(Light(tuple(map(float, way)), each) for way in (*ways, *-ways))
 
 
 def half_sphere(count: int) -> np.ndarray:

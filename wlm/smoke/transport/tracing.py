@@ -5,7 +5,7 @@ This is the reference for other methods: it has no bias, and noise with an estim
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, free_memory, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.transport.lights import AnyLight, Environment, checked_albedo, in_voxels
+from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import View
@@ -35,8 +35,9 @@ class Transport:
 
     Attributes:
         planes: float32 tensor [S, orders + 2, H, W, 3]: for each source the light that was scattered 0, 1, ... `orders`
-            times, and last the light that was scattered more often.
-        sources: Names of the sources: "light 1" and so on, "environment" and "emission".
+            times, and last the light that was scattered more often. At a times the albedo, the light of order n is
+            a^n times this.
+        sources: Names of the sources: "light 1" and so on, "sky" and "emission".
         noise: float32 tensor [S, H, W, 3], standard error of each source's sum over its planes.
         total_noise: float32 tensor [H, W, 3], standard error of `total`; since sources share paths, it exceeds the root
             of the sum of squares of `noise`.
@@ -69,49 +70,13 @@ class Transport:
         power = float(self.total.double().square().mean())
         return math.sqrt(float(self.total_noise.double().square().mean()) / power) if power > 0 else 0.0
 
-    def up_to(self, order: int) -> torch.Tensor:
-        """Returns the light that was scattered at most `order` times, for each source, [S, H, W, 3].
-
-        Raises:
-            ValueError: The order has no separate plane.
-        """
-        if not 0 <= order <= self.orders:
-            raise ValueError(f"order: expected 0 to {self.orders}, got {order}")
-        return self.planes[:, : order + 1].sum(1)
-
-    def with_albedo(self, albedo: Sequence[float]) -> "Transport":
-        """Returns the result of the same paths at another albedo: order n is scaled by the n-th power of the ratio.
-
-        Light that was scattered more than `orders` times is omitted, and the noise is scaled like the sum.
-
-        Args:
-            albedo: R, G, B, 0 to 1.
-
-        Raises:
-            ValueError: The albedo is wrong, or paths were traced with an albedo of 0.
-        """
-        wanted = checked_albedo(albedo)
-        if min(self.albedo) <= 0.0:
-            raise ValueError("albedo: expected paths of an albedo above 0")
-        ratio = torch.tensor(wanted / np.asarray(self.albedo)).to(self.planes)
-        powers = ratio ** torch.arange(self.orders + 1, device=ratio.device, dtype=ratio.dtype)[:, None]
-        planes = torch.zeros_like(self.planes)
-        planes[:, :-1] = self.planes[:, :-1] * powers[:, None, None]
-
-        def scaled(noise: torch.Tensor, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-            return torch.where(after > 0, noise * (after / before.clamp(min=1e-30)), 0.0)
-
-        noise = scaled(self.noise, self.planes.sum(1), planes.sum(1))
-        total_noise = scaled(self.total_noise, self.total, planes.sum((0, 1)))
-        return replace(self, planes=planes, noise=noise, total_noise=total_noise, albedo=tuple(map(float, wanted)))
-
 
 def trace(
     volume: DensityVolume,
     camera: Camera,
     lights: Sequence[AnyLight] = (),
     *,
-    environment: Environment | None = None,
+    sky: Sequence[float] | None = None,
     albedo: Sequence[float] = (1.0, 1.0, 1.0),
     g: float = 0.0,
     samples: int = 64,
@@ -127,7 +92,7 @@ def trace(
         volume: The smoke; emission of hot smoke is a light source too.
         camera: Any camera, outside the smoke or inside. Paths go through pixel centres, like rays of a march.
         lights: Any number of lights; their `visibility` is not used.
-        environment: Light from all directions, also visible behind the smoke.
+        sky: R, G, B, radiance from all directions, also visible behind the smoke; None: black.
         albedo: R, G, B, share of light that survives a scattering, 0 to 1.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
         samples: Paths per pixel, at least 1. The noise of a single path is unknown and given as infinite.
@@ -167,9 +132,9 @@ def trace(
         mesh = None if obstacles is None or not len(obstacles[1]) else _mesh(obstacles, volume, device)
         settings = path.PathSettings()
         settings.albedo, settings.g = wp.vec3(*map(float, colour)), float(g)
+        settings.sky = wp.vec3(*map(float, checked_colour("sky", sky or (0.0, 0.0, 0.0))))
         settings.highest, settings.kept, settings.samples = min(highest, HIGHEST), orders, samples
         settings.key = wp.uint64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
-        sky = _sky(environment, device)
         view, parts = camera.view(volume), min(_PARTS, samples)
         sources, kept = len(lights) + 2, orders + 2
         planes = sources * kept
@@ -183,7 +148,7 @@ def trace(
             count = min(at_once, parts - first)
             size = (count * planes, view.height, view.width, 3)
             out = torch.zeros(size, device=volume.device)
-            arguments = (lamps, sky, 0 if mesh is None else mesh.id, settings, first, parts)
+            arguments = (lamps, 0 if mesh is None else mesh.id, settings, first, parts)
             path.trace(medium, view, majorants, *arguments, to_warp(out, wp.vec3))
             each = out.reshape(count, *total.shape)
             total += each.sum(0)
@@ -191,8 +156,8 @@ def trace(
             meter.report(first + count)
         means = torch.cat(means)
         noise, total_noise = _noise(means, samples), _noise(means.sum(1), samples)
-    names = [f"light {n + 1}" for n in range(len(lights))] + ["environment", "emission"]
-    there = [*range(len(lights)), *([len(lights)] * (environment is not None))]
+    names = [f"light {n + 1}" for n in range(len(lights))] + ["sky", "emission"]
+    there = [*range(len(lights)), *([len(lights)] * (sky is not None))]
     there += [len(lights) + 1] * (volume.temperature is not None)
     picked = torch.tensor(there, dtype=torch.long, device=volume.device)
     chosen = tuple(names[n] for n in there)
@@ -233,13 +198,3 @@ def _mesh(obstacles: tuple[np.ndarray, np.ndarray], volume: DensityVolume, devic
         wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),
         wp.array(triangles.astype(np.int32).ravel(), dtype=int, device=device),
     )
-
-
-def _sky(environment: Environment | None, device: str) -> path.Sky:
-    sky = path.Sky()
-    given = Environment.even((0.0, 0.0, 0.0)) if environment is None else environment
-    rows, columns, sky.total = given.chances()
-    sky.radiance = wp.array(np.asarray(given.radiance, np.float32), dtype=wp.vec3, device=device)
-    sky.rows = wp.array(rows.astype(np.float32), dtype=float, device=device)
-    sky.columns = wp.array(columns.astype(np.float32), dtype=float, device=device)
-    return sky

@@ -1,6 +1,6 @@
 // The sum of a vector of N floats over a block of 32 * WARPS threads, in a fixed order, into row k of an array; constants
-// from wlm_kernels/probe/step.py. Native because a sum by atomics would change from run to run: shuffles within a warp,
-// then its warps in turn.
+// from wlm_kernels/probe/step.py. The code is native because a sum by atomics would change from run to run: it adds by
+// shuffles within each warp, then adds the warps in turn.
 
 __shared__ float parts[WARPS][N];
 const int t = threadIdx.x;

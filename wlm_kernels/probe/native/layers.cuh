@@ -1,14 +1,14 @@
 // The network's forward pass for a block of T threads (gaussian-probe-compression, eq. 7): the beginning of a function's
-// body, which network.cuh and decode.cuh go on with. The twin to read first: wlm/probe/exact.py.
+// body, which network.cuh and decode.cuh continue. The reference is wlm/probe/exact.py.
 //
 // It declares the rows X (inputs), A and B (hidden layers) and E (outputs) of P probes in shared memory, and
-// forward(in, rows, weights, out), a hidden layer, and last(in, weights, put), which hands every output c of probe p to
-// put(c, p, value). The caller fills X and synchronises.
+// forward(in, rows, weights, out), a hidden layer, and last(in, weights, put), which calls put(c, p, value) for every
+// output c of probe p. The caller fills X and synchronises.
 //
-// Native because a thread computes a piece of 4 probes by 8 units in registers while the layers stay in shared memory
-// whose rows are padded by a bank; one probe per thread would spill its registers. Measured: a whole training step on
+// The code is native because a thread computes 4 probes by 8 units in registers while the layers stay in shared memory,
+// whose rows are padded against bank conflicts; one probe per thread would spill registers. Measured: a training step on
 // 11,404 probes and 570 Gaussians takes 0.133 ms on an H200, 1 / 34.5 of plain torch's (benchmarks/nvidia-h200.json,
-// city 12.00, "fit" and "dense torch"). Warp's own tiles have not been timed in its place.
+// city 12.00, "fit" and "dense torch"). Warp's own tiles have not been measured.
 //
 // Constants from wlm_kernels/probe/network.py:
 //   L, H, D, DP  latent, hidden units, outputs, and outputs filled up to fours

@@ -1,6 +1,6 @@
-// The network's backward pass for a block of probes (gaussian-probe-compression, eq. 8), behind layers.cuh: the loss, the
+// The network's backward pass for a block of probes (gaussian-probe-compression, eq. 8), after layers.cuh: the loss, the
 // gradient of the Gaussians' sums, and this block's part of the weights' gradients.
-// The twin to read first: tests/reference/probe_network.py. Native for the reason that layers.cuh gives.
+// The reference is tests/reference/probe_network.py; layers.cuh gives the reason for native code.
 
 const int t = threadIdx.x;
 const int first = block * P, n = x.shape[0];
@@ -15,7 +15,7 @@ for (int m = t; m < I * P; m += T) {
     X[c * LD + p] = v;
 }
 __syncthreads();
-// The delta before a layer from the one behind it, in place of the layer's input.
+// The gradient of a layer's inputs from that of its outputs, written over the inputs.
 auto back = [&](const float* d, int count, const float* w, float* out) {
     for (int tile = t; tile < Q * (H / 8); tile += T) {
         const int p = tile % Q * 4, i = tile / Q * 8;
@@ -50,7 +50,7 @@ auto outer = [&](const float* in, int rows, auto tall, const float* d, int count
     constexpr int R = sizeof(*tall);
     const int down = rows / R, across = count / 4;
     for (int tile = t; tile < down * across; tile += T) {
-        // Rows a thread apart lie in different banks.
+        // The rows of neighbouring threads are in different banks.
         const int i = tile % down, j = tile / down;
         float sum[R][4] = {};
         #pragma unroll 2
@@ -81,7 +81,7 @@ auto outer = [&](const float* in, int rows, auto tall, const float* d, int count
     }
     __syncthreads();
 };
-// Rows that a thread takes, as the size of an array, for a lambda's argument can carry no number.
+// Rows per thread, as the size of an array, since a lambda's argument cannot carry a constant.
 const char (*one)[1] = nullptr, (*eight)[8] = nullptr;
 
 forward(X, I, w1, A);

@@ -9,31 +9,29 @@ const declare = (name) => `
 uniform highp usampler2D u_${name};
 #define WLM_PROBE_${name.toUpperCase()}(i) texelFetch(u_${name}, ivec2((i) & 1023, (i) >> 10), 0).r
 `;
+// The 27 numbers of a place are stored as half floats, two in a word: WebGL 2 promises only four targets.
 const STORE = `
 uniform sampler2D u_places;
-layout(location = 0) out vec4 out_0;
-layout(location = 1) out vec4 out_1;
-layout(location = 2) out vec4 out_2;
-layout(location = 3) out vec4 out_3;
-layout(location = 4) out vec4 out_4;
-layout(location = 5) out vec4 out_5;
-layout(location = 6) out vec4 out_6;
+layout(location = 0) out uvec4 out_0;
+layout(location = 1) out uvec4 out_1;
+layout(location = 2) out uvec4 out_2;
+layout(location = 3) out uvec4 out_3;
 void main()
 {
     vec3 sh[COUNT];
     wlm_probe_sh(texelFetch(u_places, ivec2(gl_FragCoord.xy), 0).xyz, sh);
-    vec3 c[9];  // 27 numbers, four in a texel
-    for (int i = 0; i < 9; ++i)
-        c[i] = i < COUNT ? sh[min(i, COUNT - 1)] : vec3(0.0);
-    out_0 = vec4(c[0], c[1].x);
-    out_1 = vec4(c[1].yz, c[2].xy);
-    out_2 = vec4(c[2].z, c[3]);
-    out_3 = vec4(c[4], c[5].x);
-    out_4 = vec4(c[5].yz, c[6].xy);
-    out_5 = vec4(c[6].z, c[7]);
-    out_6 = vec4(c[8], 1.0);
+    float numbers[32];
+    for (int i = 0; i < 32; ++i)
+        numbers[i] = i < min(3 * COUNT, 27) ? clamp(sh[min(i / 3, COUNT - 1)][i % 3], -65504.0, 65504.0) : 0.0;
+    uint words[16];
+    for (int i = 0; i < 16; ++i)
+        words[i] = packHalf2x16(vec2(numbers[2 * i], numbers[2 * i + 1]));
+    out_0 = uvec4(words[0], words[1], words[2], words[3]);
+    out_1 = uvec4(words[4], words[5], words[6], words[7]);
+    out_2 = uvec4(words[8], words[9], words[10], words[11]);
+    out_3 = uvec4(words[12], words[13], words[14], words[15]);
 }`;
-const TABLES = 7;
+const TABLES = 4;
 
 // Radiance of a white diffuse surface under spherical harmonics of radiance: irradiance / pi.
 const LIT = `${HEAD}
@@ -41,7 +39,7 @@ in vec3 a_position;
 in vec3 a_normal;
 uniform mat4 u_camera;
 uniform sampler2D u_centres, u_original;
-uniform sampler2D u_table_0, u_table_1, u_table_2, u_table_3, u_table_4, u_table_5, u_table_6;
+uniform highp usampler2D u_table_0, u_table_1, u_table_2, u_table_3;
 uniform int u_view;      // 0: the original is not seen
 uniform float u_radius;  // of spheres; 0: the vertices are a mesh's own
 out vec3 v_decoded;
@@ -59,10 +57,11 @@ void main()
 {
     int row = u_radius > 0.0 ? gl_InstanceID : gl_VertexID;
     ivec2 at = ivec2(row % ${WIDTH}, row / ${WIDTH});
-    vec4 t0 = texelFetch(u_table_0, at, 0), t1 = texelFetch(u_table_1, at, 0), t2 = texelFetch(u_table_2, at, 0);
-    vec4 t3 = texelFetch(u_table_3, at, 0), t4 = texelFetch(u_table_4, at, 0), t5 = texelFetch(u_table_5, at, 0);
-    vec3 c[9] = vec3[9](t0.xyz, vec3(t0.w, t1.xy), vec3(t1.zw, t2.x), t2.yzw, t3.xyz, vec3(t3.w, t4.xy),
-                        vec3(t4.zw, t5.x), t5.yzw, texelFetch(u_table_6, at, 0).xyz);
+    uvec4 tables[4] = uvec4[4](texelFetch(u_table_0, at, 0), texelFetch(u_table_1, at, 0),
+                               texelFetch(u_table_2, at, 0), texelFetch(u_table_3, at, 0));
+    vec3 c[9];
+    for (int i = 0; i < 27; ++i)
+        c[i / 3][i % 3] = unpackHalf2x16(tables[i / 8][(i / 2) % 4])[i % 2];
     v_decoded = wlm_diffuse(a_normal, c);
     for (int i = 0; i < 9 && u_view > 0; ++i)
         c[i] = texelFetch(u_original, ivec2((9 * row + i) & 1023, (9 * row + i) >> 10), 0).rgb;
@@ -100,6 +99,11 @@ function normals(position, triangles) {
     for (const k of [0, 1, 2]) sums[i + k] /= length;
   }
   return sums;
+}
+
+function fromHalf(bits) {
+  const sign = bits & 0x8000 ? -1 : 1, exponent = bits >> 10 & 31, fraction = bits & 1023;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : fraction * 2 ** -24);
 }
 
 class ProbePage {
@@ -151,7 +155,8 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
     const {graphics} = this, {gl} = graphics, count = values.length / 3, rows = Math.max(Math.ceil(count / WIDTH), 1);
     const texels = new Float32Array(WIDTH * rows * 4);
     for (let i = 0; i < count; ++i) texels.set(values.subarray(3 * i, 3 * i + 3), 4 * i);
-    const tables = Array.from({length: TABLES}, () => graphics.plain(WIDTH, rows, graphics.single(), null, gl.NEAREST));
+    const words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
+    const tables = Array.from({length: TABLES}, () => graphics.plain(WIDTH, rows, words, null, gl.NEAREST));
     const buffer = gl.createFramebuffer(), targets = tables.map((_, i) => gl.COLOR_ATTACHMENT0 + i);
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     tables.forEach(({texture}, i) => gl.framebufferTexture2D(gl.FRAMEBUFFER, targets[i], gl.TEXTURE_2D, texture, 0));
@@ -187,7 +192,7 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
       places.done += many;
       // Waits, so that the clock measures finished work.
       gl.readBuffer(gl.COLOR_ATTACHMENT0);
-      gl.readPixels(column, row, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
+      gl.readPixels(column, row, 1, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, new Uint32Array(4));
     }
     gl.disable(gl.SCISSOR_TEST);
     const left = this.groups.some((group) => group.places.done < group.places.count);
@@ -214,13 +219,16 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
   async read(group = 0) {
     const {places} = this.groups[group], {gl} = this.graphics, {width, height} = places.texture;
     while (places.done < places.count) await new Promise(requestAnimationFrame);
-    const numbers = new Float32Array(27 * places.count), values = new Float32Array(4 * width * height);
+    const numbers = new Float32Array(27 * places.count), words = new Uint32Array(4 * width * height);
+    const halves = new Uint16Array(words.buffer);
     gl.bindFramebuffer(gl.FRAMEBUFFER, places.buffer);
     for (let table = 0; table < TABLES; ++table) {
       gl.readBuffer(gl.COLOR_ATTACHMENT0 + table);
-      gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+      gl.readPixels(0, 0, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
       for (let i = 0; i < places.count; ++i) {
-        for (let k = 4 * table; k < Math.min(4 * table + 4, 27); ++k) numbers[27 * i + k] = values[4 * i + k - 4 * table];
+        for (let k = 8 * table; k < Math.min(8 * table + 8, 27); ++k) {
+          numbers[27 * i + k] = fromHalf(halves[8 * i + k - 8 * table]);
+        }
       }
     }
     return numbers;
