@@ -111,25 +111,6 @@ def test_the_smallest_and_the_largest_numbers(tmp_path):
     _assert_same(wlm.load(tmp_path / "a.wlm"), model)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"parts": {"lut": [9, 9, 10**9]}}, "part lut: .*: expected what .* bytes can hold"),
-        ({"parts": {"lut": [10**6, 0, 2]}}, "part lut: expected 0 bytes"),
-        ({"parts": {"dial": [1]}}, "setting parts: dial is none of the file's"),
-        ({"parts": {"lut": [4, 4, 2]}}, "part lut: expected 64 bytes"),
-        ({"parts": {}}, "part .* is uint8"),
-    ],
-)
-def test_streams_that_do_not_fit_are_refused(change, words, tmp_path):
-    path = tmp_path / "a.wlm"
-    random_model(sheet(), "tiles").save(path)
-    assert read_artifact(path).settings["parts"]["lut"] == [6, 7, 2]
-    rewrite(path, change)
-    with pytest.raises(WlmError, match=f"a.wlm: .*{words}"):
-        wlm.load(path)
-
-
 def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, stored: str = "half") -> None:
     """Saves a model with other settings or tensors; reading it is one line."""
     path = tmp_path / "a.wlm"

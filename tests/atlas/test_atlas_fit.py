@@ -8,9 +8,6 @@ import pytest
 import torch
 from builders.atlas_meshes import charts, constant, sheet, soft, triangle
 
-import wlm.atlas.model
-import wlm.atlas.tiles.layout
-import wlm.atlas.weights
 from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import from_arrays
 from wlm.atlas.decode import Decoder
@@ -188,17 +185,6 @@ def test_bright_light(name: str, brightest: float):
     assert decoded.max() == pytest.approx(mesh.sheets[0].lightmap.max(), rel=0.1)
 
 
-def test_a_spike_stays_in_its_tile():
-    """One texel at half's end: its tile may err, no other does."""
-    image = np.full((36, 36, 3), 0.5, np.float32)
-    image[17, 17] = 65504.0
-    mesh = sheet(lambda place: image, 36, 36)
-    decoded = checked(compress(mesh, HALF), mesh)
-    far = np.ones((36, 36), bool)
-    far[14:22, 14:22] = False
-    np.testing.assert_allclose(decoded[far], 0.5, rtol=1e-3)
-
-
 @pytest.mark.parametrize("views", [1, 2])
 def test_parts_that_no_view_shows_stay_in_range(views: int):
     """One view shows three sides at most, and none the chart within the cube."""
@@ -232,22 +218,6 @@ def test_weights_follow_the_views_and_the_borders():
     # The middle of the first side, three texels and more from its border.
     middle = np.s_[20:28, 12:20]
     np.testing.assert_array_equal(plain[middle], bordered[middle])
-
-
-@pytest.mark.parametrize("profile", ["standard", "cascade"])
-def test_the_coverage_by_triangles_is_computed_once(profile, monkeypatch):
-    """Of quarters of texels and of texels; the comparison with a plain lightmap shares the fit's grid."""
-    calls, names = [], ("covered_on", "covered_on", "sheet_charts", "texel_triangles")
-
-    def counted(name):
-        function = getattr(wlm.atlas.weights, name)
-        return lambda *args: calls.append(name) or function(*args)
-
-    for name in set(names):
-        monkeypatch.setattr(wlm.atlas.weights, name, counted(name))
-    model = compress(charts(), profile, views=2, steps=2, resolution=64)
-    assert "error against a plain lightmap of as many bits" in model.report
-    assert sorted(calls) == sorted(names)
 
 
 def test_a_budget_without_room_for_tiles():

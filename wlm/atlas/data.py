@@ -40,7 +40,7 @@ _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warn
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Position of one primitive's vertices and triangles in a sheet, in their original order."""
+    """The number of one primitive's first vertex and first triangle in a sheet."""
 
     primitive: GltfPrimitive
     vertex: int

@@ -157,14 +157,9 @@ def evaluate(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Report:
-    """Compares a model with the original lightmaps.
+    """Compares a model with the original lightmaps of the scene, with options as for `compare`.
 
     Seams are the borders of the new UVs' charts, or of the lightmaps' where the mesh keeps its UVs.
-
-    Args:
-        model: The model.
-        scene: The scene that was compressed, with its original lightmaps.
-        views, resolution, device, progress: As for `compare`.
 
     Raises:
         WlmError: There is no such device, or the model was made from another scene.

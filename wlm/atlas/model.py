@@ -317,11 +317,10 @@ class AtlasModel(Model):
         return import_module("wlm.atlas.stored").restore(self)
 
     def table(self) -> np.ndarray:
-        """Makes the table of sheets for kernels and shaders, int32 [rows, 7].
+        """Makes the table of sheets for kernels and shaders, int32 [rows, 7]: rows and columns of texels, the first row
+        and column in T_c, rows and columns of tiles, and the row number of the next smaller level.
 
-        Sheets come first, then levels; with separate tiles both are listed for each state in turn. A row contains the
-        rows and columns of texels, the first row and column in T_c, the rows and columns of tiles, and the row number
-        of the next smaller level.
+        Sheets come first, then levels; with separate tiles both are listed for each state in turn.
         """
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)

@@ -54,12 +54,8 @@ _PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show
 
 @dataclass(frozen=True, eq=False)
 class Textures:
-    """A cascade before it is stored.
-
-    Attributes:
-        colour: float32 [Hp, Wp, 3], T_p, linear radiance.
-        lut: float32 [Hc, Wc, 2], T_c, x and y over the size of T_p; [0, 0, 2]: none.
-    """
+    """A cascade before it is stored: T_p, float32 [Hp, Wp, 3], linear radiance; T_c, float32 [Hc, Wc, 2], x and y over
+    the size of T_p, [0, 0, 2] for none."""
 
     colour: np.ndarray
     lut: np.ndarray

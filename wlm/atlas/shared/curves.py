@@ -100,8 +100,7 @@ class Candidate:
     """The errors of all tiles with one number of components.
 
     Attributes:
-        mixtures: The mixtures.
-        number: int [T], the mixture of each tile.
+        mixtures, number: The mixtures, and that of each tile, int [T].
         choices: The sizes of the components.
         error: float64 [choices, T], mean over the states.
         left: An estimate of the whole error if tiles may have up to this number of components.

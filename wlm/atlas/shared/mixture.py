@@ -31,11 +31,10 @@ class Mixtures:
     """All mixtures with the same number of components.
 
     Attributes:
-        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
-            below 0.
+        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, at least 0.
         offset: float32 [G, K, 3]: the states are `factor` times the components less this.
         kept: float32 [G, 3 M M], flattened projections onto the subspaces: their product with a tile's moments is the
-            energy that they keep; only the first components count where `find_mixtures` has `like`.
+            energy that they keep.
     """
 
     factor: torch.Tensor

@@ -113,9 +113,7 @@ class Fitted:
     """The allocation of all tiles.
 
     Attributes:
-        planes: Sheets and levels; with separate tiles, of one state after the other.
-        layout: Their places in T_c.
-        tiles: Their tiles.
+        planes, layout, tiles: Sheets and levels, their places and tiles; separate tiles are listed state by state.
         tried: The tiles with each number of components, weighted by `balance`.
         given: Components, sizes and places of the tiles.
         numbers: Number of integers per entry of T_c.

@@ -34,13 +34,8 @@ _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14)  # texels, beside the largest side: a
 
 @dataclass(frozen=True)
 class Size:
-    """A size that a tile may have.
-
-    Attributes:
-        nx, ny: Samples along x and y.
-        format: Their format, a key of `COLOUR_BITS`.
-        second: Whether they are in the second texture of "mixed".
-    """
+    """A size that a tile may have: samples along x and y, their format, a key of `COLOUR_BITS`, and whether they are in
+    the second texture of "mixed"."""
 
     nx: int
     ny: int
@@ -60,13 +55,8 @@ class Size:
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of all tiles and their places.
-
-    Attributes:
-        chosen: int [T], numbers of sizes.
-        first: int64 [T, 2], x and y of each tile's first texel.
-        shapes: Rows and columns of T_p, and of the second texture of "mixed".
-    """
+    """The sizes of all tiles, int [T]; x and y of each tile's first texel, int64 [T, 2]; and rows and columns of T_p,
+    and of the second texture of "mixed"."""
 
     chosen: np.ndarray
     first: np.ndarray
