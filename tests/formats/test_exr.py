@@ -258,3 +258,12 @@ except WlmError as error:
     assert done.returncode == 1 and "cannot write" in done.stderr and done.stderr.count("\n") == 1
     assert path.read_bytes() == b"what was there"
     assert [entry.name for entry in tmp_path.iterdir()] == ["frame.exr"]
+
+
+def test_planes_of_several_shapes_and_types(tmp_path):
+    for planes in ({"a": np.ones((2, 2)), "b": np.ones((2, 3))}, {}):
+        with pytest.raises(ValueError, match="one shape"):
+            write_planes(tmp_path / "a.exr", planes)
+    write_planes(tmp_path / "a.exr", {"a": np.full((1, 1), 1e9), "b": np.full((1, 1), 1e9)}, whole=("b",))
+    planes, note = read_planes(tmp_path / "a.exr")
+    assert planes["a"] == HALF_MAX and planes["b"] == np.float32(1e9) and note == {}

@@ -1,4 +1,4 @@
-"""Evaluation: scores worked out by hand, hard pools, and a network beside its rivals on a tiny set."""
+"""Evaluation: scores computed by hand, hard pools, and all methods on a tiny set."""
 
 import json
 import math

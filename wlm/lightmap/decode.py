@@ -144,25 +144,6 @@ class SheetDecoder:
         self._gaps.fill(image)
         return image
 
-    def frame_8bit(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes the whole map to 8 bits: uint8 [H, W, 4], and the bound of each tile, float32 [tiles]."""
-        image = np.zeros((self._grid.height, self._grid.width, 4), np.uint8)
-        bounds = np.zeros(self._grid.count, np.float32)
-        for numbers in self._stored():
-            tiles, bounds[numbers] = self.tiles_8bit(numbers.tolist(), time)
-            place(image, tiles, numbers, self._grid)
-        # Each tile has its own bound.
-        target, source = (bounds[self._tile_of(at)] for at in (self._gaps.target, self._gaps.source))
-        factor = np.divide(source, target, out=np.zeros_like(source), where=target > 0)
-        light = image[tuple(self._gaps.source.T)][:, :3] * factor[:, None]
-        image[tuple(self._gaps.target.T)] = 255
-        image[..., :3][tuple(self._gaps.target.T)] = np.minimum(light, 255.0) + 0.5
-        return image, bounds
-
-    def _tile_of(self, at: np.ndarray) -> np.ndarray:
-        """Returns the numbers of the tiles of texels, given as rows and columns [G, 2]."""
-        return at[:, 0] // TILE * self._grid.cols + at[:, 1] // TILE
-
     def _stored(self) -> list[np.ndarray]:
         """Returns the numbers of the tiles that are not empty, in pieces, so that a large map is not in memory
         twice."""

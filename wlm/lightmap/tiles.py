@@ -166,9 +166,8 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
         The N tiles.
 
     Raises:
-        WlmError: A number is outside the grid or given twice, there is none, or gamma is not above 0.
+        WlmError: A number is outside the grid or given twice, or there is none.
     """
-    _check_gamma(gamma)
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 
@@ -267,12 +266,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
     Returns:
         `TileKind` of each tile, `[N]` int64.
 
-    Raises:
-        WlmError: Gamma is not above 0, or the budget is NaN.
     """
-    _check_gamma(gamma)
-    if math.isnan(static_budget_db):
-        raise WlmError("tiles: expected static_budget_db in decibels, got NaN")
     means = channel_means(tiles.colour, tiles.mask)
     kinds = np.empty(len(tiles.index), np.int64)
     for n, valid in enumerate(tiles.mask):
@@ -303,33 +297,6 @@ def check_index(index: np.ndarray, grid: TileGrid) -> None:
         raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
 
 
-def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
-    """Puts tiles together to a map; the inverse of `split`.
-
-    Args:
-        tiles: `[N, 128, 128, C]`, any dtype.
-        index: `[N]`, number of each tile in the grid.
-        grid: The map's.
-        fill: Value of the texels of tiles that are not in `index`.
-
-    Returns:
-        `[H, W, C]`, of the tiles' dtype. Texels past the map's end are dropped.
-
-    Raises:
-        WlmError: Shapes do not fit, or a number is outside the grid or given twice.
-    """
-    tiles = np.asarray(tiles)
-    index = np.asarray(index)
-    if tiles.ndim != 4 or tiles.shape[1:3] != (TILE, TILE) or index.shape != tiles.shape[:1]:
-        raise WlmError(
-            f"tiles: expected tiles [N, {TILE}, {TILE}, C] and N numbers, got {tiles.shape} and {index.shape}"
-        )
-    check_index(index, grid)
-    image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
-    place(image, tiles, index, grid)
-    return image
-
-
 def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGrid) -> None:
     """Writes tiles into a map.
 
@@ -349,11 +316,6 @@ def _whole(valid: np.ndarray) -> np.ndarray:
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask
-
-
-def _check_gamma(gamma: float) -> None:
-    if not (math.isfinite(gamma) and gamma > 0):
-        raise WlmError(f"tiles: expected a finite gamma above 0, got {gamma}")
 
 
 def _half_step(value: np.ndarray) -> np.ndarray:

@@ -193,8 +193,6 @@ class ShownScore(ViewScore):
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
         worst_seen: The tile and time with the lowest one: `psnr`, `time`, `tile` (its number), `row`, `column`.
-        worst_seen_time: The time with the lowest mean: `psnr`, `time`.
-        worst_seen_tile: The tile with the lowest mean: `psnr`, `tile`, `row`, `column`.
         ring: PSNR of the texels of gaps that touch a chart, dB, mean over tiles and times.
         between: PSNR half-way between stored times, dB, mean over tiles and intervals.
         worst_between: The lowest one, as in `worst_seen`; `time` is the middle.
@@ -207,8 +205,6 @@ class ShownScore(ViewScore):
     seen_by_tile: np.ndarray
     seen_by_time: np.ndarray
     worst_seen: dict[str, float | int] | None
-    worst_seen_time: dict[str, float | int] | None
-    worst_seen_tile: dict[str, float | int] | None
     ring: float
     between: float
     worst_between: dict[str, float | int] | None
@@ -301,16 +297,12 @@ class Tally:
         by_time, by_tile = nanmean(self._seen, axis=(1, 2)), nanmean(self._seen, axis=0)
         across, inside = self._border
         border = math.sqrt(across / inside) if inside > 0 else (math.inf if across > 0 else math.nan)
-        hour = _lowest(by_time)
-        worst_time = None if hour is None else {"psnr": float(by_time[hour]), "time": float(lightmaps.times[hour])}
         return ShownScore(
             **vars(NO_VIEWS if self._views is None else self._views.score()),
             seen=float(nanmean(self._seen)),
             seen_by_tile=by_tile,
             seen_by_time=by_time,
             worst_seen=self._place(self._seen, lightmaps.times),
-            worst_seen_time=worst_time,
-            worst_seen_tile=self._place(by_tile[None]),
             ring=float(nanmean(self._rings)),
             between=float(nanmean(self._between)),
             worst_between=self._place(self._between, self._middles),
@@ -393,15 +385,15 @@ class Tally:
             scale = 3 * self._valid.count * metrics.range
             self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
-    def _place(self, psnr: np.ndarray, times: np.ndarray | None = None) -> dict[str, float | int] | None:
+    def _place(self, psnr: np.ndarray, times: np.ndarray) -> dict[str, float | int] | None:
         """Returns the lowest of PSNRs [n, rows, columns] and its place."""
-        lowest = _lowest(psnr)
-        if lowest is None:
+        if np.isnan(psnr).all():
             return None
+        lowest = int(np.nanargmin(psnr))
         index, tile = divmod(lowest, self._grid.count)
         row, column = divmod(tile, self._grid.cols)
-        when = {} if times is None else {"time": float(times[index])}
-        return {"psnr": float(psnr.flat[lowest]), **when, "tile": tile, "row": row, "column": column}
+        place = {"tile": tile, "row": row, "column": column}
+        return {"psnr": float(psnr.flat[lowest]), "time": float(times[index])} | place
 
 
 class _Texels:
@@ -456,8 +448,3 @@ def _psnr(mse: np.ndarray, span: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Returns `psnr_from_mse` of tiles [rows, columns]; NaN if a tile is not counted."""
     pairs = zip(mse.flat, span.flat, counted.flat, strict=True)
     return np.array([psnr_from_mse(m, s) if c else math.nan for m, s, c in pairs]).reshape(mse.shape)
-
-
-def _lowest(psnr: np.ndarray) -> int | None:
-    """Returns the position of the lowest value in the flat array; None if all are NaN."""
-    return None if np.isnan(psnr).all() else int(np.nanargmin(psnr))

@@ -123,10 +123,6 @@ class Encoding(ABC):
             records: float32 [times, tiles, fours, 4], written; the first number of each record is set already.
         """
 
-    @abstractmethod
-    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
-        """Explains why a tile of this kind is stored in this way, in a sentence without a full stop."""
-
 
 def inverse_of(bounds: np.ndarray) -> np.ndarray:
     """Returns 1 / each bound, float32; 0 for the bound 0 of a black tile."""

@@ -258,11 +258,6 @@ class Frames(Encoding):
                 table[numbers, first, :3], table[numbers, first + 1, :3] = sheet.ranges[:, image].swapaxes(0, 1)
                 table[numbers, first, 3] = image
 
-    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
-        if sheet.profile.frames == "auto":
-            return f"{len(sheet.times)} times as BC7 take no more bytes than maps and a network"
-        return f"the setting frames is {sheet.profile.frames}"
-
 
 def _check_modes(blocks: np.ndarray, number: int) -> None:
     if (bc7_modes.block_modes(blocks) == bc7_modes.RESERVED).any():

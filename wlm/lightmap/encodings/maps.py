@@ -515,11 +515,3 @@ class Maps(Encoding):
                 record[1, :3], record[2, :3] = shift * scale, spread * scale
                 code = axis.encode(time).astype(np.float64)[:encoded]
                 record[3 : 3 + wide] = layer[-1] + np.tensordot(code, layer[:-1], 1)
-
-    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
-        if kind == TileKind.DYNAMIC:
-            less = ", and BC7 at each time would take more bytes" if sheet.profile.frames == "auto" else ""
-            return f"the light changes over time{less}"
-        if len(sheet.times) == 1:
-            return "there is one time"
-        return f"one pattern that only changes in brightness has {sheet.profile.static_budget_db:g} dB at all times"
