@@ -386,44 +386,6 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
     return arrays
 
 
-def from_grid(
-    density: wp.Volume,
-    temperature: wp.Volume | None = None,
-    *,
-    extinction: float = 1.0,
-    emission: float = 1.0,
-    name: str = "grid",
-    trust: bool = True,
-    up: str = "y",
-) -> DensityVolume:
-    """Makes a validated volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
-
-    The volume is dense: a march reads eight voxels per sample, each of which would be a traversal of the tree.
-
-    Args:
-        density: A grid of floats.
-        temperature: Another grid, or None.
-        extinction: Extinction per unit of length at density 1.
-        emission: Light emitted per unit of length at temperature 1.
-        name: Name in messages.
-        trust: Whether the box may be large although the grid stores few voxels; false for files of unknown origin.
-        up: "x", "y" or "z", the axis of the grid's world that becomes +y.
-
-    Returns:
-        The volume, repaired as in the module's table.
-
-    Raises:
-        WlmError: An error of the module's table.
-    """
-    grids = {_DENSITY: density} | ({} if temperature is None else {_TEMPERATURE: temperature})
-    parts = []
-    for field, grid in grids.items():
-        stored = grid.array().size
-        most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * stored))
-        parts.append(dense(grid, f"{name}: {grid.get_grid_info().name or field}", most))
-    return _from_parts(parts, up, trust, extinction=extinction, emission=emission, name=name)
-
-
 def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
     """Returns the arrays with bricks expanded to whole fields on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
