@@ -55,14 +55,11 @@ EDGE = 8
 
 
 def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Extracts the bricks in which any of several fields is not 0.
-
-    Args:
-        fields: [X, Y, Z] each, of one shape, on one device.
+    """Extracts the bricks in which any of several fields [X, Y, Z] of one shape is not 0.
 
     Returns:
-        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0 outside
-        the box.
+        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0
+        outside the box.
     """
     margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
     cut = []
@@ -278,11 +275,8 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
     """Writes a volume as `.npz`, atomically; `load_volume` reads it back.
 
-    Args:
-        path: The file.
-        volume: The smoke.
-        bricks: Whether to omit empty bricks instead of compressing everything by deflate: much faster, but the file is
-            larger and other programs cannot read it.
+    With `bricks` empty bricks are omitted instead of compressing everything by deflate: this is much faster, but the
+    file is larger and other programs cannot read it.
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.

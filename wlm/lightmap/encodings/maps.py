@@ -70,9 +70,7 @@ class Reads:
     columns: np.ndarray
 
     @classmethod
-    def of(
-        cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int
-    ) -> Reads:
+    def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
         """Finds the reads of a tile.
 
         Args:
