@@ -6,7 +6,7 @@ Rows of each set, by method:
   3. Size on disk and on a GPU, time of the fit with the writing, errors against the input, decode time of all live
   probes. "pca" is the same for the profile of principal components.
 - "decode": the first profile, with ellipsoids as supports and with the spheres of the paper (eq. 6), which are another
-  fit; and with the points in the order of the file.
+  fit.
 - "fit": the first profile on the first set: speed of the fit; "dense torch": as many steps in plain torch, all of them
   on CUDA, otherwise a few.
 - The rivals of `benchmarks.rivals.probe` at shares of the probes' size as float32, and Unreal's packing, which has one
@@ -40,9 +40,9 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors, expect_alone
 from wlm.errors import WlmError
 from wlm.formats import zstd
-from wlm.probe.between import between_psnr, held_out
-from wlm.probe.data import ProbeSet, load
-from wlm.probe.evaluation import Report, score
+from wlm.metrics import psnr_from_mse
+from wlm.probe.data import ProbeSet, from_arrays, load
+from wlm.probe.evaluation import Report, between_psnr, by_distance, score
 from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.gaussian.decode import GaussianDecoder, Points
@@ -61,6 +61,7 @@ SHARES = (1, 2, 3, 5, 7, 10)
 RATIOS = (0.02, 0.05, 0.10, 0.15, 0.20)
 """Gaussians as a share of the live probes, in a full run: the paper's tables 2 and 3."""
 
+_EVERY = 5  # one in this many live probes is held out
 _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 # A quick fit is worth this many steps of one probe, however many probes there are: some seconds on two CPU cores.
 _QUICK_PROBE_STEPS = 600_000
@@ -244,18 +245,27 @@ class ProbeBench(Bench):
     def held_out_row(self, fit: Fit) -> Row:
         """Returns the row of the light at probes that were left out of the compression."""
         self.note(f"{fit.option}: fitting four fifths of the probes")
-        held = held_out(fit.model, self.probes, device=self.device)
+        live = np.flatnonzero(self.probes.live)
+        out = np.arange(len(live)) % _EVERY == min(_EVERY, len(live)) - 1
+        known, asked = live[~out], live[out]
+        others = from_arrays(self.probes.position[known], self.probes.values[known], name=self.probes.name)
+        fitted = compress(others, fit.model.profile, device=self.device)
+        position, expected = self.probes.position[asked], self.probes.values[asked].astype(np.float64)
+        light = {
+            "psnr": fitted.decoder(self.device).decode(position),
+            "nearest_psnr": by_distance(others, position, 1),
+            "distance_psnr": by_distance(others, position, 8),
+        }
+        peak = float(np.ptp(self.values))
         decoder = fit.model.decoder(self.device, position=self.probes.position)
         return self.row(
             "held out",
             fit.option,
             "PSNR at every fifth probe of a file of the others; beside it that of the uncompressed others",
-            disk_bytes=held.bytes,
-            probes=held.probes,
-            psnr=held.psnr,
-            nearest_psnr=held.nearest,
-            distance_psnr=held.distance,
+            disk_bytes=fitted.file_bytes(),
+            probes=len(asked),
             half_way_psnr=between_psnr(decoder, self.probes),
+            **{name: psnr_from_mse(float(np.square(each - expected).mean()), peak) for name, each in light.items()},
         )
 
     def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
@@ -266,7 +276,6 @@ class ProbeBench(Bench):
         ways = {
             "sphere": (GaussianDecoder(spheres, self.device), sphere_exact),
             "exact": (GaussianDecoder(model, self.device), exact),
-            "exact, given order": (GaussianDecoder(model, self.device), exact),
         }
         return [self._way(fit, option, *way) for option, way in ways.items()]
 
@@ -274,8 +283,6 @@ class ProbeBench(Bench):
         self, fit: Fit, option: str, decoder: GaussianDecoder, exact: np.ndarray
     ) -> tuple[Row, Callable[[], object]]:
         points = decoder.points(self.position)
-        if option == "exact, given order":
-            _in_given_order(points)
         report, errors = self._decode(decoder, points, exact, fit.bytes)
         spheres = " with the spheres of eq. 6" if option == "sphere" else ""
         row = self.row(
@@ -385,14 +392,6 @@ def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:
     return sizes | {"share_of_float32": gpu_bytes / (4 * report.probes * report.outputs), "psnr": report.psnr}
 
 
-def _in_given_order(points: Points) -> None:
-    """Puts points back in the order in which they were given, in which neighbours may lie far apart."""
-    x = np.empty((len(points.order), 3), np.float32)
-    x[points.order] = points.x.numpy()
-    points.x = wp.array(x, dtype=wp.vec3, device=points.x.device)
-    points.order = np.arange(len(x))
-
-
 def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
     """Measures walks with the original probes and with each model, each from an empty volume.
 
@@ -440,7 +439,7 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
         views: Number of pictures, at least one.
     """
     bench.note(f"{views} views of balls")
-    decoded = model.decoder(bench.device).decode_probes(probes.position)
+    decoded = model.decoder(bench.device, position=probes.position).decode_probes()
     try:
         scores = score_views(probes, decoded, views=views, device=bench.device)
     except WlmError as error:  # no spherical harmonics

@@ -82,7 +82,7 @@ def run(out: Path, data: Path, device: str) -> dict[str, float]:
     probes = wlm.probe.load(data / "probes.npz", key=KEY)
     path = out / "cornell_probes.wlm"
     probe_size = wlm.probe.compress(probes, device=device).save(path)
-    values = wlm.load(path).decoder(device, position=probes.position).decode_probes(probes.position)
+    values = wlm.load(path).decoder(device, position=probes.position).decode_probes()
     score = wlm.probe.score(values, probes, probe_size)
     lap("fit probes")
     atomic_write(out / "cornell_report.json", (json.dumps(report.to_json(), indent=1) + "\n").encode())

@@ -54,8 +54,8 @@ def run(out: Path, device: str) -> dict[str, float]:
     lap("fit")
     # From here on only the file is used, and the positions, which an engine has.
     model = wlm.load(path)
-    decoder = model.decoder(device)
-    decoded = decoder.decode_probes(probes.position)
+    decoder = model.decoder(device, position=probes.position)
+    decoded = decoder.decode_probes()
     wlm.probe.save_probes(out / "street_decoded.npz", probes.position, decoded)
     lap("decode")
     report = wlm.probe.score(decoded, probes, size)

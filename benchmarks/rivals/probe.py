@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.rivals import probe_mbd, probe_pca
 from benchmarks.rivals.rival import Rival, measure
 from wlm.errors import WlmError
-from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
+from wlm.probe.engines.unreal import RANGE, ambient_colour, packed
 
 # Bits of a weight that `at_bytes` tries; None for half floats. Below 4 bits the rounding error dominates.
 WEIGHT_BITS = (4, 5, 6, 8, 10, None)
@@ -122,6 +122,23 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
         lambda payload: unpack_unreal(payload, width, bands),
         option=lambda payload: f"L{bands - 1}",
     )
+
+
+def pack_unreal(values: np.ndarray, bands: int) -> bytes:
+    """Packs the first bands of probes [N, D]: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
+    ambient, level = packed(np.asarray(values, np.float64).reshape(len(values), -1, 3)[:, : bands**2])
+    return ambient.tobytes() + level.tobytes()
+
+
+def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
+    """Unpacks the result of `pack_unreal`, float32 [N, D] with D = `width`; zero beyond the stored bands."""
+    probes = len(payload) // (4 + 3 * (bands**2 - 1))
+    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
+    colour = ambient_colour(np.frombuffer(payload, "<u4", probes))
+    sh = np.zeros((probes, width // 3, 3), np.float32)
+    sh[:, 0] = colour
+    sh[:, 1 : bands**2] = ((level / 127.5 - 1.0) * colour[:, :, None] * RANGE[: bands**2 - 1]).transpose(0, 2, 1)
+    return sh.reshape(probes, width)
 
 
 def at_bytes(

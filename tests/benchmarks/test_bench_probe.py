@@ -43,7 +43,7 @@ def rows(sets):
 
 def test_every_row_has_its_figures(rows):
     ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20")]
-    ways = ["sphere", "exact", "exact, given order"]
+    ways = ["sphere", "exact"]
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
     rivals = [(name, size) for size in ("5%", "10%") for name in RIVALS] + [("Unreal packing", "")]
     held = [("held out", "standard")]

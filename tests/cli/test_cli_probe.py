@@ -97,9 +97,10 @@ def decoded(path, *words):
 
 @pytest.mark.parametrize("suffix", [".npz", ".json"])
 def test_decode_at_the_probes(suffix, fitted, carrying, room, tmp_path):
-    probes, decoder = data.load(room), wlm.load(fitted).decoder()
+    probes = data.load(room)
+    decoder = wlm.load(fitted).decoder(position=probes.position)
     light = decoded(tmp_path / f"a{suffix}", fitted, "--positions", room)
-    np.testing.assert_array_equal(light.values, decoder.decode_probes(probes.position))
+    np.testing.assert_array_equal(light.values, decoder.decode_probes())
     np.testing.assert_array_equal(light.position, probes.position)
     assert np.count_nonzero(~light.live) == DEAD
     stored = decoded(tmp_path / f"b{suffix}", carrying)
@@ -128,7 +129,7 @@ def test_decode_in_an_engines_convention(fitted, room, tmp_path):
     assert "the probes" in text and f"{PROBES}" in text
     with np.load(tmp_path / "a.npz") as arrays:
         assert arrays["convention"] == "unity"
-    expected = wlm.load(fitted).decoder().decode_probes(data.load(room).position)
+    expected = wlm.load(fitted).decoder(position=data.load(room).position).decode_probes()
     np.testing.assert_allclose(data.load(tmp_path / "a.npz").values, expected, rtol=1e-5, atol=1e-6)
 
 

@@ -236,3 +236,12 @@ def test_a_disk_that_fills_while_writing_leaves_what_was_there(tmp_path, capfd, 
     with pytest.raises(WlmError, match="does not exist"):
         write_exr(tmp_path / "none" / "a.exr", pixels)
     assert capfd.readouterr() == ("", "")
+
+
+def test_planes_of_several_shapes_and_types(tmp_path):
+    for planes in ({"a": np.ones((2, 2)), "b": np.ones((2, 3))}, {}):
+        with pytest.raises(ValueError, match="one shape"):
+            write_planes(tmp_path / "a.exr", planes)
+    write_planes(tmp_path / "a.exr", {"a": np.full((1, 1), 1e9), "b": np.full((1, 1), 1e9)}, whole=("b",))
+    planes, note = read_planes(tmp_path / "a.exr")
+    assert planes["a"] == HALF_MAX and planes["b"] == np.float32(1e9) and note == {}

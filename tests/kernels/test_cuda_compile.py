@@ -19,7 +19,7 @@ from wlm_kernels.lightmap import matrix_decode
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.frames import KERNELS as FRAMES
 from wlm_kernels.probe import decode as probe_decode
-from wlm_kernels.probe import gaussian_sum, optimiser
+from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.smoke import (
@@ -121,8 +121,7 @@ def test_frames(tmp_path: Path):
 @pytest.mark.parametrize("latent", _slow_but(9, [1, 12, 32]))
 def test_gaussians(latent: int, tmp_path: Path):
     """A training step's sum of Gaussians, and the update."""
-    _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path / "step")
-    _compile_all([optimiser.update_kernel(latent)], tmp_path / "update")
+    _compile_all(vars(probe_step.step_kernels(latent, "cuda")).values(), tmp_path)
 
 
 @pytest.mark.slow

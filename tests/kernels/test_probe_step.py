@@ -10,7 +10,7 @@ from reference import gaussians as reference
 
 from kernels.compare import array, close
 from wlm.ops import plain
-from wlm_kernels.probe import gaussian_sum, optimiser
+from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
 from wlm_kernels.probe.step import GROUP, SPLITS
@@ -231,7 +231,7 @@ class Training:
         self.control = wp.zeros(1, dtype=int, device=device)
         self._moments = wp.zeros((4, *self.step.rows.shape), dtype=float, device=device)
         self._net_moments = wp.zeros((2, NET), dtype=float, device=device)
-        o = self.optimiser = optimiser.Optimiser()
+        o = self.optimiser = probe_step.Optimiser()
         o.control, o.net_rate, o.adan, o.move, o.keep = self.control, NET_RATE, adan, 1, 0
         o.schedule, o.rates = array(SCHEDULE, float, device), array(RATES, float, device)
         o.bounds = self.step.bounds

@@ -65,7 +65,9 @@ def test_the_models_own_probes(device):
     decoder = GaussianDecoder(model, device)
     decoded = decoder.decode_probes()
     assert decoded.shape == (200, 27) and (decoded[model.dead] == 0).all() and (decoded[~model.dead] != 0).any(1).all()
-    np.testing.assert_array_equal(decoder.decode_probes(model.stored_positions()), decoded)
+    np.testing.assert_array_equal(
+        GaussianDecoder(model, device, position=model.stored_positions()).decode_probes(), decoded
+    )
     # The order of the points on the device does not show in the result.
     turned = decoder.decode(model.stored_positions()[::-1])[::-1]
     np.testing.assert_array_equal(turned[~model.dead], decoded[~model.dead])
@@ -76,7 +78,7 @@ def test_wrong_positions():
     with pytest.raises(WlmError, match="random: the file stores no positions"):
         decoder.decode_probes()
     with pytest.raises(WlmError, match="expected the positions of its own 200 probes"):
-        decoder.decode_probes(np.zeros((7, 3)))
+        GaussianDecoder(random_model(), position=np.zeros((7, 3)))
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
     with pytest.raises(WlmError, match="position 2: expected finite"):

@@ -1,27 +1,16 @@
-"""What an engine gets: numbers that decode to the same light with NumPy alone, and a shader that does the same."""
+"""The export for an engine: its numbers decode to the same light with NumPy alone."""
 
 import itertools
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from builders.exported import read_export
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
+from probe.test_shaders import SHAPES
 
 from wlm.errors import WlmError
 from wlm.export import export
-from wlm.probe.gaussian.shader import probe_glsl
-
-SHAPES = [
-    {},
-    {"support": "sphere"},
-    {"latent": 1, "hidden": 8, "bits": 4, "outputs": 3},
-    {"latent": 4, "outputs": 5, "count": 1},
-    {"turn": 0.0},
-    {"latent": 13, "hidden": 24, "bits": 16, "outputs": 12, "probes": 7},
-]
 
 
 def sigmoid(x):
@@ -173,161 +162,3 @@ def test_what_cannot_be_exported(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(WlmError, match="cannot write there"):
         export(model, tmp_path / "file")
-
-
-CALLER = """
-layout(local_size_x = 64) in;
-layout(std430, binding = 3) readonly buffer Lists { uint lists[]; };
-layout(std430, binding = 4) buffer Results { float results[]; };
-#define WLM_PROBE_LIST(i) lists[i]
-%s
-void main()
-{
-    int i = int(gl_GlobalInvocationID.x);
-    vec3 position = vec3(float(i), 0.5, 0.25);
-    float values[WLM_PROBE_OUTPUTS];
-    wlm_probe_values_listed(wlm_probe_place(position), 8, 4, values);
-    for (int c = 0; c < WLM_PROBE_OUTPUTS; ++c)
-        results[c] = values[c];
-    %s
-}
-"""
-SH_CALLER = """vec3 sh[%d];
-    wlm_probe_sh(position, sh);
-    results[0] += sh[0].x;
-    wlm_probe_sh_listed(position, 0, 2, sh);
-    results[0] += sh[0].y;"""
-
-
-@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
-@pytest.mark.parametrize("settings", SHAPES, ids=str)
-@pytest.mark.parametrize(("version", "options"), [(430, []), (450, ["-V", "-o", "shader.spv"])])
-def test_the_shader_compiles(settings, version, options, tmp_path):
-    model = random_model(**settings)
-    sh = SH_CALLER % (model.outputs // 3) if model.outputs % 3 == 0 else ""
-    (tmp_path / "shader.comp").write_text(f"#version {version}\n" + CALLER % (probe_glsl(model.content), sh))
-    done = subprocess.run(["glslangValidator", *options, "shader.comp"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
-
-
-def test_the_shader_depends_on_the_shape_alone():
-    assert probe_glsl(random_model(seed=0).content) == probe_glsl(random_model(seed=1, count=9, bits=7).content)
-    assert probe_glsl(random_model().content) != probe_glsl(random_model(support="sphere").content)
-
-
-# GLSL's vectors and functions for a C++ compiler, in single precision as a GPU has it.
-SHIM = """
-#include <cmath>
-#include <cstdint>
-#include <cstdio>
-#include <cstring>
-#include <vector>
-typedef uint32_t uint;
-struct vec2 { float x, y; };
-struct vec3 { float x, y, z; vec3() {} vec3(float x, float y, float z) : x(x), y(y), z(z) {} };
-struct vec4 { float x, y, z, w; vec4() {} vec4(float x, float y, float z, float w) : x(x), y(y), z(z), w(w) {}
-    float& operator[](int i) { return (&x)[i]; } };
-struct mat4 { vec4 c[4]; mat4(vec4 a, vec4 b, vec4 d, vec4 e) { c[0] = a; c[1] = b; c[2] = d; c[3] = e; } };
-vec3 operator*(float s, vec3 a) { return vec3(s * a.x, s * a.y, s * a.z); }
-vec3 operator+(vec3 a, vec3 b) { return vec3(a.x + b.x, a.y + b.y, a.z + b.z); }
-vec3 operator-(vec3 a, vec3 b) { return vec3(a.x - b.x, a.y - b.y, a.z - b.z); }
-vec3 operator/(vec3 a, vec3 b) { return vec3(a.x / b.x, a.y / b.y, a.z / b.z); }
-vec3 operator/(vec3 a, float s) { return vec3(a.x / s, a.y / s, a.z / s); }
-vec4 operator*(vec4 a, float s) { return vec4(a.x * s, a.y * s, a.z * s, a.w * s); }
-vec4 operator+(vec4 a, vec4 b) { return vec4(a.x + b.x, a.y + b.y, a.z + b.z, a.w + b.w); }
-vec4 operator-(vec4 a) { return vec4(-a.x, -a.y, -a.z, -a.w); }
-vec4 operator/(vec4 a, vec4 b) { return vec4(a.x / b.x, a.y / b.y, a.z / b.z, a.w / b.w); }
-void operator+=(vec4& a, vec4 b) { a = a + b; }
-vec4 operator*(mat4 m, vec4 v) { return m.c[0] * v.x + m.c[1] * v.y + m.c[2] * v.z + m.c[3] * v.w; }
-float dot(vec3 a, vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-vec3 cross(vec3 a, vec3 b)
-{ return vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x); }
-float exp(float x) { return std::exp(x); }
-float sqrt(float x) { return std::sqrt(x); }
-float min(float a, float b) { return b < a ? b : a; }
-float max(float a, float b) { return a < b ? b : a; }
-vec4 exp(vec4 a) { return vec4(exp(a.x), exp(a.y), exp(a.z), exp(a.w)); }
-vec4 min(vec4 a, vec4 b) { return vec4(min(a.x, b.x), min(a.y, b.y), min(a.z, b.z), min(a.w, b.w)); }
-float clamp(float x, float a, float b) { return min(max(x, a), b); }
-vec3 clamp(vec3 x, vec3 a, vec3 b) { return vec3(clamp(x.x, a.x, b.x), clamp(x.y, a.y, b.y), clamp(x.z, a.z, b.z)); }
-float uintBitsToFloat(uint u) { float f; std::memcpy(&f, &u, 4); return f; }
-float half(uint h)
-{
-    int exponent = h >> 10 & 31, mantissa = h & 1023;
-    float f = exponent ? std::ldexp(1024.0f + mantissa, exponent - 25) : std::ldexp(float(mantissa), -24);
-    return h >> 15 ? -f : f;
-}
-vec2 unpackHalf2x16(uint u) { return vec2{half(u & 65535), half(u >> 16)}; }
-std::vector<uint> gaussians, network, lists;
-#define WLM_PROBE_GAUSSIANS(i) gaussians[i]
-#define WLM_PROBE_NETWORK(i) network[i]
-#define WLM_PROBE_LIST(i) lists[i]
-#define inout
-#define out
-#include "probe.glsl"
-#undef out
-void read(std::vector<uint>& to, const char* path)
-{
-    FILE* file = fopen(path, "rb");
-    uint word;
-    while (fread(&word, 4, 1, file) == 1) to.push_back(word);
-    fclose(file);
-}
-// Positions on stdin; for each the values from all Gaussians, then those from a list of the odd and one of the even.
-int main(int, char** argument)
-{
-    read(gaussians, argument[1]);
-    read(network, argument[2]);
-    int count = wlm_probe_count();
-    for (int k = 1; k < count; k += 2) lists.push_back(k);
-    int odd = lists.size();
-    for (int k = 0; k < count; k += 2) lists.push_back(k);
-    float p[3], values[WLM_PROBE_OUTPUTS];
-    while (fread(p, 4, 3, stdin) == 3) {
-        vec3 position(p[0], p[1], p[2]);
-        for (int kind = 0; kind < 3; ++kind) {
-#ifdef COEFFICIENTS
-            vec3 sh[COEFFICIENTS];
-            if (kind == 0) wlm_probe_sh(position, sh);
-            else wlm_probe_sh_listed(position, kind == 1 ? 0 : odd, kind == 1 ? odd : count - odd, sh);
-            for (int c = 0; c < COEFFICIENTS; ++c)
-            { values[3 * c] = sh[c].x; values[3 * c + 1] = sh[c].y; values[3 * c + 2] = sh[c].z; }
-#else
-            vec3 x = wlm_probe_place(position);
-            if (kind == 0) wlm_probe_values(x, values);
-            else wlm_probe_values_listed(x, kind == 1 ? 0 : odd, kind == 1 ? odd : count - odd, values);
-#endif
-            fwrite(values, 4, WLM_PROBE_OUTPUTS, stdout);
-        }
-    }
-}
-"""
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
-@pytest.mark.parametrize("settings", SHAPES, ids=str)
-def test_the_shaders_arithmetic(settings, tmp_path):
-    model = random_model(**settings)
-    folder = tmp_path / "export"
-    export(model, folder)
-    (tmp_path / "run.cpp").write_text(SHIM)
-    program = tmp_path / "run"
-    shape = [f"-DCOEFFICIENTS={model.outputs // 3}"] if model.outputs % 3 == 0 else []
-    done = subprocess.run(
-        ["g++", "-O1", "-std=c++14", *shape, "-I", folder, "-o", program, tmp_path / "run.cpp"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    files = Files(folder)
-    position = np.concatenate([places(), read_export(folder)[1]["position"]]).astype(np.float32)
-    words = [program, folder / "gaussians.bin", folder / "network.bin"]
-    out = subprocess.run(words, input=position.tobytes(), capture_output=True, check=True).stdout
-    values = np.frombuffer(out, np.float32).reshape(len(position), 3, model.outputs)
-    x, latent = files.place(position.astype(np.float64)), files.latent
-    for kind, chosen in enumerate((slice(None), slice(1, None, 2), slice(0, None, 2))):
-        files.latent = np.zeros_like(latent)
-        files.latent[chosen] = latent[chosen]
-        expected = files.values(position.astype(np.float64))
-        np.testing.assert_allclose(values[:, kind], expected, rtol=0, atol=2e-5 * np.abs(expected).max())
-    assert files.weights(x).any()

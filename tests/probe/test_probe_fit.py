@@ -12,8 +12,7 @@ from wlm.probe.data import from_arrays, save_probes
 from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import compress, open_checkpoint
 from wlm.probe.gaussian import trainer as training
-from wlm.probe.gaussian.start import first_gaussians, local_spread
-from wlm.probe.gaussian.trainer import Trainer
+from wlm.probe.gaussian.trainer import Trainer, first_gaussians, local_spread
 from wlm.probe.model import Profile, box_of
 from wlm.probe.morton import morton_order
 
@@ -129,8 +128,8 @@ HARD = {
 def test_hard_sets(kind, tmp_path):
     probes = from_arrays(*HARD[kind])
     compress(probes, SMALL, steps=240, ratio=0.5, positions=True).save(tmp_path / "a.wlm")
-    decoder = wlm.load(tmp_path / "a.wlm").decoder()
-    decoded = decoder.decode_probes(probes.position)
+    back = wlm.load(tmp_path / "a.wlm")
+    decoded = back.decoder(position=probes.position).decode_probes()
     assert decoded.shape == probes.values.shape and np.isfinite(decoded).all()
     assert (decoded[~probes.live] == 0).all()
     live = probes.values[probes.live].astype(np.float64)
@@ -140,7 +139,7 @@ def test_hard_sets(kind, tmp_path):
     assert error <= mean * 1.05 + 2e-3 * np.abs(live).max()
     if kind == "coincident":
         assert np.ptp(decoded, axis=0).max() == 0
-    np.testing.assert_allclose(decoder.decode_probes(), decoded, rtol=0, atol=0.3 * np.abs(live).max())
+    np.testing.assert_allclose(back.decoder().decode_probes(), decoded, rtol=0, atol=0.3 * np.abs(live).max())
 
 
 def test_more_gaussians_than_places_are_not_made():

@@ -10,11 +10,12 @@ import pytest
 from builders.probe_models import random_model
 
 import wlm
+from benchmarks.rivals.probe import pack_unreal, unpack_unreal
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.probe.conventions import from_canonical
 from wlm.probe.engines.lattice import lattice_of
-from wlm.probe.engines.unreal import SH_FILES, pack_unreal, unpack_unreal
+from wlm.probe.engines.unreal import SH_FILES
 from wlm.probe.sphere import fibonacci_sphere, irradiance
 
 FILES = ("ambient.dds", *SH_FILES)

@@ -107,9 +107,6 @@ def evaluate(
         int, typer.Option(help="Number of pictures of balls, and of --mesh, under the light to score; 0 for none.")
     ] = 0,
     mesh: SceneFile = None,
-    hold_out: Annotated[
-        bool, typer.Option("--hold-out", help="Fit four fifths of the probes again and score the light at the others.")
-    ] = False,
     key: Key = None,
     convention: _Convention = None,
     device: Device = "cpu",
@@ -127,7 +124,7 @@ def evaluate(
     note_warnings(probes.warnings)
     with running("evaluate") as progress:
         size = file.stat().st_size
-        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size, hold_out=hold_out)
+        report = evaluate(model, probes, device=device, progress=progress, file_bytes=size)
     if not probes.source.startswith(model.source):
         note(f"warning: {probes_path}: not the input of {file}; another key, convention or file?")
     pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
@@ -233,11 +230,6 @@ def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     rows.add_section()
     if report.between_psnr is not None:
         rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
-    if report.held_out is not None:
-        held = report.held_out
-        rows.add_row(f"{held.probes:,} probes left out of a fit", number(held.psnr, ".2f"), "", "", f"{held.bytes:,}")
-        rows.add_row("  nearest uncompressed probe there", number(held.nearest, ".2f"))
-        rows.add_row("  8 uncompressed probes by distance", number(held.distance, ".2f"))
     show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe

@@ -262,16 +262,12 @@ def _layer_psnr(reports: dict[Sheet, SheetReport], layer: str) -> float:
 
 
 def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.ndarray) -> float:
-    """Computes the PSNR of one lightmap of a sheet, dB: `SheetReport.psnr_by_time` of its hour.
+    """Computes the mean PSNR over the tiles of one lightmap of a sheet, dB: `SheetReport.psnr_by_time` of its hour.
 
     Args:
-        model: The sheet's model.
-        lightmaps: The input, of the model's size.
+        model, lightmaps: The sheet and its input, of one size.
         number: Number of the lightmap in the sheet.
         decoded: float32 [H, W, 3], the decoded map at its hour.
-
-    Returns:
-        The mean over the tiles; NaN if none has a score.
     """
     mask, name = lightmaps.mask & _stored(model), f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
@@ -281,18 +277,8 @@ def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
     """Looks for fireflies that a fit lost: tiles whose light is in few texels are decoded at their times.
 
-    `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB.
-
-    Args:
-        model: The model.
-        lightmaps: The input.
-        device: Device that decodes.
-
-    Returns:
-        Lines with the number of texels and the largest loss.
-
-    Raises:
-        WlmError: As for `evaluate`.
+    `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB. The lines
+    have the number of texels and the largest loss.
     """
     lines = []
     for sheet, own in model.sheets.items():
@@ -336,9 +322,6 @@ def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
         model: The sheet's model.
         mask: Valid texels of the input, bool [H, W].
         size: Bytes.
-
-    Raises:
-        WlmError: The model holds no tile.
     """
     return size * 8 / (_area(model, mask) * len(model.times))
 
@@ -368,9 +351,6 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
 
     Returns:
         bool [H, W], the valid texels of stored tiles: the texels that are scored.
-
-    Raises:
-        WlmError: As for `evaluate`.
     """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):

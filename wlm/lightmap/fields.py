@@ -22,18 +22,10 @@ def read_set(path: Path) -> dict[str, Any]:
 
 
 def field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
-    """Returns the value of a field.
-
-    Args:
-        path: The file.
-        holder: The object with the field.
-        key: Name of the field.
-        place: Place of the object in the file, for messages: `lightmaps[0].`.
-        ok: Returns whether a value is right.
-        expected: Description of right values.
+    """Returns the value of a field of an object at a place of the file, such as `lightmaps[0].`, if `ok` accepts it.
 
     Raises:
-        WlmError: The field is missing or wrong.
+        WlmError: The field is missing or wrong; the line names the place, the key and the expected values.
     """
     if key not in holder:
         raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")

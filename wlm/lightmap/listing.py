@@ -116,15 +116,9 @@ def list_set(
 ) -> Listing:
     """Lists a set, as `wlm.lightmap.load` describes.
 
-    Args:
-        path: The `set.json` or the folder.
-        times: A time for each state, replacing those of the set.
-        layers: Names of the layers to read; None reads all.
-        trust: Whether a `set.json` may name files outside its folder.
-
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, or the states do not have the same pictures; the message names the file and the field.
+            many states, or the states do not have the same pictures.
     """
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE

@@ -123,7 +123,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
     raw = reader(path, key)
     stated = raw.convention if convention is None else convention
-    return _check(str(path), path.stem, raw.position, raw.values, raw.key, stated, raw.beside)
+    return _check(str(path), path.stem, raw, stated)
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
@@ -183,7 +183,7 @@ def from_arrays(
     """
     beside = {_NORMAL: normal, _VALID: valid}
     beside = {field: np.asarray(array) for field, array in beside.items() if array is not None}
-    return _check(name, name, np.asarray(position), np.asarray(values), key, convention, beside)
+    return _check(name, name, _Raw(np.asarray(position), np.asarray(values), key, convention, beside), convention)
 
 
 def save_probes(
@@ -316,17 +316,9 @@ def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.nda
         raise WlmError(f"{where}: {error}") from error
 
 
-def _check(
-    where: str,
-    name: str,
-    position: np.ndarray,
-    values: np.ndarray,
-    key: str,
-    convention: str,
-    beside: Mapping[str, np.ndarray],
-) -> ProbeSet:
+def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
     """Checks and repairs the content of a file."""
-    position = _check_positions(where, position)
+    position, values, key, beside = _check_positions(where, raw.position), raw.values, raw.key, raw.beside
     count = len(position)
     if values.dtype.kind not in "iuf":
         raise WlmError(f"{where}: {key}: expected numbers, got {values.dtype}")
@@ -355,11 +347,11 @@ def _check(
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
     if _VALID in beside:
-        checked[~_check_valid(where, _VALID, beside[_VALID], count)] = 0.0
+        checked[~_check_valid(where, beside[_VALID], count)] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
-    normal = _check_normal(where, _NORMAL, beside[_NORMAL], count) if _NORMAL in beside else None
+    normal = _check_normal(where, beside[_NORMAL], count) if _NORMAL in beside else None
 
     warnings = []
     broken = np.flatnonzero(~finite)
@@ -417,22 +409,22 @@ def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _check_valid(where: str, field: str, valid: np.ndarray, count: int) -> np.ndarray:
+def _check_valid(where: str, valid: np.ndarray, count: int) -> np.ndarray:
     """Returns the valid ones of `count` probes, bool [N], for `valid` [N] of true or false or of 0 to 1."""
-    _check_field(where, field, valid, "biuf", (count,))
+    _check_field(where, _VALID, valid, "biuf", (count,))
     bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
     if len(bad):
-        raise WlmError(f"{where}: {field}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
+        raise WlmError(f"{where}: {_VALID}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
     return valid >= 0.5
 
 
-def _check_normal(where: str, field: str, normal: np.ndarray, count: int) -> np.ndarray:
+def _check_normal(where: str, normal: np.ndarray, count: int) -> np.ndarray:
     """Returns the unit normals of `count` probes, float64 [N, 3]; normals of length 0 stay 0."""
-    _check_field(where, field, normal, "iuf", (count, 3))
+    _check_field(where, _NORMAL, normal, "iuf", (count, 3))
     normal = normal.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(normal).all(1))
     if len(bad):
-        raise WlmError(f"{where}: {field}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
+        raise WlmError(f"{where}: {_NORMAL}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
     # Divided by the largest number first, since squares of very long or short vectors do not fit float64.
     normal = _divided(normal, np.abs(normal).max(1, keepdims=True))
     return _divided(normal, np.linalg.norm(normal, axis=1, keepdims=True))

@@ -56,28 +56,19 @@ class Decoder(ABC):
         """
 
     @abstractmethod
-    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
-        """Computes the light of the model's own probes.
-
-        Args:
-            position: [N, 3], in the order of the fit; None: `own_positions`, if the method needs any.
-
-        Returns:
-            float32 [N, D], zero where a probe is dead.
+    def decode_probes(self) -> np.ndarray:
+        """Computes the light of the model's own probes, float32 [N, D], zero where a probe is dead.
 
         Raises:
-            WlmError: The positions are not those of the model's probes, or none are stored and the model needs them.
+            WlmError: The method needs the positions of the probes, and there are none.
         """
 
     @abstractmethod
     def light(self, position: np.ndarray) -> Light:
-        """Returns the light of the model's own probes for a volume, decoded on demand.
-
-        Args:
-            position: [N, 3], of all probes, in the order of the fit; Gaussians can be decoded at any other points too.
+        """Returns the light of probes at positions [N, 3] for a volume, decoded on demand.
 
         Raises:
-            WlmError: The positions are not those of the model's probes, or a position is not finite.
+            WlmError: A position is not finite, or the model is not of Gaussians and these are not its own probes.
         """
 
     def own_positions(self) -> np.ndarray:

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
 from wlm.metrics import LostLight, psnr_from_mse
-from wlm.probe.between import HeldOut, between_psnr, held_out
 from wlm.probe.data import ProbeSet
+from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
 from wlm.system import Meter, OnProgress
@@ -22,6 +23,7 @@ from wlm.system import Report as BaseReport
 NORMALS = 32
 """Number of normals: the mean square of any L2 irradiance over them is within 6% of that over the sphere, 0.3 dB."""
 
+_NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
 
@@ -42,16 +44,14 @@ class Report(BaseReport):
         peak: Range of the input's coefficients.
         psnr: PSNR over all coefficients of all probes.
         psnr_live: PSNR over the live probes; the others decode to zero exactly.
-        mse, mean_abs_error, max_abs_error: Errors over all coefficients of all probes.
+        mse, max_abs_error: Errors over all coefficients of all probes.
         worst_probe: The probe of the largest mean squared error: `probe` (its index), `psnr` and `position`; None if
             all are exact.
         psnr_by_band: PSNR of each SH band over all probes and RGB.
-        psnr_by_coefficient: PSNR of each number, float64 [D], over all probes.
         irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
             range of the input's irradiance there.
         warnings: Lost light that the means hide.
-        between_psnr: PSNR half-way between probes, see `wlm.probe.between`; None if it was not computed.
-        held_out: Score at probes that a second fit left out; None if it was not computed.
+        between_psnr: The result of `between_psnr`; None if it was not computed.
     """
 
     name: str
@@ -65,15 +65,12 @@ class Report(BaseReport):
     psnr: float
     psnr_live: float
     mse: float
-    mean_abs_error: float
     max_abs_error: float
     worst_probe: dict[str, Any] | None
     psnr_by_band: list[float] | None
-    psnr_by_coefficient: np.ndarray
     irradiance_psnr: float | None
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
-    held_out: HeldOut | None = None
     gpu_bytes: int = 0
 
 
@@ -84,7 +81,6 @@ def evaluate(
     device: str = "cpu",
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
-    hold_out: bool = False,
 ) -> Report:
     """Decodes a model at its probes and compares the result with the input.
 
@@ -94,7 +90,6 @@ def evaluate(
         device: Where the model is decoded.
         progress: Called after the decode and at the end.
         file_bytes: Size of the model's file; None: the size that `model.save` would write.
-        hold_out: Whether to fit four fifths of the probes once more and score the light at the others.
 
     Returns:
         The report.
@@ -115,7 +110,6 @@ def evaluate(
         report,
         warnings=lost.warnings(probes.name, "probe", "the set"),
         between_psnr=between_psnr(decoder, probes),
-        held_out=held_out(model, probes, device=device, progress=progress) if hold_out else None,
         gpu_bytes=model.content.nbytes,
     )
     meter.report(2, PSNR_dB=report.psnr)
@@ -158,11 +152,11 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
 
     by_probe = np.empty(count)  # mean squared error
     by_coefficient = np.zeros(outputs)  # sum of squares
-    absolute, largest = 0.0, 0.0
+    largest = 0.0
     for start in range(0, count, _ROWS):
         rows = slice(start, start + _ROWS)
         error = np.abs(decoded[rows].astype(np.float64) - values[rows])
-        absolute, largest = absolute + float(error.sum()), max(largest, float(error.max()))
+        largest = max(largest, float(error.max()))
         error *= error
         by_probe[rows] = error.mean(axis=1)
         by_coefficient += error.sum(axis=0)
@@ -187,11 +181,9 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         psnr=psnr_from_mse(mse, peak),
         psnr_live=psnr_from_mse(by_probe[live].mean(), peak) if live.any() else math.nan,
         mse=mse,
-        mean_abs_error=absolute / (count * outputs),
         max_abs_error=largest,
         worst_probe=_worst(by_probe, probes.position, peak),
         psnr_by_band=by_band,
-        psnr_by_coefficient=np.array([psnr_from_mse(error, peak) for error in by_coefficient]),
         irradiance_psnr=None if coefficients is None else _irradiance_psnr(decoded[live], values[live], coefficients),
     )
 
@@ -216,3 +208,35 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
         low, high = min(low, float(exact.min())), max(high, float(exact.max()))
         total += float(np.square(predicted - exact).sum())
     return psnr_from_mse(total / (len(values) * NORMALS * 3), high - low)
+
+
+def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
+    """Scores decoded light half-way from each live probe to its nearest neighbour, where no bake exists.
+
+    Args:
+        decoder: A decoder that has the positions of its probes.
+        probes: The input.
+
+    Returns:
+        PSNR in dB against the eight nearest probes of the input, weighted by the inverse square of their distance; the
+        peak is the range of the live probes. NaN for fewer than two live probes.
+    """
+    place, values = probes.position[probes.live], probes.values[probes.live]
+    if len(place) < 2:
+        return float("nan")
+    nearest = cKDTree(place).query(place, k=2)[1][:, 1]
+    middle = 0.5 * (place + place[nearest])
+    error = decoder.decode(middle) - by_distance(probes, middle, _NEAREST)
+    return psnr_from_mse(float(np.square(error).mean()), float(np.ptp(values)))
+
+
+def by_distance(probes: ProbeSet, position: np.ndarray, count: int) -> np.ndarray:
+    """Interpolates the nearest live probes at points [M, 3] with weights 1 / distance^2; float64 [M, D]."""
+    place, values = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
+    count = min(count, len(place))
+    distance, index = cKDTree(place).query(position, k=np.arange(1, count + 1))
+    # A probe at the point itself takes all of the weight.
+    least = np.maximum(distance[:, :1], np.finfo(np.float64).tiny)
+    weight = np.square(least / np.maximum(distance, least * 1e-9))
+    weight /= weight.sum(1, keepdims=True)
+    return (values[index] * weight[..., None]).sum(1)

@@ -54,24 +54,13 @@ class NetworkKernels:
     """The network of one shape on one kind of device.
 
     Attributes:
-        latent: L.
-        hidden: H, units of both hidden layers.
-        outputs: D.
         device_kind: "cpu" or "cuda".
         probes: Probes per block of threads on CUDA.
     """
 
-    latent: int
-    hidden: int
-    outputs: int
     device_kind: str
     probes: int
     _kernel: Any
-
-    @property
-    def size(self) -> int:
-        """Length of the array of weights."""
-        return (self.latent + 4) * self.hidden + (self.hidden + 1) * (self.hidden + padded(self.outputs))
 
     def parts(self, probes: int) -> int:
         """Returns the number of partial gradients that a launch over a number of probes writes."""
@@ -159,7 +148,7 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
 
     else:
         kernel = _cpu_kernel(latent, hidden, outputs)
-    return NetworkKernels(latent, hidden, outputs, device_kind, probes, kernel)
+    return NetworkKernels(device_kind, probes, kernel)
 
 
 @dataclass(frozen=True)

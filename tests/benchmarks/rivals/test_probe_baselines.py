@@ -13,10 +13,11 @@ from benchmarks.rivals.probe import (
     clustered_pca,
     global_pca,
     moving_basis,
+    pack_unreal,
+    unpack_unreal,
     unreal_packing,
 )
 from wlm.errors import WlmError
-from wlm.probe.engines.unreal import pack_unreal, unpack_unreal
 
 HALF = 2.0**-11  # relative error of a half float
 SIGNAL = functools.partial(clustered_pca, signal=True)

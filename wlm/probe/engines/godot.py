@@ -49,20 +49,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model's light as a bake of Godot 4, `light.lmbake`.
+    """Writes a model of L2 in RGB as a bake of Godot 4, `light.lmbake`.
 
-    Args:
-        bundle: The bundle of a model of L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        cells: Cells along the longest side of the box, 1 to 64, without a bake; None: 24.
-        original: The `.lmbake` that was compressed, whose light is replaced. Otherwise the bake has probes at the
-            corners of cubic cells that fill the probes' box, with the decoded light there; another file that was
-            compressed gives the positions, if the method needs them and the model stores none.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index, and entries that describe the lattice.
+    If `original` is the `.lmbake` that was compressed, its light is replaced. Otherwise the bake has probes at the
+    corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24), and another
+    `original` gives the positions, if the method needs them and the model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range or given with a bake, the bake has

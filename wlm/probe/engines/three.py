@@ -72,21 +72,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model's light as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
+    """Writes a model of L2 in RGB as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
 
-    The grid's probes are at the centres of cubic cells that fill the probes' box, with the decoded light there in half
-    floats.
-
-    Args:
-        bundle: The bundle of a model of L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        cells: Cells along the longest side of the box, 1 to 256.
-        original: The file that was compressed, if the method needs positions and the model stores none.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index.
+    The grid's probes are at the centres of cubic cells that fill the probes' box, 1 to 256 `cells` along its longest
+    side, with the light there in half floats. `original` is the file that was compressed, if the method needs
+    positions and the model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the

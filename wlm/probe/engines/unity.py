@@ -176,17 +176,8 @@ def write_kit(
 ) -> dict[str, Any]:
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
-    Args:
-        bundle: The bundle of a model of L0, L1 or L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        mirror: Axis to mirror, "x", "y" or "z". Unity is left-handed: importers mirror a glTF scene along x or along z;
-            a scene that came from Unity needs no mirroring.
-        original: The file that was compressed, for its positions; None: those stored with the model.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index.
+    Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is that axis; a scene that came from
+    Unity needs none. `original` is the file that was compressed, for its positions; None: those stored with the model.
 
     Raises:
         WlmError: The numbers are not spherical harmonics of up to L2, there are more than 131,072 probes, the axis does

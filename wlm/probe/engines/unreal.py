@@ -28,12 +28,11 @@ AMBIENT_FILE = "ambient.dds"
 SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
 SHADER_FILE = "WlmProbes.usf"
 _MOST_CELLS = 128
-_BANDS = 3
 _AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
 
 # Ranges of coefficients 1 to 8 over the ambient one, as in the engine: sqrt(3) for L1, the bound for non-negative
 # light, and twice the bound for L2.
-_RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
+RANGE = np.sqrt([3.0, 3.0, 3.0, 15.0, 15.0, 20.0, 15.0, 15.0])
 # Largest finite numbers with 6, 6 and 5 bits of mantissa and half float's exponent.
 _PACKED_MAX = np.array([65024.0, 65024.0, 64512.0])
 # Low bits of a half float's mantissa that R11G11B10F drops.
@@ -117,21 +116,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model's light as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
+    """Writes a model of L2 in RGB as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
 
-    Probes are at the centres of cubic cells that fill the probes' box. A coefficient beyond the bound of non-negative
-    light is clamped, and a negative ambient colour becomes 0.
-
-    Args:
-        bundle: The bundle of a model of L2 in RGB.
-        folder: The folder; it must exist.
-        engine: Not used.
-        cells: Cells along the longest side of the box, 1 to 128.
-        original: The file that was compressed, if the method needs positions and the model stores none.
-        device: Where the light is decoded.
-
-    Returns:
-        The entry "about" of the index.
+    Probes are at the centres of cubic cells that fill the probes' box, 1 to 128 `cells` along its longest side. A
+    coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0. `original`
+    is the file that was compressed, if the method needs positions and the model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range, the light exceeds 11-bit floats, or
@@ -144,7 +133,7 @@ def write_kit(
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
         raise WlmError(f"{model.name}: expected light within {_PACKED_MAX.min():g}, got {np.abs(sh[:, 0]).max():.3g}")
     width, height, depth = (int(count) for count in lattice.count)
-    ambient, level = _packed(sh, _BANDS)
+    ambient, level = packed(sh)
     textures = {AMBIENT_FILE: (_AMBIENT, ambient)}
     textures |= {
         name: (_RATIOS, np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
@@ -168,48 +157,20 @@ def write_kit(
     return {"about": _ABOUT}
 
 
-def pack_unreal(values: np.ndarray, bands: int) -> bytes:
-    """Packs probes as the engine does: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios.
-
-    Args:
-        values: [N, D], coefficients from L00, each red, green and blue.
-        bands: Number of bands to keep, 1 to 3.
-    """
-    ambient, level = _packed(np.asarray(values, np.float64).reshape(len(values), -1, 3), bands)
-    return ambient.tobytes() + level.tobytes()
-
-
-def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
-    """Unpacks the result of `pack_unreal`, float32 [N, D] with D = `width`; zero beyond the stored bands."""
-    probes = len(payload) // (4 + 3 * (bands**2 - 1))
-    level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
-    sh = np.zeros((probes, width // 3, 3), np.float32)
-    sh[:, : bands**2] = _unpacked(np.frombuffer(payload, "<u4", probes), level)
-    return sh.reshape(probes, width)
-
-
-def _packed(sh: np.ndarray, bands: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns uint32 [N] and uint8 [N, 3, bands² - 1] for coefficients [N, C, 3]."""
+def packed(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Packs coefficients float64 [N, C, 3]: ambient colours, uint32 [N], and ratios, uint8 [N, 3, C - 1]."""
     colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
     step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
     code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
     ambient = np.bitwise_or.reduce(code << _SHIFT, axis=1).astype("<u4")
-    others = sh[:, 1 : bands**2].transpose(0, 2, 1)
+    others = sh[:, 1:].transpose(0, 2, 1)
     # Ratios to the decoded ambient colour are more exact, at no cost.
-    unit = _ambient(ambient)[:, :, None] * _RANGE[: bands**2 - 1]
+    unit = ambient_colour(ambient)[:, :, None] * RANGE[: others.shape[2]]
     ratio = np.divide(others, unit, out=np.zeros_like(others), where=unit > 0.0)
     return ambient, np.rint((np.clip(ratio, -1.0, 1.0) * 0.5 + 0.5) * 255.0).astype(np.uint8)
 
 
-def _unpacked(ambient: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Returns coefficients float64 [N, C, 3] from ambient colours uint32 [N] and ratios uint8 [N, 3, C - 1]."""
-    colour = _ambient(ambient)
-    with np.errstate(invalid="ignore"):  # a file may contain infinity
-        others = (level / 127.5 - 1.0) * colour[:, :, None] * _RANGE[: level.shape[2]]
-    return np.concatenate([colour[:, :, None], others], 2).transpose(0, 2, 1)
-
-
-def _ambient(code: np.ndarray) -> np.ndarray:
+def ambient_colour(code: np.ndarray) -> np.ndarray:
     """Converts R11G11B10F to float64 [N, 3]."""
     part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
     return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)

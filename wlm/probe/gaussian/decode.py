@@ -84,10 +84,8 @@ class GaussianDecoder(Decoder):
         self.run(points)
         return points.values()
 
-    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
-        if position is not None:
-            self.check_own(position)
-        values = self.decode(self.own_positions() if position is None else position)
+    def decode_probes(self) -> np.ndarray:
+        values = self.decode(self.own_positions())
         values[~self.model.live] = 0.0
         return values
 

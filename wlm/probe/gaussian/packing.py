@@ -106,19 +106,14 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Weights of Gaussians at the probes.
-
-    Attributes:
-        rows: float64 [K, 9], the Gaussians without their latents.
-        weight: float64 [N, K] on the device; None where there are too many of them.
-        square: weight^T weight; None with `weight`.
-        feed: `_feed` of `square`; None with `weight`.
-    """
+    """Weights of Gaussians [K, 9] at the probes, float64 [N, K]; None with more than `_TOGETHER` Gaussians."""
 
     rows: np.ndarray
-    weight: torch.Tensor | None
-    square: np.ndarray | None
-    feed: np.ndarray | None
+    weight: torch.Tensor | None = None
+    square: np.ndarray | None = None
+    """weight^T weight."""
+    feed: np.ndarray | None = None
+    """`_feed` of `square`."""
 
 
 class _Search:
@@ -218,7 +213,7 @@ class _Search:
 
     def _sums(self, rows: np.ndarray) -> _Sums:
         if len(rows) > _TOGETHER:
-            return _Sums(rows, None, None, None)
+            return _Sums(rows)
         weight = torch.cat(list(self._weights(rows)))
         square = (weight.T @ weight).cpu().numpy()
         return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))

@@ -1,6 +1,7 @@
 """The GLSL that decodes Gaussians from the buffers of `wlm.probe.gaussian.bundle`."""
 
 from wlm.probe.gaussian.model import LATENT, Gaussians
+from wlm.probe.glsl import buffer_glsl
 from wlm.probe.sphere import sh_count
 
 HEAD_WORDS = 10  # words of the buffer `gaussians` before the bounds: see _TEMPLATE
@@ -36,27 +37,7 @@ _TEMPLATE = """\
 // other ways to read word i. If WLM_PROBE_LIST(i) is defined, as a way to read entry i of lists of Gaussians, there are
 // also functions that sum a range of it; the document describes how to build lists that miss no Gaussian.
 
-#ifndef WLM_PROBE_GAUSSIANS
-#ifndef WLM_PROBE_GAUSSIANS_BINDING
-#define WLM_PROBE_GAUSSIANS_BINDING 0
-#endif
-layout(std430, binding = WLM_PROBE_GAUSSIANS_BINDING) readonly buffer WlmProbeGaussians
-{{
-    uint wlm_probe_gaussians[];
-}};
-#define WLM_PROBE_GAUSSIANS(i) wlm_probe_gaussians[i]
-#endif
-#ifndef WLM_PROBE_NETWORK
-#ifndef WLM_PROBE_NETWORK_BINDING
-#define WLM_PROBE_NETWORK_BINDING 1
-#endif
-layout(std430, binding = WLM_PROBE_NETWORK_BINDING) readonly buffer WlmProbeNetwork
-{{
-    uint wlm_probe_network[];
-}};
-#define WLM_PROBE_NETWORK(i) wlm_probe_network[i]
-#endif
-
+{buffers}
 const int WLM_PROBE_LATENT = {latent};
 const int WLM_PROBE_OUTPUTS = {outputs};
 const int WLM_PROBE_CHANNELS = {channels}; // numbers of a Gaussian
@@ -242,7 +223,9 @@ def probe_glsl(content: Gaussians) -> str:
     channels = LATENT.start + latent
     sphere = content.support == "sphere"
     fours = -(-(latent + 3) // 4), hidden // 4
+    buffers = [buffer_glsl("probe", name, number) for number, name in enumerate(("gaussians", "network"))]
     text = _TEMPLATE.format(
+        buffers="".join(buffers),
         latent=latent,
         hidden=hidden,
         outputs=content.outputs,

@@ -6,20 +6,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.parts import Part, all_finite, check_part, check_parts
 from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, ROTATION, SCALE, Gaussians, gaussian_count, layer_shapes
-from wlm.probe.gaussian.start import first_gaussians
 from wlm.probe.model import Profile
 from wlm.probe.morton import morton_order
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
 from wlm_kernels.probe.network import CPU_LANES
-from wlm_kernels.probe.optimiser import Optimiser
-from wlm_kernels.probe.step import GROUP
+from wlm_kernels.probe.step import GROUP, Optimiser
 
 CODE_BITS, CENTRE_BITS = 10, 16
 """Bits of a code in training: of scale, rotation and latent, and of a centre."""
@@ -31,6 +30,12 @@ _QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the
 _FIRST_LATENT = 0.1  # standard deviation of the first latents
 _PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
+_NEIGHBOURS = 9  # probes whose spread is the local spread of one of them
+_PIECE = 4096  # probes per piece
+_ROUNDS = 4  # of k-means where the draw follows detail, which more rounds would undo
+_PLAIN_ROUNDS = 20  # of k-means where the draw is uniform
+_FLOOR = 0.05  # smallest local spread, as a share of the mean
+_SMALLEST = 1e-4  # smallest first scale, as a share of the box
 _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe at the edge of its group's box
 
 
@@ -393,3 +398,60 @@ def _first_numbers(
     second[hidden] = -0.5 * second[:hidden].sum(0)
     third[hidden] = -0.5 * third[:hidden].sum(0)
     return rows, np.concatenate([first.ravel(), second.ravel(), third.ravel()]).astype(np.float32)
+
+
+def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Measures how much the light varies around each probe.
+
+    Args:
+        x: [N, 3].
+        values: [N, D].
+
+    Returns:
+        float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
+    """
+    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)))[1].reshape(len(x), -1)
+    # In pieces: all neighbours' numbers at once would be nine times the set.
+    pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))
+    spread = np.concatenate([np.sqrt(values[piece].astype(np.float64).var(1).sum(1)) for piece in pieces])
+    floor = _FLOOR * spread.mean()
+    return spread + (floor if floor > 0 else 1.0)
+
+
+def first_gaussians(
+    x: np.ndarray, values: np.ndarray, count: int, detail: float, first_scale: float, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places centres by k-means that starts where the light varies, with scales from the nearest other centre.
+
+    Args:
+        x: float32 [N, 3], normalised positions.
+        values: float32 [N, D].
+        count: Number of Gaussians; there are never more than distinct positions.
+        detail, first_scale: See `wlm.probe.model.Profile`.
+        random: Source of the draw.
+
+    Returns:
+        Centres, float64 [K, 3], and scales, float64 [K].
+    """
+    distinct, index = np.unique(x, axis=0, return_index=True)
+    count = min(count, len(distinct))
+    if count == len(distinct):
+        centre = distinct.astype(np.float64)
+    else:
+        weight = local_spread(x, values)[index] ** detail
+        centre = distinct[random.choice(len(distinct), count, replace=False, p=weight / weight.sum())]
+        centre = _kmeans(x.astype(np.float64), centre.astype(np.float64), _ROUNDS if detail > 0 else _PLAIN_ROUNDS)
+    if count == 1:
+        return centre, np.array([max(np.linalg.norm(x - centre, axis=1).max(), _SMALLEST)])
+    nearest = cKDTree(centre).query(centre, k=2)[0][:, 1]
+    return centre, np.maximum(first_scale * nearest, _SMALLEST)
+
+
+def _kmeans(x: np.ndarray, centre: np.ndarray, rounds: int) -> np.ndarray:
+    for _ in range(rounds):
+        label = cKDTree(centre).query(x)[1]
+        size = np.bincount(label, minlength=len(centre))
+        total = np.stack([np.bincount(label, x[:, axis], len(centre)) for axis in range(3)], 1)
+        # A centre that is nearest to no probe keeps its position.
+        centre = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], centre)
+    return centre

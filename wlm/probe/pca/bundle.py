@@ -3,6 +3,7 @@
 import numpy as np
 
 from wlm.probe.decode import Decoder
+from wlm.probe.glsl import buffer_glsl
 from wlm.probe.model import GpuForm, ProbeModel
 from wlm.probe.sphere import sh_count
 
@@ -31,17 +32,7 @@ _TEMPLATE = """\
 //
 // It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
 
-#ifndef WLM_PROBE_PROBES
-#ifndef WLM_PROBE_PROBES_BINDING
-#define WLM_PROBE_PROBES_BINDING 0
-#endif
-layout(std430, binding = WLM_PROBE_PROBES_BINDING) readonly buffer WlmProbeProbes
-{{
-    uint wlm_probe_probes[];
-}};
-#define WLM_PROBE_PROBES(i) wlm_probe_probes[i]
-#endif
-
+{buffers}
 const int WLM_PROBE_OUTPUTS = {outputs};
 const int WLM_PROBE_COLUMNS = {columns};
 
@@ -135,6 +126,7 @@ def component_glsl(count: int, outputs: int, basis: bool) -> str:
     first = 1 + columns
     layout = {"first": first, "words": words, "codes": first + (count * words if basis else 0)}
     text = _TEMPLATE.format(
+        buffers=buffer_glsl("probe", "probes", 0),
         outputs=outputs,
         count=count,
         columns=columns,

@@ -78,9 +78,7 @@ class ComponentDecoder(Decoder):
             values[~covered] = at_probes(self, nearest)
         return values
 
-    def decode_probes(self, position: np.ndarray | None = None) -> np.ndarray:
-        if position is not None:
-            self.check_own(position)
+    def decode_probes(self) -> np.ndarray:
         return at_probes(self, np.arange(self.model.probes))
 
     def light(self, position: np.ndarray) -> "ComponentDecoder":

@@ -1,5 +1,6 @@
 """The GLSL that reads a volume from the buffers of `wlm.probe.volume.bundle`."""
 
+from wlm.probe.glsl import buffer_glsl
 from wlm.probe.sphere import sh_count
 
 _HEAD_WORDS = 4  # words of the buffer `volume` before the levels
@@ -116,18 +117,6 @@ vec3 wlm_volume_diffuse(vec3 p, vec3 n)
 }}
 """
 
-_BUFFER = """#ifndef WLM_VOLUME_{name}
-#ifndef WLM_VOLUME_{name}_BINDING
-#define WLM_VOLUME_{name}_BINDING {number}
-#endif
-layout(std430, binding = WLM_VOLUME_{name}_BINDING) readonly buffer WlmVolume{title}
-{{
-    {type} wlm_volume_{lower}[];
-}};
-#define WLM_VOLUME_{name}(i) wlm_volume_{lower}[i]
-#endif
-"""
-
 _BUFFERS = (("HEAD", "uint"), ("PAGE", "int"), ("POOL", "float"))
 
 
@@ -140,10 +129,7 @@ def volume_glsl(outputs: int) -> str:
     Returns:
         GLSL 4.30, which Vulkan's dialect takes too.
     """
-    buffers = [
-        _BUFFER.format(name=name, lower=name.lower(), title=name.title(), type=kind, number=number)
-        for number, (name, kind) in enumerate(_BUFFERS)
-    ]
+    buffers = [buffer_glsl("volume", name, number, kind) for number, (name, kind) in enumerate(_BUFFERS)]
     text = _TEMPLATE.format(head=_HEAD_WORDS, level_words=_LEVEL_WORDS, buffers="".join(buffers), outputs=outputs)
     coefficients = sh_count(outputs)
     if coefficients in (1, 4, 9):

@@ -120,7 +120,7 @@ def settle(volume: Volume, viewpoint: np.ndarray) -> int:
 
 
 def score_volume(
-    probes: ProbeSet, light: Light, *, frames: int | None = None, up: int = 1, progress: OnProgress | None = None
+    probes: ProbeSet, light: Light, *, frames: int | None = None, progress: OnProgress | None = None
 ) -> dict[str, object]:
     """Walks around a scene with a volume that starts empty, and scores the readings against the original probes.
 
@@ -128,7 +128,6 @@ def score_volume(
         probes: The original probes.
         light: Light of all of them, original or decoded.
         frames: Frames of the loop; None: each frame moves the viewer by a tenth of a block.
-        up: Index of the axis that points up.
         progress: As for `walk`.
 
     Returns:
@@ -137,7 +136,7 @@ def score_volume(
     """
     volume = Volume(probes.position, light, live=probes.live, normal=probes.normal)
     lit = probes.position[probes.live]
-    path = camera_path(lit, frames or loop_frames(lit, _STEP * volume.sizes[0], up), up=up)
+    path = camera_path(lit, frames or loop_frames(lit, _STEP * volume.sizes[0]))
     first = volume.update(path[0])
     count = 1 + (settle(volume, path[0]) if first.left else 0)
     return walk(volume, path, probes.values, progress=progress) | {

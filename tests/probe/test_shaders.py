@@ -1,0 +1,124 @@
+"""The exported shaders of models: they compile for Vulkan, and decode the buffers like Python."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, with_content
+from builders.probe_sets import synthetic
+from builders.shader_runs import run_glsl
+from builders.shader_subjects import points_of
+
+import wlm
+from wlm.probe.exact import decode64
+from wlm.probe.gaussian.shader import probe_glsl
+from wlm.probe.volume.shader import volume_glsl
+
+SHAPES = [
+    {},
+    {"support": "sphere"},
+    {"latent": 1, "hidden": 8, "bits": 4, "outputs": 3},
+    {"latent": 4, "outputs": 5, "count": 1},
+    {"turn": 0.0},
+    {"latent": 13, "hidden": 24, "bits": 16, "outputs": 12, "probes": 7},
+]
+_VALUES = """
+    vec3 x = wlm_probe_place(position);
+    float all[WLM_PROBE_OUTPUTS], odd[WLM_PROBE_OUTPUTS], even[WLM_PROBE_OUTPUTS];
+    wlm_probe_values(x, all);
+    wlm_probe_values_listed(x, 0, ODD, odd);
+    wlm_probe_values_listed(x, ODD, wlm_probe_count() - ODD, even);
+    light = vec4(all[pixel.y], odd[pixel.y], even[pixel.y], 1.0);
+"""
+_SH = """
+    vec3 all[COUNT], odd[COUNT], even[COUNT];
+    wlm_probe_sh(position, all);
+    wlm_probe_sh_listed(position, 0, ODD, odd);
+    wlm_probe_sh_listed(position, ODD, wlm_probe_count() - ODD, even);
+    int c = pixel.y / 3;
+    light = vec4(all[c][pixel.y % 3], odd[c][pixel.y % 3], even[c][pixel.y % 3], 1.0);
+"""
+
+
+def _run(shader: str, main: str, size: tuple[int, int], buffers: dict[str, np.ndarray], head: str = "", **textures):
+    """Draws a picture whose row is a number of a probe, and whose column is a probe or a point."""
+    for name, words in buffers.items():
+        words = words.view("<u4")
+        textures[f"u_{name}"] = np.pad(words, (0, -len(words) % 1024)).reshape(-1, 1024, 1)
+        head += f"uniform usampler2D u_{name};\n"
+        head += f"#define WLM_PROBE_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, (i) >> 10), 0).r\n"
+    return run_glsl(head + shader, main, size, textures, version=430)
+
+
+@pytest.mark.parametrize("settings", SHAPES, ids=str)
+def test_gaussians_and_lists_of_them(settings):
+    model = random_model(**settings)
+    made, count = model.bundle(), model.content.count
+    position = ORIGIN + EXTENT * SIZE * np.random.default_rng(1).uniform(-0.1, 1.1, (50, 3))
+    position = np.concatenate([position, made.reference["position"]]).astype(np.float32)
+    head = f"uniform sampler2D u_points;\n#define ODD {count // 2}\n#define COUNT {model.outputs // 3}\n"
+    head += "#define WLM_PROBE_LIST(i) uint((i) < ODD ? 2 * (i) + 1 : 2 * ((i) - ODD))\n"
+    main = "vec3 position = texelFetch(u_points, ivec2(pixel.x, 0), 0).xyz;" + (_VALUES, _SH)[model.outputs != 5]
+    size = model.outputs, len(position)
+    got = _run(made.shader, main, size, dict(made.buffers), head, u_points=points_of(position))
+    for kind, chosen in enumerate((slice(None), slice(1, None, 2), slice(0, None, 2))):
+        code = model.content.code[chosen]
+        if len(code):
+            expected = decode64(with_content(model, code=code), position)
+            np.testing.assert_allclose(got[..., kind].T, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("count", "coefficients"), [(200, 9), (20, 9), (30, 1)])
+def test_principal_components(count, coefficients):
+    probes = synthetic(count, coefficients=coefficients, dead=2)
+    made = wlm.probe.compress(probes).bundle()
+    assert (made.document["basis"], count) in ((True, 200), (False, 20), (False, 30))
+    assert made.document["live"] == count - 2
+    main = "float values[WLM_PROBE_OUTPUTS]; wlm_probe_values(pixel.x, values); light = vec4(values[pixel.y]);"
+    got = _run(made.shader, main, (probes.outputs, count - 2), dict(made.buffers))[..., 0].T
+    reference = made.reference
+    scale = np.abs(reference["values"]).max()
+    np.testing.assert_allclose(got[reference["live"]], reference["values"], rtol=0, atol=1e-5 * scale)
+
+
+def _gaussians(**settings) -> tuple[str, str]:
+    model = random_model(**settings)
+    call = "wlm_probe_values_listed(wlm_probe_place(vec3(0.5)), 8, 4, o);"
+    if model.outputs % 3 == 0:
+        call += f" vec3 sh[{model.outputs // 3}]; wlm_probe_sh(vec3(1.0), sh); o[0] += sh[0].x;"
+        call += " wlm_probe_sh_listed(vec3(1.0), 0, 2, sh); o[0] += sh[0].y;"
+    head = "layout(std430, binding = 3) readonly buffer Lists { uint lists[]; };\n#define WLM_PROBE_LIST(i) lists[i]\n"
+    return head + probe_glsl(model.content), f"float o[{model.outputs}]; {call}"
+
+
+CALLERS = {str(shape): lambda shape=shape: _gaussians(**shape) for shape in SHAPES} | {
+    "components": lambda: (
+        wlm.probe.compress(synthetic(100)).bundle().shader,
+        "vec3 sh[9]; wlm_probe_sh(2, sh); float o[1]; o[0] = sh[0].x;",
+    ),
+    **{
+        f"volume {outputs}": lambda outputs=outputs: (
+            volume_glsl(outputs),
+            f"float o[{outputs}]; o[0] += wlm_volume_read(vec3(1.0), vec3(1.0), o);",
+        )
+        for outputs in (27, 5)
+    },
+}
+
+
+@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
+@pytest.mark.parametrize("kind", CALLERS)
+@pytest.mark.parametrize(("version", "options"), [(430, []), (450, ["-V", "-o", "shader.spv"])])
+def test_it_compiles(kind, version, options, tmp_path):
+    shader, body = CALLERS[kind]()
+    text = f"#version {version}\nlayout(local_size_x = 64) in;\n{shader}\n"
+    text += "layout(std430, binding = 7) buffer Results { float results[]; };\n"
+    (tmp_path / "shader.comp").write_text(f"{text}void main() {{ {body} results[0] = o[0]; }}\n")
+    done = subprocess.run(["glslangValidator", *options, "shader.comp"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
+
+
+def test_the_shader_depends_on_the_shape_alone():
+    assert probe_glsl(random_model(seed=0).content) == probe_glsl(random_model(seed=1, count=9, bits=7).content)
+    assert probe_glsl(random_model().content) != probe_glsl(random_model(support="sphere").content)
