@@ -56,7 +56,7 @@ from wlm.lightmap.runtime import (
     fast_decoder,
 )
 from wlm.lightmap.runtime_texture import MapDecoder
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind, assemble
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
 from wlm.lightmap.view_scores import VIEWS, Tally, views_of
 from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
 
@@ -378,7 +378,9 @@ class _LightmapBench(Bench):
         return [row]
 
     def _assembled(self, tiles: np.ndarray) -> np.ndarray:
-        return assemble(tiles, np.arange(self.grid.count), self.grid)
+        image = np.zeros((self.grid.height, self.grid.width, 3), tiles.dtype)
+        place(image, tiles, np.arange(self.grid.count), self.grid)
+        return image
 
     def _tiles(self, model: SheetModel) -> dict[str, int]:
         """Counts tiles by kind; those without valid texels are left out."""

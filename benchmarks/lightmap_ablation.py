@@ -28,7 +28,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.profile import Profile, TimeAxis
-from wlm.lightmap.tiles import TILE, TileGrid, assemble
+from wlm.lightmap.tiles import TILE, TileGrid, place
 from wlm.metrics import evaluate_frame, summarise
 
 METHOD = "ablation"
@@ -126,7 +126,12 @@ class _AblationBench(Bench):
         self._targets = targets
         self._grid = TileGrid.of(*self._lightmaps.mask.shape)
         tiles = np.ones((len(targets.number), TILE, TILE, 1), bool)
-        self._held = assemble(tiles, targets.number, self._grid)[..., 0]
+        self._held = self._assembled(tiles)[..., 0]
+
+    def _assembled(self, tiles: np.ndarray) -> np.ndarray:
+        image = np.zeros((self._grid.height, self._grid.width, tiles.shape[3]), tiles.dtype)
+        place(image, tiles, self._targets.number, self._grid)
+        return image
 
     def variant_row(self, name: str) -> Row:
         """Returns the row of a variant of the feature maps."""
@@ -141,7 +146,7 @@ class _AblationBench(Bench):
             tiles = fit.decode()
         except WlmError as error:
             return self.missing_row(METHOD, name, error)
-        frames = (assemble(tiles[:, k], self._targets.number, self._grid) for k in range(len(self._lightmaps.times)))
+        frames = (self._assembled(tiles[:, k]) for k in range(len(self._lightmaps.times)))
         return self._row(name, "in plain torch", fit.tile_bytes * len(tiles), frames, seconds)
 
     def kernels_row(self) -> Row:

@@ -37,14 +37,14 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import stream, to_warp
+from wlm.interop import stream, to_warp, torch_memory
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import Guide, guide
 from wlm.smoke.march.fine import bake
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, cast_shadow, light_axes
+from wlm.smoke.shading import Light, light_axes
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
@@ -57,6 +57,7 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
+from wlm_kernels.smoke.shadow import visibility
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
@@ -621,7 +622,8 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
         with stream(device):
             mesh, view = (to_warp(corners, wp.vec3), to_warp(triangles)), camera.in_world()
             for light in lights:
-                cast_shadow(*mesh, light_axes(light.toward), view, to_warp(surface.depth), to_warp(seen))
+                maps = to_warp(surface.depth), to_warp(seen)
+                visibility(*mesh, light_axes(light.toward), view, *maps, empty=torch_memory(seen.device))
 
     def shading() -> torch.Tensor:
         return six.shade(lights, background=scene.background)

@@ -27,7 +27,7 @@ import torch
 
 from benchmarks.path_tracer import PathTracer, denoise, has_denoiser, has_tracer
 from benchmarks.plot import Panel
-from benchmarks.rivals.smoke import billboard, coarse
+from benchmarks.rivals.smoke import billboard
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.timing import Timing, time_together
@@ -39,7 +39,7 @@ from wlm.interop import stream
 from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network, shipped
-from wlm.smoke.evaluation import of_decoder
+from wlm.smoke.evaluation import coarse, of_decoder
 from wlm.smoke.evaluation import score as score_pool
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import bake_coarse

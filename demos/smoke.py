@@ -42,7 +42,7 @@ from wlm_kernels.smoke.settings import March
 
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
-FRAMES, RATE = 8, 2.0  # four seconds, in which the jet crosses the box
+FRAMES, RATE = 8, 2.0  # in four seconds the jet crosses the box
 RESOLUTION = 96
 
 # Limits of the checks, from measurements on the CPU.
@@ -163,7 +163,7 @@ def _check_lightmaps(name: str, six: SixWay) -> None:
         most = MOST_LIGHT["front" if direction == "front" else "side"]
         if not 0 <= plane.min() <= plane.max() <= most:
             raise WlmError(f"demo: {name}: {direction}: expected light of 0 to {most}, got {plane.max():.4g}")
-        # Scattered light passes through what hides the background.
+        # Only smoke that hides the background scatters light.
         if (plane > 1.0 - six.transparency.cpu().numpy() + 1e-3).any():
             raise WlmError(f"demo: {name}: {direction}: expected no more light than opacity")
     if six.error is not None and not six.error.rms <= MOST_STEP_ERROR:
@@ -176,7 +176,7 @@ def _check_solids(name: str, scene: Scene, volume: DensityVolume, at: float) -> 
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     density = volume.density.cpu().numpy()
     for obstacle in scene.obstacles:
-        # The solver placed it half a step ago, and a cell belongs to it by its centre.
+        # The obstacle's position is up to one step older, and a cell counts as inside by its centre.
         slack = 1.5 * scene.grid.cell + obstacle.fastest * scene.step * scene.smoke.substeps
         inside = np.linalg.norm(places - obstacle.centre(at), axis=-1) < obstacle.radius - slack
         if density[inside].any():

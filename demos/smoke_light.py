@@ -1,6 +1,6 @@
-"""Lights a plume: light scattered once, of all orders by diffusion and the learned mix that ships, and path-traced.
+"""Lights a plume by single scattering, by light of all orders (diffusion and fitted weights), and by path tracing.
 
-Leaves a contact sheet of the three under lights from four sides, and checks how near the first two come to the third.
+Writes a contact sheet of the three under lights from four sides, and compares the first two with the third.
 
     python demos/smoke_light.py
 """
@@ -28,10 +28,10 @@ from wlm.view.pictures import contact_sheet, to_bytes
 
 HERE = Path(__file__).resolve().parent
 PIXELS, SAMPLES = 96, 64
-ALBEDO = (0.97, 0.95, 0.92)  # of each scattering: what is scattered often turns warmer
-SIDES = (0.0, 90.0, 180.0, 270.0)  # degrees round the plume; 0 is behind the camera's back
+ALBEDO = (0.97, 0.95, 0.92)  # light that was scattered more often is warmer
+SIDES = (0.0, 90.0, 180.0, 270.0)  # degrees around the plume; 0 is behind the camera
 
-# Of pictures in sRGB, dB, the mean over the four sides: 23.3 dB for light scattered once, 38.1 for all orders.
+# Least mean PSNR in sRGB over the four sides, in dB: 23.3 for single scattering, 38.1 for all orders when measured.
 LEAST_ALL, LEAST_GAIN = 35.0, 12.0
 
 

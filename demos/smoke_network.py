@@ -1,12 +1,12 @@
-"""Lights smoke by a network's six-way lightmaps, beside a fine march of them and a coarse one, and checks the results.
+"""Lights smoke by a network's six-way lightmaps, beside a fine and a coarse march, and checks the results.
 
-Three scenes: a jet under a turning camera and light, a sphere that crosses a jet, an explosion that glows. Each leaves
-a sequence of PNGs, the three side by side, and a contact sheet. The network is the one that comes with wlm, or that of
-`--network`; `--train` trains a small one first, for half a minute.
+There are three scenes: a jet under a turning camera and light, a sphere that crosses a jet, and a glowing explosion.
+Each leaves a contact sheet. The network is the shipped one or that of `--network`; `--train` first trains a
+small network, for half a minute.
 
-The coarse march is the network's guide as it is. On grids as small as these its steps are shorter than a voxel, so that
-it is nearer to the fine march than a network is that has learned from 128 to 400 voxels and 205 to 1,024 pixels along
-an edge: the gate takes little of it here, and no frame may be worse than its guide.
+The coarse march is the network's guide. On grids as small as these its steps are shorter than a voxel, so that it is
+nearer to the fine march than the network; the gate gives the network little weight, and no frame may be worse than its
+guide.
 
     python demos/smoke_network.py
 """
@@ -52,7 +52,7 @@ RESOLUTION, FRAMES = 128, 6
 RATES = {"jet-sphere": 1.5, "jet-moving": 1.5, "explosion": 6.0}  # frames a second
 TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its lights turn the other way
 
-# By how many dB a frame by the network may be worse than its guide. A network of a guide that isn't lightmaps has none.
+# Largest loss in dB of a frame by the network against its guide, which only a guide of six lightmaps has.
 MOST_LOST = 0.1
 # Largest mean light of a network's lightmaps where the fine march sees no smoke.
 MOST_STRAY = 1e-3
@@ -80,7 +80,7 @@ SMALL = Profile.model_validate(
 def render(
     volume: DensityVolume, camera: Camera, model: SmokeModel, predictor: SmokePredictor, seed: int
 ) -> dict[str, SixWay]:
-    """Lightmaps by the fine march, the network and the coarse march that is its guide."""
+    """Returns lightmaps by the fine march, the network, and the coarse march that is its guide."""
     return {
         "reference": bake(volume, camera, step=STEP, estimate=False),
         "network": predictor(volume, camera, seed),
@@ -122,7 +122,7 @@ def light(out: Path, name: str, scene: Scene, model: SmokeModel, turn: float, de
 
 
 def few_frames(name: str, scale: float, refine: int, resolution: int) -> Scene:
-    """A scene on other grids, for few frames."""
+    """Returns a scene with another grid and few frames."""
     scene = load_scene(name).scaled(scale)
     return scene.model_copy(
         update={
@@ -136,7 +136,7 @@ def few_frames(name: str, scale: float, refine: int, resolution: int) -> Scene:
 
 
 def turned(light: LightSettings, degrees: float) -> LightSettings:
-    """A light, turned about the vertical."""
+    """Returns a light that is turned about the vertical axis."""
     x, y, z = light.toward
     angle = np.radians(degrees)
     around = (x * np.cos(angle) + z * np.sin(angle), y, z * np.cos(angle) - x * np.sin(angle))
@@ -144,7 +144,7 @@ def turned(light: LightSettings, degrees: float) -> LightSettings:
 
 
 def psnr(predicted: SixWay, target: SixWay) -> dict[str, float]:
-    """PSNR over the six lightmaps in sRGB, and over the emission if there is any."""
+    """Returns the PSNR of the six lightmaps in sRGB, and of the emission if there is any."""
     off = (encode_lightmaps(predicted) - encode_lightmaps(target)).square()
     values = {"": psnr_from_mse(float(off[: len(DIRECTIONS)].mean()), 1.0)}
     if target.emission is not None:
@@ -153,7 +153,7 @@ def psnr(predicted: SixWay, target: SixWay) -> dict[str, float]:
 
 
 def check_clear(name: str, predicted: SixWay, target: SixWay) -> None:
-    """Checks that a network leaves black what has no smoke."""
+    """Checks that a network's lightmaps are black where there is no smoke."""
     clear = target.transparency > 0.999
     if clear.any():
         stray = predicted.lightmaps[:, clear].mean(1)

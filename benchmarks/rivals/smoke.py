@@ -1,53 +1,10 @@
-"""Rivals of the lightmaps of the network: the coarse march, and a flip book that was baked from one side."""
+"""A rival of the network: a flip book that was baked from one side, on a billboard."""
 
 import numpy as np
 import torch
 
 from wlm.smoke.camera import Camera
-from wlm.smoke.evaluation import Contender, Entry, HeldOut
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.network.planes import GUIDES, PLANES
-from wlm.smoke.network.pool import Pool
-
-COARSE, FLIP_BOOK = "coarse march", "flip book"
-
-_SIX = GUIDES["six"]
-
-
-def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """Returns the coarse march of six lights, which is a pool's guide of kind "six".
-
-    Raises:
-        ValueError: The pool's guides are of another kind.
-    """
-    if pool.guides.shape[2] != len(_SIX):
-        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(_SIX)}, H, W]")
-    return pool.guides[part][:, :, [_SIX.index(name) for name in PLANES]].float()
-
-
-def flip_book(held_out: HeldOut) -> Entry:
-    """Shows the planes of the first view in the other views, as a flip book baked from that view does.
-
-    Returns:
-        It, with the samples of the other views, none where there is one view.
-
-    Raises:
-        ValueError: The samples aren't whole sets of views.
-    """
-    pool, views = held_out.whole, held_out.settings.views
-    if len(pool) % views:
-        raise ValueError(f"pool: expected whole sets of {views} views, got {len(pool)} samples")
-    number = torch.arange(len(pool), device=pool.device)
-    others = number[(number % views > 0) & held_out.keep]
-    baked = pool.targets[others - others % views]
-    return Entry(pool.take(others), lambda _, part: baked[part].float())
-
-
-RIVALS: dict[str, Contender] = {
-    COARSE: lambda held_out: Entry(held_out.pool("six"), coarse),
-    FLIP_BOOK: flip_book,
-}
-"""Rivals of a network in `wlm.smoke.evaluate`, by name."""
 
 
 def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) -> SixWay:

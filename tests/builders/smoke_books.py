@@ -1,4 +1,4 @@
-"""Flip books of smoke of random light, and what an engine has to show of them."""
+"""Flip books of random light, and the pictures that an engine must show of them."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ TOWARD, IRRADIANCE, SKY = (0.48, -0.6, 0.64), (3.0, 2.0, 1.0), (0.2, 0.3, 0.4)
 
 
 def random_frames(count: int = 5, size: tuple[int, int] = (12, 16), *, hot: bool = True, seed: int = 0) -> list[SixWay]:
-    """Frames whose light, in steps of 255, changes as slowly as filters need; also where no smoke is."""
+    """Makes frames of light in steps of 1/255 that changes slowly over the image, also where there is no smoke."""
     random = np.random.default_rng(seed)
     coarse = torch.tensor(random.uniform(0.1, 0.9, (count, 8, 3, 3)), dtype=torch.float32)
     maps = torch.nn.functional.interpolate(coarse, size, mode="bilinear", align_corners=True)
@@ -29,7 +29,7 @@ def random_frames(count: int = 5, size: tuple[int, int] = (12, 16), *, hot: bool
 
 
 def random_book(frames: list[SixWay], *, moving: bool = False, ramp: Ramp | None = FIRE, padding: int = 2) -> Book:
-    """A flip book of them; `moving`: one place in all of it moves as in `MOVED`."""
+    """Packs frames into a flip book; `moving`: with the constant motion `MOVED`."""
     book = pack_book([Shot(i, six) for i, six in enumerate(frames, 1)], padding=padding, gain=1.0, rate=10.0)
     book = dataclasses.replace(book, ramp=ramp if book.hot else None)
     if not moving:
@@ -46,7 +46,7 @@ MOVED = (0.125, -0.125)
 
 
 def shown(frames: list[SixWay], book: Book, time: float) -> np.ndarray:
-    """What a billboard shows at a time in frames under the light and the sky: light and opacity, [H, W, 4]."""
+    """Returns a billboard at a time in frames under the light and the sky: light and opacity, [H, W, 4]."""
     first = min(int(time), len(frames) - 1)
     one, other = frames[first], frames[min(first + 1, len(frames) - 1)]
     moved = torch.zeros((2, *book.size))

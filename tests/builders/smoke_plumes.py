@@ -1,4 +1,4 @@
-"""Small smoke for tests: a leaning plume, alone and as the frames of a scene; cameras before it."""
+"""Small smoke for tests: a leaning plume, alone and as the frames of a scene, and cameras in front of it."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ SPHERE = {"radius": 0.15, "path": [[0, -0.4, 0.6, 0.3], [0.4, 0.4, 0.6, 0.3]]}
 
 
 def plume(frame: int = 3, *, hot: bool = False, device: str = "cpu") -> DensityVolume:
-    """A column of SCENE's box that rises by a third of it a frame, thicker and leaning as it rises."""
+    """Makes a leaning column in the box of SCENE, a third of the box higher with each frame."""
     centres = [(np.arange(n) + 0.5) * 0.05 for n in (20, 24, 20)]
     x, y, z = np.meshgrid(centres[0] - 0.5, centres[1], centres[2] - 0.5, indexing="ij")
     wide = np.hypot(x - 0.15 * y, z) / (0.12 + 0.15 * y)
@@ -36,20 +36,20 @@ def plume(frame: int = 3, *, hot: bool = False, device: str = "cpu") -> DensityV
 
 
 def unit_grid(n: int) -> list[np.ndarray]:
-    """x, y and z of n^3 voxel centres of the box from -1 to 1."""
+    """Returns x, y and z of the n^3 voxel centres of the box from -1 to 1."""
     axis = (np.arange(n) + 0.5) / n * 2 - 1
     return np.meshgrid(axis, axis, axis, indexing="ij")
 
 
 def facing(volume: DensityVolume, way: tuple = (0.0, 0.0, 1.0), size: int = 24, **options) -> Camera:
-    """A square image of a volume from some side, of 1.1 times its longest edge unless told."""
+    """Makes a square camera in front of a volume; the image is 1.1 times the volume's longest edge by default."""
     edge = max(volume.shape) * volume.voxel
     position = volume.centre + 3.3 * edge * np.array(way) / np.linalg.norm(way)
     return Camera.look_at(position, volume.centre, **({"extent": 1.1 * edge, "height": size, "width": size} | options))
 
 
 def write_frames(folder: Path, **changed: object) -> Frames:
-    """A folder as a simulation leaves it."""
+    """Writes a folder like that of a simulation."""
     frames = open_frames(folder, Scene.model_validate(SCENE | changed))
     for number in range(1, frames.scene.frames + 1):
         save_volume(frames.file(number), plume(number))

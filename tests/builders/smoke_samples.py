@@ -26,7 +26,7 @@ STEP = 3.0
 
 
 def view_of(volume: DensityVolume, degrees: float = 0.0, resolution: int = 32) -> Camera:
-    """A camera that holds a volume, turned about it."""
+    """Makes a camera that shows a whole volume, turned about it."""
     settings = CameraSettings(resolution=resolution).turned(degrees)
     return make_camera(settings, volume.origin, volume.voxel * np.array(volume.shape))
 
@@ -34,14 +34,14 @@ def view_of(volume: DensityVolume, degrees: float = 0.0, resolution: int = 32) -
 def sample(
     volume: DensityVolume, camera: Camera, seed: int = 0, kind: str = "paper"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """A guide [C, H, W] of a kind and its lightmaps [8, H, W], encoded."""
+    """Returns a guide [C, H, W] of a kind and its lightmaps [8, H, W], encoded."""
     guide = render_guide(volume, camera, kind, March(STEP, seed=seed))
     return guide, encode_lightmaps(bake(volume, camera, step=1.0, estimate=False))
 
 
 @functools.cache
 def small_pool(count: int = 6, first: int = 0, resolution: int = 32, kind: str = "paper") -> Pool:
-    """Samples on the CPU, those of odd numbers hot; numbers begin at `first`."""
+    """Makes samples on the CPU; samples of odd numbers are hot, and numbers begin at `first`."""
     guides, targets = [], []
     for i in range(first, first + count):
         pair = []
@@ -58,7 +58,7 @@ def small_pool(count: int = 6, first: int = 0, resolution: int = 32, kind: str =
 
 
 def random_model(spread: float = 0.2, seed: int = 0, **settings: Any) -> SmokeModel:
-    """A tiny network all of whose weights matter."""
+    """Makes a tiny network whose weights all have an effect."""
     torch.manual_seed(seed)
     network = SixWayNetwork(NetworkSettings(**{"width": 8, "levels": 3} | settings))
     for parameter in network.parameters():
@@ -67,7 +67,7 @@ def random_model(spread: float = 0.2, seed: int = 0, **settings: Any) -> SmokeMo
 
 
 def file_content(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What a network's file holds, but for the seconds that its training took."""
+    """Returns the content of a network's file except for the seconds of its training."""
     artifact = read_artifact(path)
     settings = {**artifact.settings, "summary": {**artifact.settings["summary"], "seconds": 0}}
     return settings, {name: array.tobytes() for name, array in artifact.tensors.items()}

@@ -1,4 +1,4 @@
-"""Shaders of flip books, and what they should show."""
+"""Shaders of flip books, and the results that they must give."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +19,7 @@ from wlm.smoke.shading import Light
 
 
 def smoke(layout, _) -> Subject:
-    """What `shade` makes of the frames that the textures hold, and where they are."""
+    """Compares the functions with `shade` of the frames in the textures, and with the places of the frames."""
     random = np.random.default_rng(5)
     maps = torch.tensor(random.uniform(0, 1, (5, 8, 6, 9)), dtype=torch.float32)
     frames = [SixWay(m[:6], m[6], m[7]) for m in maps]
@@ -59,7 +59,7 @@ vec4 shown(ivec2 pixel)
 
 
 def smoke_motion(_) -> Subject:
-    """Where a flip book's two frames are read, by a motion texture's texel, and the level of a smaller texture."""
+    """Compares the places at which two frames are read, from a texel of motion, and the mip level."""
     random = np.random.default_rng(7)
     scale = 0.07
     text = smoke_shader(replace(random_book(random_frames(size=(24, 24)), padding=4), scale=scale))
@@ -90,7 +90,7 @@ vec4 shown(ivec2 pixel)
 
 
 def billboard(_) -> Subject:
-    """What `shade` shows of a flip book with motion and fire, at a place in each pixel, at and between frames."""
+    """Compares a billboard with motion and fire with `shade`, at and between frames."""
     frames = random_frames()
     book = random_book(frames, moving=True)
     times = (0.0, 1.5, 3.25)
@@ -110,6 +110,6 @@ vec4 shown(ivec2 pixel)
 
 
 def smoke_subjects() -> dict[str, Callable[[object], Subject]]:
-    """All of them by name; each is made with the folder for its files, of which it needs none."""
+    """Returns all subjects by name."""
     layouts = {f"smoke {layout}": partial(smoke, layout) for layout in LAYOUTS}
     return {"smoke motion": smoke_motion, "smoke billboard": billboard} | layouts

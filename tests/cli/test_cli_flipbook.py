@@ -26,7 +26,7 @@ def info_of(folder) -> dict:
 
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory):
-    """Five frames of a scene with 20 a second, as bake leaves them, of fire with a ramp."""
+    """Writes five frames of burning smoke at 20 frames a second, like bake."""
     folder = tmp_path_factory.mktemp("jet")
     glow = ((0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.5, 0.0))
     for i, six in enumerate(random_frames(), 1):
@@ -37,7 +37,7 @@ def baked(tmp_path_factory):
 
 @pytest.fixture
 def frames() -> list[SixWay]:
-    """Four frames of smoke in a disc, with premultiplied light."""
+    """Makes four frames of smoke in a disc, with premultiplied light."""
     rows, columns = np.mgrid[:SIZE, :SIZE] / (SIZE - 1.0) - 0.5
     opacity = torch.tensor(np.clip(1.2 - 3.0 * np.hypot(rows, columns), 0.0, 1.0), dtype=torch.float32)
     random = np.random.default_rng(0)
@@ -53,7 +53,7 @@ def write(frames, layout, path):
 
 @pytest.fixture
 def straight(frames, tmp_path):
-    """The same with straight alpha: two textures, and one of opacity."""
+    """Writes the same with straight alpha: two textures, and one of opacity."""
     bare = []
     for frame in frames:
         opacity = 1.0 - frame.transparency
@@ -68,13 +68,13 @@ def straight(frames, tmp_path):
 
 
 def light_of(path) -> np.ndarray:
-    """A picture's linear light."""
+    """Reads the linear light of a picture."""
     code = np.asarray(Image.open(path).convert("RGB")) / 255.0
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
 def test_folders_of_baked_frames(baked, tmp_path):
-    """The rate is that of the scene's frames that are taken; the fire has its ramp."""
+    """The rate follows from the times of the chosen frames; the fire has the ramp of the scene."""
     text = call("smoke", "flipbook", baked, "-o", tmp_path / "all", "--engine", "three")
     assert "2 x 3 cells of 16 x 12, padded by 1" in text and "first.png" in text
     info = info_of(tmp_path / "all")

@@ -8,7 +8,6 @@ import yaml
 from builders.layered_sets import write_unity
 from builders.running import call, fails
 from builders.small_sets import tiny_profile
-from PIL import Image
 
 import wlm
 from wlm.formats.channels import read_channels
@@ -33,7 +32,6 @@ def test_compress_and_info_tell_every_sheet(made):
         assert sheet.label in text and sheet.label in call("info", folder / "a.wlm")
     assert len(model.sheets) == 6 and model.period == 24 and not list(folder.glob("*.partial"))
     facts = json.loads(call("info", folder / "a.wlm", "--json"))
-    assert "tiles of Lightmap-1/dir" in call("info", folder / "a.wlm", "--tiles")
     assert facts["bytes_on_disk"] == (folder / "a.wlm").stat().st_size
     assert facts["sheets"][3]["atlas"] == "Lightmap-1" and facts["sheets"][3]["height"] == 24
 
@@ -51,16 +49,14 @@ def test_evaluate_scores_every_sheet(made):
 def test_decode_writes_a_layer_with_its_channels(made, tmp_path):
     folder, _ = made
     decoder = wlm.load(folder / "a.wlm").decoder()
-    out, png = tmp_path / "a.exr", tmp_path / "a.png"
+    out = tmp_path / "a.exr"
     text = call("decode", folder / "a.wlm", "--time", 6, "--layer", "dir", "--atlas", "Lightmap-1", "-o", out)
     assert "R, G, B, A" in text and "Lightmap-1" in text
     pixels, names, _ = read_channels(out)
     assert names == ("R", "G", "B", "A")
     np.testing.assert_allclose(pixels, decoder.frame(6.0, "dir", "Lightmap-1"), atol=1e-3)
-    call("decode", folder / "a.wlm", "--time", 6, "-o", out, "--eight-bit", png)
-    assert read_channels(out)[0].shape == (16, 12, 3) and json.loads(Image.open(png).text["wlm"])["gamma"] == 2.2
-    options = ["-o", out, "--layer", "dir", "--eight-bit", png]
-    assert "at most three channels" in fails("decode", folder / "a.wlm", "--time", 6, *options)
+    options = ["-o", out, "--layer", "dir", "--texture", tmp_path / "a.dds"]
+    assert "expected a layer of light" in fails("decode", folder / "a.wlm", "--time", 6, *options)
 
 
 def test_wrong_layers_and_export(made, tmp_path):

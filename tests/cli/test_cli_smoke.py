@@ -36,7 +36,7 @@ def volume(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def frames(tmp_path_factory):
-    """Three frames of a plume that a sphere passes."""
+    """Three frames of a plume with a moving sphere."""
     return write_frames(tmp_path_factory.mktemp("frames") / "a", obstacles=[SPHERE]).path
 
 
@@ -156,7 +156,7 @@ def test_shade(baked, tmp_path):
 
 
 def test_every_route_keeps_the_scene(tmp_path):
-    """Lights, background, glow, obstacles and their shadows are those of the scene, whoever made the lightmaps."""
+    """Lights, background, glow, obstacles and shadows are those of the scene, however the lightmaps were made."""
     lights = [{"toward": [1, 0, 1], "irradiance": [20, 2, 2]}, {"toward": [-1, 1, 0], "irradiance": [0, 0, 30]}]
     looks = {"lights": lights, "background": [0.0, 0.2, 0.0], "obstacles": [SPHERE | {"colour": [0.5, 0.5, 0.1]}]}
     smoke = {"extinction": 8.0, "emission": 2.0, "glow": [[0, 0, 0, 0], [1, 3, 1, 0]], "albedo": [0.9, 0.5, 0.7]}
@@ -191,7 +191,6 @@ def test_every_route_keeps_the_scene(tmp_path):
 
 
 def test_a_scenes_glow(tmp_path):
-    """The emission's colour is that of the scene's stops, without any light."""
     smoke = {"extinction": 8.0, "emission": 5.0, "glow": [[0, 0, 0, 0], [0.1, 1, 0.5, 0], [9, 1, 0.5, 0]]}
     folder = write_frames(tmp_path / "a", smoke=smoke, lights=[], frames=1).path
     save_volume(folder / "frame_0001.npz", plume(hot=True))
@@ -203,7 +202,6 @@ def test_a_scenes_glow(tmp_path):
 
 
 def test_hard_volumes(tmp_path):
-    """Empty smoke, NaN, one voxel: each command ends well."""
     cases = {"empty": np.zeros((4, 5, 6)), "nan": np.full((3, 3, 3), np.nan), "one": np.ones((1, 1, 1))}
     for name, density in cases.items():
         path = tmp_path / f"{name}.npz"
@@ -240,6 +238,12 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
         assert line in fails(*made, "--volume", text)
     assert "--step" in fails(*made, "--step", 0)
     assert "device 'tpu'" in fails(*made, "--device", "tpu")
+    for words, line in (
+        (("--fit", "cube"), "--fit"),
+        (("--albedo", 0.9), "--albedo"),
+        (("--fit", "sphere", "--supersample", 2), "--supersample"),
+    ):
+        assert line in fails(*made, *words)
     assert "ends in .exr" in fails("smoke", "bake", volume, "-o", tmp_path / "a.png")
     assert "gone.npz: cannot read the arrays: No such file" in fails("smoke", "bake", tmp_path / "gone.npz", "-o", out)
     assert "expected a name that ends in .npz, .nvdb, .vdb" in fails("smoke", "bake", tmp_path / "a.abc", "-o", out)

@@ -35,7 +35,7 @@ def camera_of(volume) -> Camera:
 
 
 def test_marched_and_traced_pictures_agree(volume, tmp_path):
-    """All orders are brighter than one, and near what is traced; an albedo of 0 is black where no fire is."""
+    """All orders are brighter than single scattering and near the traced picture; albedo 0 is black without fire."""
     lamp = ("--light", "1,0.5,0.6:9", "--volume", "extinction=8", "--volume", "emission=0")
     for name, words in (
         ("all", ("--albedo", "0.95")),

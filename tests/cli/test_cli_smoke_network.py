@@ -1,4 +1,4 @@
-"""The network from the command line: trained, stopped and resumed, used, measured, exported; its samples."""
+"""The commands of the network: train, predict, evaluate and export."""
 
 import json
 import os
@@ -49,7 +49,7 @@ PROFILE = {
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A profile and what its training leaves, with its output."""
+    """A profile with the result and the output of its training."""
     folder = tmp_path_factory.mktemp("trained")
     (folder / "tiny.yaml").write_text(yaml.safe_dump(PROFILE))
     text = call("smoke", "train", folder / "tiny.yaml", "-o", folder / "a.safetensors", "--seed", 3)
@@ -84,7 +84,7 @@ def test_train(trained):
 
 
 def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
-    """By Ctrl-C, then by the clock; it ends with the same weights."""
+    """A training stopped by Ctrl-C and by the time limit ends with the same weights."""
     folder, _, _ = trained
     words = ("smoke", "train", folder / "tiny.yaml", "-o", tmp_path / "a.safetensors", "--seed", 3)
     run, calls = Trainer.run, []
@@ -170,7 +170,7 @@ def test_evaluate(network, volume, tmp_path):
     names = ["density x 0.5", "density x 1", "density x 2", str(volume)]
     assert [part["name"] for part in report["sets"]] == names and report["resolution"] == 20 and report["cells"] == 16
     for part in report["sets"]:
-        assert list(part["methods"]) == ["network"] and part["half_loss"] is None
+        assert list(part["methods"]) == ["network", "coarse march"] and part["half_loss"] is None
         for method in part["methods"].values():
             assert method["lowest"] <= method["psnr"] <= method["highest"] and len(method["planes"]) == 8
             assert f"{method['psnr']:.2f}" in text and f"{method['planes']['top']:.2f}" in text
@@ -184,7 +184,7 @@ def test_evaluate(network, volume, tmp_path):
 
 
 def test_export(network, tmp_path):
-    """ONNX computes what the network does, of a size that its levels' squares don't divide."""
+    """The ONNX network computes the same at a size that its levels do not divide."""
     for package in ("onnx", "onnxscript"):
         pytest.importorskip(package)
     runtime = pytest.importorskip("onnxruntime")

@@ -1,4 +1,4 @@
-"""A scene as pictures in memory: `wlm smoke run`."""
+"""`wlm smoke run`."""
 
 import os
 import sys
@@ -51,7 +51,7 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
 
 
 def test_run_has_light_of_all_orders(scene, tmp_path):
-    """As `light` lights the frames of `simulate`; brighter than light that was scattered once."""
+    """The pictures equal those of `light` and are brighter than single scattering."""
     two = ("--frames", 2)
     text = call("smoke", "run", scene, "-o", tmp_path / "run", *two)
     assert "light of all orders" in text and "shadows and picture" in text

@@ -1,4 +1,4 @@
-"""Simulations from the command line: as told, stopped and resumed, and of hard scenes."""
+"""`wlm smoke simulate`: options, interruption, resume, and hard scenes."""
 
 import itertools
 import os
@@ -32,7 +32,7 @@ JET = SCENE | {
 
 @pytest.fixture(scope="session")
 def jet(tmp_path_factory):
-    """A scene to simulate, and what it leaves."""
+    """A scene and the folder of its simulation."""
     folder = tmp_path_factory.mktemp("jet")
     (folder / "jet.yaml").write_text(yaml.safe_dump(JET))
     call("smoke", "simulate", folder / "jet.yaml", "-o", folder / "a")
@@ -90,7 +90,7 @@ def test_simulate_as_told(jet, tmp_path):
 
 @pytest.mark.parametrize("within", [False, True])
 def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch):
-    """Ctrl-C during the second frame keeps it, or what there is of it; the rest comes out the same to the last bit."""
+    """Ctrl-C within the second frame or at its end keeps the state; the resumed frames are equal to the bit."""
     out, scene = tmp_path / "out", jet / "jet.yaml"
     step, done = Solver.step, []
 
@@ -146,7 +146,7 @@ def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
 
 
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
-    """A state is kept after its frame: where the frame isn't there, it is simulated again."""
+    """A state is saved after its frame: a missing frame is simulated again."""
     scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
 
     def full(path, volume, **options):

@@ -119,10 +119,10 @@ def test_the_first_argument_is_found_anywhere(tmp_path, monkeypatch):
 
 
 def test_the_file_chooses_the_system(tmp_path):
-    assert "wlm info" in call("info", "--help") and "--tiles" not in call("info", "--help")
-    assert "--tiles" in call("info", FILES / "lightmap.wlm", "--help")
-    assert "--tiles" in call("info", "--system", "lightmap", "--help")
-    assert "--tiles" not in call("info", "--system=probe", "--help")
+    assert "wlm info" in call("info", "--help") and "--layer" not in call("decode", "--help")
+    assert "--layer" in call("decode", FILES / "lightmap.wlm", "--help")
+    assert "--layer" in call("decode", "--system", "lightmap", "--help")
+    assert "--layer" not in call("decode", "--system=probe", "--help")
     assert "expected one of lightmap, atlas, probe, smoke, got 'sound'" in fails("info", "--system", "sound")
     assert "Missing argument" in fails("info")
     assert "expected an artifact" in fails("info", __file__)

@@ -17,7 +17,7 @@ LOOSE = 2e-5  # of the largest value: what float32 leaves of sums over 100 sampl
 
 
 def _scene(turned: bool, perspective: bool = False, inside: bool = False, seed: int = 3) -> Scene:
-    """Blobs of smoke with holes, of three unlike sizes, seen along an axis or askew."""
+    """Makes smoke in random blobs, in a box of three different sizes, seen along an axis or at an angle."""
     random = np.random.default_rng(seed)
     density = np.maximum(random.normal(0.2, 0.6, (9, 12, 10)), 0).astype(np.float16).astype(np.float32)
     density[:3, :5] = 0
@@ -38,7 +38,7 @@ def _view(scene: Scene) -> View:
 
 
 def _run(launch, planes: tuple, scene: Scene, device: str, *arguments, dtype=wp.float32, hot=None, **options):
-    """A march's result; `hot`: temperature and emission."""
+    """Returns the result of a march; `hot`: temperature and emission."""
     heat = () if hot is None else (array(hot[0], dtype, device), hot[1])
     medium = Medium(array(scene.density, dtype, device), scene.extinction, *heat)
     out = wp.full((*planes, scene.height, scene.width), np.nan, dtype=float, device=device)
@@ -62,7 +62,7 @@ def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
 @pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
 def test_guide_against_reference(device: str, turned: bool, perspective: bool, kind: str):
-    """Algorithm 1 with a march from each sample, at a step that is no divisor of anything."""
+    """Algorithm 1 with a march from each sample, at a step that divides no length."""
     scene = _scene(turned, perspective)
     result = _guide(scene, device, TYPES[kind], step=2.37, jitter=0.0, g=0.3, threshold=0.1, cutoff=0.0, shared=False)
     expected = reference.guide(scene, 2.37, 0.3, 0.1)
@@ -71,7 +71,7 @@ def test_guide_against_reference(device: str, turned: bool, perspective: bool, k
 
 
 def test_shared_lights(device: str):
-    """The lattice holds what the reference marches; with nodes a voxel apart the map is nearly the marched one."""
+    """The lattice equals the reference; with nodes a voxel apart the map is near that without a lattice."""
     scene = _scene(True)
     medium = Medium(array(scene.density, float, device), scene.extinction)
     nodes = marches.guide_nodes(medium, scene.up, 2.5)
@@ -88,7 +88,7 @@ def test_shared_lights(device: str):
 
 
 def test_jitter(device: str):
-    """It moves samples within their steps: another seed, another map, no other mean; the same seed, the same bits."""
+    """Another seed gives another map with the same mean; the same seed gives the same bits."""
     scene = _scene(True)
     scene.height = scene.width = 64
     scene.pitch = 0.15
@@ -101,7 +101,7 @@ def test_jitter(device: str):
 
 
 def test_cutoff(device: str):
-    """What a ray leaves out when it ends early is within what is said."""
+    """The light that a ray omits when it ends early is within the stated bound."""
     scene = _scene(False)
     scene.extinction = 3.0
     whole = _guide(scene, device, step=0.5, jitter=0.0, cutoff=0.0)
@@ -116,7 +116,7 @@ def test_cutoff(device: str):
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
 def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind: str, monkeypatch):
-    """With the same samples, in slabs of a few planes; from inside the smoke too, and smoke that glows."""
+    """The same samples, processed in slabs of a few planes, also from inside the smoke and for hot smoke."""
     scene = _scene(turned, inside=inside)
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
     monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
@@ -128,7 +128,7 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
 
 
 def test_image_smaller_than_the_smoke(device: str):
-    """Smoke outside the image still casts its shadow: a window of the map is the map of the window."""
+    """Smoke outside the image casts shadows: a smaller image equals a part of the larger one."""
     scene = _scene(True)
     scene.height = scene.width = 16
     whole = _six(scene, device, step=0.8)
@@ -137,7 +137,7 @@ def test_image_smaller_than_the_smoke(device: str):
 
 
 def test_six_way_against_single_lights(device: str):
-    """The shared sweeps against a march from each sample, which has no code of theirs, as both steps shrink."""
+    """The sweeps converge to the independent march from each sample as both steps shrink."""
     scene = _scene(True)
     ways = [sign * axis for axis in (scene.right, scene.up, scene.toward) for sign in (1.0, -1.0)]
     fine = [_lit(scene, device, way, step=0.04, g=0.3) for way in ways]
@@ -152,7 +152,7 @@ def test_six_way_against_single_lights(device: str):
 
 @pytest.mark.parametrize("extinction", [1e-4, 0.05, 2.0])
 def test_slab_closed_forms(device: str, extinction: float):
-    """A ray through the middle of a block: closed forms for what comes along it, one integral for the sides."""
+    """A ray through the middle of a block has closed forms, and an integral for the light from the sides."""
     n = 16
     centre = np.full(3, n / 2)
     density = np.ones((n, n, n), np.float32)
@@ -177,7 +177,7 @@ def test_slab_closed_forms(device: str, extinction: float):
 
 
 def test_empty_bricks(device: str):
-    """They are those without smoke within reach, and a march that skips them finds what one without bricks does."""
+    """Bricks without smoke within reach are found, and skipping them does not change the light."""
     density = np.zeros((40, 20, 9), np.float32)
     density[24:] = 1.0
     assert occupied(Medium(array(density, float, device), 1.0)).numpy()[:, 0, 0].tolist() == [0, 0, 1, 1, 1]

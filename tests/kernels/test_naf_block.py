@@ -1,4 +1,4 @@
-"""What a NAFBlock does besides products, against float64 of torch."""
+"""The kernels of a NAFBlock against torch in float64."""
 
 import numpy as np
 import pytest

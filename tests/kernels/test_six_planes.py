@@ -1,4 +1,4 @@
-"""The guide of six lights and the planes behind the network's heads, against float64 of torch."""
+"""The encoding of the guide of six lights and the planes after the network's heads, against torch in float64."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ def _wanted(heads, guide, filters, places, stem, smoke, reach=8) -> torch.Tensor
 @pytest.mark.parametrize("stem", [1, 2, 3])
 @pytest.mark.parametrize("size", [(1, 1), (4, 8), (17, 23), (41, 50)])
 def test_planes_of_heads_and_a_filter(device, size, stem, half):
-    """Sums are float32 even of half floats. The image of the heads may be larger, and the filter may leave planes."""
+    """Sums are float32 also for half floats. The image of the heads may be larger, and the filter may omit planes."""
     heads = _random(half, 2, 5 * PLANES + 4, *(-(-extent // stem) + 1 for extent in size))
     guide, filters = _random(half, 4, *size), _random(False, PLANES, 3, 5, 5)
     smoke = [[int(i == j == 0) for j in range(-(-size[1] // 8))] for i in range(-(-size[0] // 8))]
@@ -108,7 +108,7 @@ def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
 @pytest.mark.parametrize("reach", [4, 8, 32])
 @pytest.mark.parametrize("size", [(1, 1), (8, 5), (17, 70), (100, 33)])
 def test_blocks_with_smoke(device, size, reach, half):
-    """One pixel is enough, even a block's last; what is 0, below or not a number isn't smoke."""
+    """A single pixel counts, also the last of a block; 0, negative values and NaN do not."""
     guide = _random(half, 4, *size)
     some = torch.rand(size, generator=torch.Generator().manual_seed(1))
     guide[2] = torch.where(some < 0.01, 1e-3, torch.where(some < 0.5, torch.nan, -(some > 0.9).float()))

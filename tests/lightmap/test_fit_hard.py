@@ -58,7 +58,7 @@ def test_a_constant_tile_is_within_half_a_step_of_half_float(tmp_path):
     np.testing.assert_allclose(decoded(decoder), frames, rtol=2**-10)
     # Between two times a constant tile is interpolated as light is.
     np.testing.assert_allclose(decoder.frame(0.25)[5, 5], 0.75 * levels[0] + 0.25 * levels[1], rtol=2**-10)
-    pixels, peak = decoder.frame_8bit(2.0)
+    (pixels,), peak = decoder.tiles_8bit([0], 2.0)
     np.testing.assert_allclose((pixels[3, 3, :3] / 255.0 * peak[0]) ** 2.2, levels[2], rtol=1e-3)
 
 
@@ -176,8 +176,6 @@ def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
     assert len(decoder.model.kind) == tiles
     assert decoder.tile(tiles - 1, 3.0).shape == (128, 128, 3)
     assert decoder.tile(0, 3.0, border=4).shape == (136, 136, 3)
-    pixels, peak = decoder.frame_8bit(3.0)
-    assert pixels.shape == (height, width, 4) and peak.shape == (tiles,)
     report = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps, metrics=("psnr",))
     assert report.bytes == (tmp_path / "a.wlm").stat().st_size
     assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
@@ -230,7 +228,7 @@ def test_a_channel_that_is_black_at_one_time_stays_black(tmp_path):
     out = decoded(decoder)
     assert not out[1, ..., 2].any() and not out[3].any()
     assert out[1, ..., 0].mean() > 0.05 and out[2, ..., 2].mean() > 0.05
-    pixels, peak = decoder.frame_8bit(HOURS[3])
+    pixels, peak = decoder.tiles_8bit([0], HOURS[3])
     assert peak[0] == 0 and not pixels[..., :3].any()
 
 
@@ -326,8 +324,8 @@ def test_midnight_lies_between_the_last_and_the_first_time():
 
 def test_the_eight_bit_path_is_the_float_path_rounded(tmp_path):
     decoder = through_file(tmp_path, moving_light(), tiny_profile(steps=60))
-    pixels, peak = decoder.frame_8bit(5.0)
-    colour = np.minimum(decoder.frame(5.0) ** (1.0 / 2.2) / peak[0], 1.0)
+    pixels, peak = decoder.tiles_8bit([0], 5.0)
+    colour = np.minimum(decoder.tiles([0], 5.0) ** (1.0 / 2.2) / peak[0], 1.0)
     np.testing.assert_allclose(pixels[..., :3] / 255.0, colour, atol=0.51 / 255.0)
     assert (pixels[..., 3] == 255).all()
 

@@ -81,16 +81,6 @@ def test_a_map_and_its_tiles_agree(model, time):
         assert np.array_equal(last[: inside.shape[0], : inside.shape[1]], inside)
 
 
-def test_eight_bits_follow(model):
-    decoder = SheetDecoder(model)
-    for time in (7.5, 10.0):
-        pixels, bounds = decoder.frame_8bit(time)
-        largest = np.repeat(np.repeat(bounds.reshape(2, 2), 128, 0), 128, 1)[:236, :247, None]
-        colour = np.minimum(decoder.frame(time) ** (1.0 / 2.2) / largest, 1.0)
-        assert np.abs(pixels[..., :3] / 255.0 - colour).max() < 1.6 / 255.0
-        assert (pixels[..., 3] == 255).all()
-
-
 def _file_of(sheet):
     return LightmapModel("m", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
 

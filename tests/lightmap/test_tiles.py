@@ -11,9 +11,9 @@ from wlm.lightmap.tiles import (
     TileData,
     TileGrid,
     TileKind,
-    assemble,
     channel_means,
     classify,
+    place,
     split,
     static_pattern,
 )
@@ -57,14 +57,16 @@ def test_grid():
         TileGrid.of(0, 5)
 
 
-def test_split_and_assemble_are_inverse(lightmaps):
+def test_split_and_place_are_inverse(lightmaps):
     grid = TileGrid.of(HEIGHT, WIDTH)
     tiles = split(lightmaps, 1.0)
     np.testing.assert_array_equal(tiles.index, range(6))
     assert tiles.colour.shape == (6, 3, TILE, TILE, 3) and tiles.colour.dtype == np.float32
-    np.testing.assert_array_equal(assemble(tiles.mask[..., None], tiles.index, grid)[..., 0], lightmaps.mask)
+    valid, image = np.zeros((HEIGHT, WIDTH, 1), bool), np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    place(valid, tiles.mask[..., None], tiles.index, grid)
+    np.testing.assert_array_equal(valid[..., 0], lightmaps.mask)
     for t in range(3):
-        image = assemble(tiles.colour[:, t], tiles.index, grid)
+        place(image, tiles.colour[:, t], tiles.index, grid)
         np.testing.assert_array_equal(image[lightmaps.mask], lightmaps.frames[t][lightmaps.mask])
 
 
@@ -115,23 +117,6 @@ def test_split_refuses(lightmaps):
     for tiles, text in (([6], "outside the grid"), ([-1], "outside the grid"), ([1, 1], "twice"), ([], "none")):
         with pytest.raises(WlmError, match=text):
             split(lightmaps, GAMMA, tiles)
-    for gamma in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(WlmError, match="gamma"):
-            split(lightmaps, gamma)
-
-
-def test_assemble_fills_what_is_absent_and_keeps_the_type():
-    grid = TileGrid.of(HEIGHT, WIDTH)
-    image = assemble(np.full((1, TILE, TILE, 2), 7, np.uint8), np.array([4]), grid, fill=3)
-    assert image.shape == (HEIGHT, WIDTH, 2) and image.dtype == np.uint8
-    assert (image[TILE:, TILE : 2 * TILE] == 7).all() and (image == 7).sum() == (HEIGHT - TILE) * TILE * 2
-    assert ((image == 7) | (image == 3)).all()
-    with pytest.raises(WlmError, match="twice"):
-        assemble(np.zeros((2, TILE, TILE, 3)), np.array([1, 1]), grid)
-    with pytest.raises(WlmError, match="expected tiles"):
-        assemble(np.zeros((2, TILE, TILE, 3)), np.array([1]), grid)
-    with pytest.raises(WlmError, match="outside"):
-        assemble(np.zeros((1, TILE, TILE, 3)), np.array([6]), grid)
 
 
 def test_channel_means_count_valid_texels_only(lightmaps):
@@ -244,11 +229,3 @@ def test_grey_time_of_no_range_but_another_light_is_dynamic():
 def test_classify_takes_a_batch_in_order(lightmaps):
     kinds = classify(split(lightmaps, GAMMA), GAMMA)
     assert kinds.tolist() == [3, 0, 3, 3, 3, 3] and kinds.dtype == np.int64
-
-
-def test_classify_refuses():
-    tile = _tile(np.zeros((1, 1, 1, 3)))
-    with pytest.raises(WlmError, match="static_budget_db"):
-        classify(tile, GAMMA, float("nan"))
-    with pytest.raises(WlmError, match="gamma"):
-        classify(tile, 0.0)

@@ -1,4 +1,4 @@
-"""Six-way lightmaps by a coarse march: against the fine march, the guiding map, and what is known exactly."""
+"""Six-way lightmaps by a coarse march: against the fine march, the guiding map, and closed forms."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -35,7 +35,7 @@ def _planes(volume: DensityVolume, camera: Camera, **settings) -> torch.Tensor:
 
 
 def _errors(result: SixWay, exact: SixWay) -> tuple[float, float]:
-    """Greatest and mean error of any plane, over the plane's greatest value."""
+    """Returns the largest and the mean error of any plane, relative to the plane's largest value."""
     pairs = [*zip(result.lightmaps, exact.lightmaps, strict=True), (result.transparency, exact.transparency)]
     if exact.emission is not None:
         pairs += [(result.emission, exact.emission)]
@@ -44,7 +44,7 @@ def _errors(result: SixWay, exact: SixWay) -> tuple[float, float]:
 
 
 def _blob(shape: tuple[int, int, int], device: str) -> DensityVolume:
-    """Smooth, and thin at the box's border."""
+    """Makes smooth smoke that is thin at the border of the box."""
     axes = [np.linspace(-1, 1, n + 2)[1:-1] for n in shape]
     x, y, z = np.meshgrid(*axes, indexing="ij")
     density = np.exp(-4 * (x * x + y * y + z * z + x * y)) * (1 + 0.4 * np.sin(4 * x + 3 * z))
@@ -53,7 +53,7 @@ def _blob(shape: tuple[int, int, int], device: str) -> DensityVolume:
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_small_steps_give_the_fine_march(device: str, view: str):
-    """All planes, of hot smoke with a phase function that isn't even, from any side."""
+    """All planes of hot smoke with an anisotropic phase function, from all views."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume, toward=VIEWS[view])
     exact = bake(volume, camera, step=0.25, g=0.4, estimate=False)
@@ -69,7 +69,7 @@ def test_small_steps_give_the_fine_march(device: str, view: str):
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("shape", [(20, 20, 20), (5, 30, 12), (1, 16, 16), (16, 1, 16), (1, 1, 24)])
 def test_boxes(device: str, shape: tuple[int, int, int], view: str):
-    """Of any form, thin ones too, with smoke up to the border."""
+    """Boxes of any shape, also thin ones, with smoke up to the border."""
     rng = np.random.default_rng(5)
     volume = from_array(rng.uniform(0.5, 1.0, shape).astype(np.float32), extinction=0.1, device=device)
     camera = _camera(volume, 32, VIEWS[view])
@@ -82,7 +82,7 @@ def test_boxes(device: str, shape: tuple[int, int, int], view: str):
 
 
 def test_finer_nodes_and_finer_ways_are_better(device: str):
-    """Each of the three steps has an error of its own."""
+    """Each of the three steps has an error."""
     volume = _blob((24, 30, 20), device)
     camera = _camera(volume, 32)
     exact = bake(volume, camera, step=0.25, estimate=False)
@@ -93,7 +93,7 @@ def test_finer_nodes_and_finer_ways_are_better(device: str):
 
 
 def test_a_pixel_by_float64(device: str):
-    """The definition, added up in float64 without anything shared."""
+    """The definition in float64, without shared work."""
     volume = _blob((12, 14, 10), device)
     middle = np.array([6.2, 7.5, 5.1])
     camera = Camera.look_at((30.0, 22.0, 41.0), middle, world_up=(0.3, 1.0, 0.1), extent=1.0, height=1, width=1)
@@ -128,7 +128,7 @@ def test_a_pixel_by_float64(device: str):
 
 
 def test_shadows_to_all_sides(device: str):
-    """A wall darkens the light that it stands before, and no other."""
+    """A wall darkens only the light of its side."""
     density = np.zeros((24, 24, 24), np.float32)
     density[11:13, 11:13, 8:16] = 0.05
     open_smoke = from_array(density, device=device)
@@ -147,7 +147,7 @@ def test_shadows_to_all_sides(device: str):
 
 
 def test_sums_are_the_guiding_map(device: str):
-    """Front, top and bottom together are the guide's light, and without jitter depth and transparency are its own."""
+    """Front, top and bottom add up to the guide's light; without jitter depth and transparency are equal."""
     volume = plume(device=device)
     camera = _camera(volume)
     settings = {"jitter": 0.0, "threshold": 0.05, "g": -0.2}
@@ -160,7 +160,7 @@ def test_sums_are_the_guiding_map(device: str):
 
 
 def test_emission_knows_no_nodes(device: str):
-    """What smoke gives off itself passes the ray alone; nothing does without a temperature."""
+    """Emission does not depend on the lattice, and is absent without a temperature."""
     volume = plume(hot=True, device=device)
     camera = _camera(volume)
     rough, fine = (_planes(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
@@ -192,7 +192,7 @@ def test_empty_bricks_change_nothing(device: str, dtype: torch.dtype, monkeypatc
 
 
 def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torch.Tensor:
-    """The jitter of a single step through the box, by the depth of its sample."""
+    """Returns the jitter of a single step through the box, measured by the depth of its sample."""
     volume = from_array(np.ones((8, 8, 8), np.float32), device=device)
     camera = Camera.look_at((4.0, 4.0, 18.5), (4.0, 4.0, 4.0), extent=6.0, height=size, width=size)
     result = _march(volume, camera, step=9.0, jitter=jitter, seed=seed, threshold=0.0)
@@ -201,7 +201,7 @@ def _shifts(seed: int, device: str, size: int = 64, jitter: float = 1.0) -> torc
 
 @pytest.mark.parametrize("seed", [1, 63, 64 * 10**12 + 9, -3])
 def test_jitter(device: str, seed: int):
-    """Jimenez's noise, of which 64 patterns differ; half of it is half as wide."""
+    """The noise is Jimenez's with 64 patterns; half the jitter has half the range."""
     result = _shifts(seed, device)
     assert float(result.min()) > -1e-6 and float(result.max()) < 1.0
     y, x = np.mgrid[:64, :64] + 5.588238 * (seed % 64)
@@ -215,7 +215,7 @@ def test_jitter(device: str, seed: int):
 
 
 def test_jitter_over_a_few_pixels(device: str):
-    """Their mean varies far less than that of independent numbers, and all numbers are as frequent."""
+    """The mean over a few pixels varies far less than that of independent numbers; the distribution is uniform."""
     result = _shifts(11, device)
     means = torch.nn.functional.avg_pool2d(result[None], 5)[0]
     assert float(means.std()) < 0.5 * (1 / 12) ** 0.5 / 5
@@ -224,7 +224,7 @@ def test_jitter_over_a_few_pixels(device: str):
 
 
 def test_nodes_are_bounded(device: str):
-    """However close they are asked for, and however thin the box."""
+    """The number of nodes is bounded for any spacing and any box."""
     volume = _blob((12, 9, 10), device)
     camera = _camera(volume)
     expected = _planes(volume, camera, step=1.0, spacing=0.25)

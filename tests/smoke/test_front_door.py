@@ -1,4 +1,4 @@
-"""The calls of `wlm.smoke` as a user writes them: the README's snippet, and the three ways to lightmaps."""
+"""The calls of `wlm.smoke` as in the README, and the three ways to make lightmaps."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def test_the_snippet(smoke):
 
 
 def test_three_ways_to_the_same_lightmaps(smoke):
-    """On dense smoke each is near the fine march, in its own planes."""
+    """On dense smoke both other methods are near the fine march."""
     dense = wlm.smoke.DensityVolume(smoke.density, 8.0, smoke.voxel, smoke.origin, smoke.temperature)
     camera = wlm.smoke.Camera.around(dense, toward=(0.3, 0.2, 1.0), pixels=96)
     baked = wlm.smoke.bake(dense, camera)
@@ -42,7 +42,7 @@ def test_three_ways_to_the_same_lightmaps(smoke):
 
 
 def test_a_predictor_for_many_frames(smoke):
-    """One network, several sizes; the seed is that of the guiding map."""
+    """One predictor serves several sizes; the seed is that of the guiding map."""
     predictor = wlm.smoke.SmokePredictor()
     cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 24, 32, 40, 48)]
     first = [wlm.smoke.predict(smoke, camera, predictor, seed=1) for camera in cameras]

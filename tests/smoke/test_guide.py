@@ -1,4 +1,4 @@
-"""Guiding maps in the world: units, cameras and the error of a large step."""
+"""Guiding maps in world units: depth, cameras, and the error of the step."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from wlm_kernels.smoke.settings import March
 
 
 def _ball(device: str, n: int = 32, voxel: float = 0.5, extinction: float = 0.4) -> DensityVolume:
-    """A soft ball with a bump, off the origin of the world."""
+    """Makes a soft ball with a bump, away from the world's origin."""
     x, y, z = unit_grid(n)
     density = np.clip(1.6 - 2 * np.sqrt(x**2 + y**2 + z**2), 0, 1) * (1 + 0.5 * np.sin(5 * x) * np.cos(4 * y))
     return from_array(
@@ -29,7 +29,7 @@ def _camera(volume: DensityVolume, way: tuple = (0.3, 0.4, 1.0), distance: float
 
 @pytest.mark.parametrize("perspective", [False, True])
 def test_depth_is_in_the_world(device: str, perspective: bool):
-    """A pixel's depth along its ray ends on the ball's face; scale and shift change nothing else."""
+    """A pixel's depth ends on the surface of the ball; scaling and moving the world changes nothing else."""
     volume = _ball(device)
     camera = _camera(volume, extent=0.4 if perspective else 16.0, perspective=perspective)
     result = guide(volume, camera, March(0.5, jitter=0.0, threshold=0.05))
@@ -48,7 +48,7 @@ def test_depth_is_in_the_world(device: str, perspective: bool):
 
 
 def test_distance_of_an_orthographic_camera(device: str):
-    """It changes the depths alone, by as much, even from very far."""
+    """The distance changes only the depths, by the same amount, also from very far away."""
     volume = _ball(device)
     near, far = (
         guide(volume, _camera(volume, distance=distance), March(1.0, jitter=0.0)) for distance in (30.0, 30_000.0)
@@ -60,7 +60,7 @@ def test_distance_of_an_orthographic_camera(device: str):
 
 
 def test_camera_inside(device: str):
-    """It sees less smoke than from outside, and no depth beyond what is ahead."""
+    """A camera inside shows less smoke than one outside, and no depth beyond the smoke in front of it."""
     volume = _ball(device)
     inside, outside = (
         guide(volume, _camera(volume, distance=distance, extent=4.0), March(0.5, jitter=0.0))
@@ -72,7 +72,7 @@ def test_camera_inside(device: str):
 
 
 def test_steps_against_a_fine_march(device: str):
-    """The error grows with the step, as a table has it; with a step of a voxel it is small."""
+    """The error grows with the step, and is small for a step of a voxel."""
     volume = _ball(device)
     camera = _camera(volume)
     fine = guide(volume, camera, March(0.1, jitter=0.0, cutoff=0.0), shared=False).maps

@@ -1,4 +1,4 @@
-"""Every march at its limits: no smoke, a wall, one voxel, NaN, a camera inside the smoke or that doesn't see it."""
+"""Every march with extreme input: no smoke, opaque smoke, one voxel, NaN, and a camera inside or turned away."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The march to a scene's own lights: against the march that shares nothing, the path tracer, and six ways."""
+"""The march to each light: against a march from every sample, the path tracer, and six-way lightmaps."""
 
 import math
 
@@ -22,14 +22,14 @@ WAYS = [(1.0, 0.7, 0.8), (-0.3, -0.9, 0.5), (0.0, 0.0, -1.0)]
 
 
 def rms(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Root of the mean square of the difference over that of `b`."""
+    """Returns the RMS of the difference relative to that of `b`."""
     return float(((a - b).double().square().mean() / b.double().square().mean()).sqrt())
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("perspective", [False, True])
 def test_each_light_has_its_own_march(device: str, g: float, perspective: bool):
-    """Lights from anywhere within 0.5% of a march from each sample, and the opposite ones as well."""
+    """Lights from any direction and their opposites are within 0.5% of a march from every sample."""
     volume = make_plume(28, hot=False, extinction=10.0, device=device)
     camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=16, perspective=perspective)
     made = light_smoke(volume, camera, [Light(way) for way in WAYS], fine_march(volume, g))
@@ -61,7 +61,7 @@ def test_a_point_light_at_a_sample_is_no_brighter_than_beside_it(device: str, z:
 
 
 def test_the_whole_picture_is_the_tracers(device: str):
-    """Two lights in colour, albedo in colour, emission and background: as the first order that is traced."""
+    """Coloured lights, albedo, emission and background give the first traced order."""
     volume = make_plume(28, hot=True, extinction=8.0, device=device)
     camera = facing(volume, (0.2, 0.1, 1.0), size=12)
     lights = [Light((1.0, 0.7, 0.8), (6.0, 3.0, 1.0)), Light((-1.0, 0.1, 0.2), (0.0, 4.0, 8.0))]
@@ -77,7 +77,7 @@ def test_the_whole_picture_is_the_tracers(device: str):
 
 
 def test_six_ways_are_far_off_and_this_is_not(device: str):
-    """What the lights' own march is for: oblique lights, where weighed lightmaps are wrong by a quarter."""
+    """Weighted lightmaps have a large error for an oblique light, the march to the light has not."""
     volume = make_plume(40, hot=False, extinction=25.0, device=device)
     camera = facing(volume, size=20)
     light = Light((1.0, 0.7, 0.8))
@@ -90,7 +90,6 @@ def test_six_ways_are_far_off_and_this_is_not(device: str):
 
 
 def test_hard_smoke(device: str):
-    """No smoke, thick smoke, no light, a camera and a light within, one voxel."""
     volume = make_plume(16, extinction=10.0, device=device)
     none = light_smoke(volume, facing(volume, size=6), [])
     assert none.planes.shape == (0, 6, 6) and none.emission.any() and none.shade().any()
@@ -108,7 +107,7 @@ def test_hard_smoke(device: str):
 
 
 def test_a_sky_is_twelve_lights(device: str):
-    """They have all of its light, and the picture is near the tracer's."""
+    """The lights have all light of the sky, and the picture is near the traced one."""
     sky = (0.3, 0.3, 0.6)
     lights = sky_lights(sky)
     total = sum(np.array(light.irradiance) for light in lights)

@@ -1,4 +1,4 @@
-"""Losses: each part against its definition, and on errors of a known kind."""
+"""Losses: definitions, and errors of known kinds."""
 
 import math
 
@@ -49,7 +49,6 @@ def test_warping_by_nan_or_infinity_is_outside():
 
 @pytest.mark.parametrize("size", [(7, 9), (1, 5), (1, 1)])
 def test_warping_and_its_gradient_are_those_of_torch(size):
-    """Against `grid_sample`, which clamps likewise."""
     height, width = size
     image = torch.randn(2, 3, height, width, dtype=torch.float64, requires_grad=True)
     motion = 4 * torch.randn(2, 2, height, width, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Motion across the image: against closed forms, a loop of NumPy, and what it is for, finding smoke where it was."""
+"""Motion across the image: closed forms, a loop in NumPy, and the warped earlier frame."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,6 @@ from reference.marching import trilinear
 from wlm.fluid.volume import from_array
 from wlm.smoke.march.fine import bake
 from wlm.smoke.march.motion import motion
-from wlm.smoke.network.dataset import make_validation
-from wlm.smoke.network.losses import warp
-from wlm.smoke.network.planes import OPACITY_PLANE
-from wlm.smoke.network.settings import DatasetSettings
 
 SIZE = 24
 
@@ -29,7 +25,7 @@ def _ball(at: tuple = (12.0, 12.0, 12.0), radius: float = 6.0, n: int = SIZE) ->
 
 
 def _warped(earlier: torch.Tensor, moved: torch.Tensor) -> torch.Tensor:
-    """An earlier picture [H, W], read where each pixel's smoke was."""
+    """Reads an earlier picture [H, W] at the places that the motion names."""
     height, width = earlier.shape
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     grid = torch.stack([(x - moved[0].cpu()) / width * 2 - 1, (y - moved[1].cpu()) / height * 2 - 1], -1)
@@ -38,7 +34,7 @@ def _warped(earlier: torch.Tensor, moved: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.6, 0.4, -1.0), (0.0, 1.0, 0.0)])
 def test_uniform_motion(device: str, way: tuple):
-    """A ball that moves as a whole: its velocity's part in the image, and the earlier picture becomes the later one."""
+    """The motion of a moving ball is its velocity in the image, and warps the earlier picture into the later one."""
     shift = np.array([2.0, -3.0, 1.0])
     before, after = (from_array(_ball(12 + k * shift), voxel=0.5, device=device) for k in (-0.5, 0.5))
     camera = facing(after, way, 48)
@@ -61,7 +57,7 @@ def test_uniform_motion(device: str, way: tuple):
 
 
 def test_rotation(device: str):
-    """About the view's axis every depth turns alike; the trace is that of an arc, to the third order of its angle."""
+    """Rotation about the view's axis is the same at every depth; the error is of third order in the angle."""
     n, angle = 8, 0.2
     volume = from_array(_ball(radius=10.0), voxel=2.0, origin=(-24.0, -24.0, -24.0), device=device)
     grid = np.stack(np.meshgrid(*[6.0 * (np.arange(n) + 0.5) - 24.0] * 3, indexing="ij"), -1)
@@ -79,7 +75,7 @@ def test_rotation(device: str):
 
 @pytest.mark.parametrize("thickness", [0.02, 0.3, 20.0])
 def test_hidden_smoke(device: str, thickness: float):
-    """A slab before another that goes the other way: each counts for what is seen of it."""
+    """Two slabs that move in opposite directions count by their visibility."""
     density = np.zeros((16, 16, 16))
     density[:, :, 2:6] = density[:, :, 10:14] = 1.0
     volume = from_array(density, extinction=thickness, device=device)
@@ -95,7 +91,7 @@ def test_hidden_smoke(device: str, thickness: float):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
 def test_against_a_loop(device: str, dtype: type):
-    """Askew, over air of other cells than the smoke, at a step that is no divisor of anything."""
+    """An oblique view, air with other cells than the smoke, and a step that divides no length."""
     random = np.random.default_rng(5)
     density = np.maximum(random.normal(0.1, 0.5, (9, 14, 11)), 0).astype(dtype)
     density[:, :5, :4] = 0
@@ -110,7 +106,7 @@ def test_against_a_loop(device: str, dtype: type):
 
 
 def _loop(density, extinction, air, reach, camera, volume, h):
-    """What the kernel does, in float64 and pixel by pixel; and each pixel's opacity."""
+    """Computes the motion and the opacity pixel by pixel in float64."""
     size = np.array(density.shape)
     share = np.array(air.shape[:3]) / size
 
@@ -143,7 +139,7 @@ def _loop(density, extinction, air, reach, camera, volume, h):
 
 
 def test_what_came_in(device: str):
-    """Smoke that an inlet let in since was never outside: no pixel reads from beyond the box's foot."""
+    """Smoke from an inlet is not traced back beyond the border of the box."""
     density = np.zeros((16, 16, 16))
     density[5:11, :12, 5:11] = 1.0
     volume = from_array(density, device=device)
@@ -159,7 +155,6 @@ def test_what_came_in(device: str):
 
 
 def test_hard_cases(device: str):
-    """No smoke, smoke too thin to be seen, one voxel, and the same bits again."""
     wind = _velocity(np.ones((2, 2, 2, 3)), device)
     for density in (np.zeros((6, 6, 6)), np.full((6, 6, 6), 1e-6)):
         volume = from_array(density, device=device)
@@ -174,7 +169,6 @@ def test_hard_cases(device: str):
 
 
 def test_wrong_use(device: str):
-    """Each wrong argument is named."""
     ball = from_array(_ball(), device=device)
     wind = _velocity(np.ones((2, 2, 2, 3)), device)
     with pytest.raises(ValueError, match="orthographic"):
@@ -184,31 +178,3 @@ def test_wrong_use(device: str):
             motion(ball, wind, facing(ball), **options)
     with pytest.raises(ValueError, match="velocity"):
         motion(ball, wp.zeros((2, 2, 2), dtype=float, device=device), facing(ball), reach=1.0)
-
-
-@pytest.mark.slow
-def test_optical_flow_sees_the_same_motion():
-    """OpenCV's DIS, which knows two pictures of opacity alone, across their edges: along these it can't see any."""
-    cv2 = pytest.importorskip("cv2")
-    settings = DatasetSettings(cells=32, refine=4, resolution=128, frames=3, validation_sequences=2, views=2)
-    pool = make_validation(settings)
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setFinestScale(0)
-    alike = []
-    for opacity, moved in zip(pool.targets[:, :, OPACITY_PLANE].float(), pool.motion.float(), strict=True):
-        earlier, later = ((255 * picture).byte().numpy() for picture in opacity)
-        # From the later frame back to the earlier one, which is what a pixel's motion is told by.
-        result = -flow.calc(later, earlier, None).transpose(2, 0, 1)
-        slope = np.stack(np.gradient(opacity[1].numpy())[::-1])
-        steep = np.linalg.norm(slope, axis=0)
-        edges = (opacity[1].numpy() > 0.1) & (steep > 0.01)
-        across = (slope / np.maximum(steep, 1e-6))[:, edges]
-        theirs, ours = ((part[:, edges] * across).sum(0) for part in (result, moved.numpy()))
-        alike.append(np.corrcoef(theirs, ours)[0, 1])
-        still, followed = (
-            float((picture - opacity[1])[torch.from_numpy(edges)].abs().mean())
-            for picture in (opacity[0], warp(opacity[:1][None], moved[None])[0][0, 0])
-        )
-        assert followed < 0.85 * still
-    # .77 to .90 of twelve pairs.
-    assert len(alike) == 12 and min(alike) > 0.7

@@ -1,4 +1,4 @@
-"""Light of all orders by diffusion and a learned mix: against path tracing, on its own smoke and on a simulation's."""
+"""Light of all orders by diffusion and fitted weights, against path tracing."""
 
 import math
 from dataclasses import replace
@@ -39,17 +39,17 @@ def lessons() -> list[Lesson]:
 
 
 def diffused(inputs: Inputs, albedo: float) -> torch.Tensor:
-    """What the mix begins with, [H, W]: single scattering and diffusion."""
+    """Returns the input of the prediction, [H, W]: single scattering and diffusion."""
     return inputs.by_diffusion(albedo)[0]
 
 
 def mixed(model: OrdersModel, inputs: Inputs, albedo: float) -> torch.Tensor:
-    """All light of one light, [H, W]."""
+    """Returns all light of one light, [H, W]."""
     return model.light(inputs.at(albedo), (albedo,) * 3)[0, ..., 0]
 
 
 def test_the_mix_is_worth_its_name_and_never_worse(lessons):
-    """Much better than its input, on no light worse; one that wasn't trained fails here."""
+    """The shipped weights improve every light; untrained weights and the identity fail the same check."""
     model = load_orders()
 
     def holds(model: OrdersModel) -> bool:
@@ -74,7 +74,7 @@ def test_the_mix_is_worth_its_name_and_never_worse(lessons):
 
 @pytest.mark.parametrize("cells", [32, 64])
 def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
-    """Smoke of another maker and a plume, at both ends of the thickness that was learned, in cells coarse and fine."""
+    """Other smoke and a plume, at both ends of the fitted thickness, on coarse and fine grids."""
     model, gains = load_orders(), []
     cloud = DensityVolume(make_cloud(cells, "cpu"), 8.0, 1.0 / cells)
     for number, volume in enumerate((cloud, make_plume(cells, seed=12, hot=False, extinction=40.0))):
@@ -90,7 +90,7 @@ def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
 
 @pytest.mark.parametrize("extinction", [0.3, 400.0])
 def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
-    """The mix is as at the end of what it knows, and no worse than its input."""
+    """Outside the fitted range the result is no worse than its input."""
     volume = make_plume(32, seed=3, hot=False, extinction=extinction)
     camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20)
     lights = [Light((1.0, 0.6, 0.2)), Light((-0.4, 0.5, -0.8))]
@@ -103,7 +103,7 @@ def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
 
 @pytest.mark.parametrize("kind", ["directional", "point", "perspective"])
 def test_other_smoke_other_lights_other_cameras(device: str, kind: str):
-    """A plume of another maker, in a box that isn't a cube: 6 dB nearer to all light than single scattering."""
+    """Another plume in a box that is not a cube is 6 dB nearer to all light than single scattering."""
     volume = plume(device=device)
     camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=24, perspective=kind == "perspective")
     light = Light((1.0, 0.5, 0.6)) if kind != "point" else PointLight((1.0, 1.4, 1.2), (4 * math.pi,) * 3)
@@ -116,7 +116,7 @@ def test_other_smoke_other_lights_other_cameras(device: str, kind: str):
 
 @pytest.mark.parametrize(("g", "least"), [(-0.3, 30.0), (0.3, 30.0), (0.6, 23.0)])
 def test_light_that_is_scattered_onward_or_back(device: str, g: float, least: float):
-    """Of a phase function that the mix wasn't fitted to: 8 dB nearer than light scattered once."""
+    """With an anisotropic phase function the result is 8 dB nearer than single scattering."""
     volume = plume(device=device)
     camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=24)
     lights = [Light((1.0, 0.5, 0.6), (6.0, 6.0, 6.0)), Light((-0.2, 0.3, -1.0), (4.0, 4.0, 4.0))]
@@ -128,7 +128,7 @@ def test_light_that_is_scattered_onward_or_back(device: str, g: float, least: fl
 
 @pytest.mark.slow
 def test_a_mix_is_fitted(lessons):
-    """From noisy references alone: it helps at once, and one seed gives one model."""
+    """A fit to noisy references helps, and one seed gives one model."""
     model, again = (learn(6, samples=32, seed=5) for _ in range(2))
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
     found = np.mean([psnr(mixed(model, x.inputs, 1.0), x.light[-1]) for x in lessons])
@@ -137,7 +137,7 @@ def test_a_mix_is_fitted(lessons):
 
 
 def test_a_mix_finds_the_weights_that_light_is_made_with(lessons):
-    """Of light that is a mix of features: the same light again."""
+    """A fit to a known combination of features reproduces its light."""
     random = torch.Generator().manual_seed(4)
     made = []
     for lesson in lessons:
@@ -160,7 +160,7 @@ def test_views_are_of_their_numbers():
 
 
 def test_light_is_the_mix_of_its_features(device: str):
-    """Of lights at once, in colour, against the same in NumPy in float64."""
+    """Several lights in colour against NumPy in float64."""
     random = torch.Generator().manual_seed(3)
     single, opposite = 1.5 * torch.rand(2, 2, 6, 7, generator=random)
     diffused, (clear, thin) = 2.0 * torch.rand(2, 2, 3, 6, 7, generator=random), torch.rand(2, 6, 7, generator=random)
@@ -193,7 +193,6 @@ def test_light_is_the_mix_of_its_features(device: str):
 
 
 def test_hard_smoke(device: str):
-    """No smoke, albedo 0 and in colour, smoke ten times as thick as any that was learned, and half floats."""
     camera = Camera.around(plume(), pixels=12)
     empty = scatter(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light((1, 1, 1))])
     assert not empty.shade().any()
@@ -211,7 +210,7 @@ def test_hard_smoke(device: str):
 
 @pytest.mark.parametrize("within", ["light", "camera", "both"])
 def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
-    """No less than light scattered once, and no more than there is; of a light from outside it is all there is."""
+    """The result is at least single scattering, and the total is near the traced one."""
     volume = make_plume(20, hot=False, extinction=12.0, device=device)
     inside = Camera.look_at((0.5, 0.6, 0.5), (0.5, 0.6, 0.0), extent=1.0, height=12, width=12, perspective=True)
     camera = Camera.around(volume, toward=(0.2, 0.1, 1.0), pixels=12) if within == "light" else inside
@@ -226,7 +225,7 @@ def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
 
 
 def test_files_of_models(tmp_path):
-    """A model comes back as it went; every wrong one is a line that names the part."""
+    """A saved model is read back; each wrong file is an error that names the part."""
     model = load_orders()
     model.save(tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
@@ -252,7 +251,7 @@ def test_files_of_models(tmp_path):
 
 
 def test_inputs_hold_for_any_image(device: str):
-    """At twice the pixels light is the same."""
+    """The light does not depend on the number of pixels."""
     volume, model = plume(device=device), load_orders().to(device)
     made = []
     for pixels in (24, 48, 96):

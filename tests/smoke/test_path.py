@@ -1,4 +1,4 @@
-"""The path tracer: each order against quadrature and Mitsuba, energy, lights of each kind, obstacles, hard cases."""
+"""The path tracer: orders against quadrature and Mitsuba, energy, all kinds of lights, obstacles, hard cases."""
 
 import math
 
@@ -28,14 +28,14 @@ WAY = (1.0, 0.7, 0.8)
 
 
 def ball(n: int = 12, depth: float = 4.0, device: str = "cpu") -> DensityVolume:
-    """A soft ball of an optical depth through its middle, in a box of edge 1."""
+    """Makes a soft ball with an optical depth through its middle, in a box of edge 1."""
     x, y, z = unit_grid(n)
     density = np.clip(1.5 - 1.5 * np.sqrt(x**2 + y**2 + z**2), 0, 1).astype(np.float32)
     return from_array(density, extinction=depth, voxel=1.0 / n, device=device)
 
 
 def close(traced: torch.Tensor, noise: torch.Tensor, expected: torch.Tensor, share: float) -> None:
-    """Holds the mean to a share and the pixels to the noise that is stated."""
+    """Checks the mean against a relative limit, and the pixels against the stated noise."""
     assert noise.square().sum().sqrt() / noise.numel() < 0.6 * share * expected.mean()  # or nothing is shown
     assert abs(float(traced.mean() / expected.mean()) - 1.0) < share
     assert 0.6 < float((traced - expected).square().mean() / noise.square().mean()) < 1.6
@@ -43,7 +43,7 @@ def close(traced: torch.Tensor, noise: torch.Tensor, expected: torch.Tensor, sha
 
 @pytest.mark.parametrize("g", [-0.3, 0.0, 0.6])
 def test_the_first_order_is_single_scattering(device: str, g: float):
-    """Against the march that shares nothing, of the mean within 0.5%, of pixels as the noise estimate says."""
+    """The mean is within 0.5% of the march from every sample, the pixels within the stated noise."""
     volume = make_plume(24, hot=False, extinction=14.0, device=device)
     camera = facing(volume, (0.3, 0.2, 1.0), size=20)
     lights = [Light(WAY), Light((0.0, 0.3, -1.0))]
@@ -97,7 +97,7 @@ def test_orders_and_albedo(device: str):
 
 
 def test_point_lights(device: str):
-    """From far off as a directional light; by the inverse square; in the smoke as much light as a march finds."""
+    """A distant point light equals a directional one; the inverse square law holds; inside the smoke a march agrees."""
     volume = ball(device=device)
     camera = facing(volume, size=8)
     toward = np.array(WAY) / np.linalg.norm(WAY)
@@ -111,7 +111,7 @@ def test_point_lights(device: str):
 
 
 def test_emission_is_seen_and_scattered(device: str):
-    """Unscattered it is what bake finds; smoke of albedo 1 scatters as much as it takes away, in all directions."""
+    """Unscattered emission equals that of bake; smoke of albedo 1 scatters as much as it removes."""
     volume = make_plume(20, extinction=8.0, device=device)
     camera = facing(volume, size=16)
     traced = trace(volume, camera, samples=1024, albedo=(1.0, 0.5, 0.0), orders=1, seed=1)
@@ -125,7 +125,7 @@ def test_emission_is_seen_and_scattered(device: str):
 
 
 def test_obstacles_block(device: str):
-    """A plate between smoke and light keeps its light off, one before the camera hides all; beside them nothing."""
+    """A plate towards the light removes its light, one in front of the camera hides everything, one aside nothing."""
     volume = ball(device=device)
     camera = facing(volume, size=8)
     corners, triangles = box()
@@ -149,7 +149,6 @@ def test_obstacles_block(device: str):
 
 
 def test_hard_smoke(device: str):
-    """Empty, black and thick smoke, a camera and a light within it are no error; one seed gives one image."""
     camera = facing(ball(), size=6)
     empty = trace(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light(WAY)], samples=2)
     assert not empty.total.any() and empty.error == 0.0
@@ -166,7 +165,7 @@ def test_hard_smoke(device: str):
 
 
 def test_empty_bricks_around_smoke_are_left_out(device: str):
-    """Smoke in a corner of a large box is traced as in a box of its own, and paths walk through as few bricks."""
+    """Smoke in a corner of a large box is traced like smoke in its own box, with as few bricks."""
     small = ball(20, device=device)
     density = torch.zeros(64, 40, 48, device=device)
     density[41:61, 3:23, 20:40] = small.density
@@ -179,7 +178,7 @@ def test_empty_bricks_around_smoke_are_left_out(device: str):
 
 
 def test_the_noise_of_all_lights_counts_what_they_share(device: str):
-    """Lights that nearly coincide share their paths; the spread between seeds is as stated."""
+    """Lights share their paths; the stated noise equals the spread between seeds."""
     volume = ball(8, depth=8.0, device=device)
     lights = [Light((0.1 * n, 1.0, 0.2)) for n in range(4)]
     made = [trace(volume, facing(volume, size=8), lights, samples=32, orders=6, seed=seed) for seed in range(16)]

@@ -1,4 +1,4 @@
-"""The network: its size, its switches, hard images, its file, the one that ships, and ONNX."""
+"""The network: its size, its settings, hard images, its file, the shipped network, and ONNX."""
 
 import runpy
 from importlib import resources
@@ -37,7 +37,7 @@ def _network(**settings) -> SixWayNetwork:
 
 
 def test_the_u_net_has_its_published_size():
-    """Ronneberger's of 64 channels with 1 channel in and 2 out is known for its 31.03 million."""
+    """Ronneberger's U-Net with 64 channels, 1 input and 2 outputs has 31.03 million parameters."""
     network = SixWayNetwork(NetworkSettings(width=64))
     count = sum(parameter_count(part) for part in (network.encoder, network.decoder))
     # Ours reads 3 planes; its up-convolutions, of 2 x 2 pixels, are the rest but for the last layer's 130.
@@ -77,7 +77,7 @@ def test_it_starts_as_a_mix_of_the_guide():
 
 @pytest.mark.parametrize("stem", [1, 2])
 def test_with_six_lights_it_starts_as_these(stem):
-    """Up to the mask, which is 1 wherever the guide has smoke."""
+    """An untrained network returns the planes of its guide where there is smoke."""
     guides = small_pool(2, kind="six").guides[:, 1].float()
     network = SixWayNetwork(NetworkSettings(width=8, levels=3, guide="six", stem=stem))
     for name, plane in zip(PLANES, network(guides).unbind(1), strict=True):
@@ -249,7 +249,7 @@ def test_a_network_comes_with_the_package(monkeypatch, tmp_path):
 
 
 def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
-    """On dense smoke with an edge, which steps of a voxel miss, at as many pixels a length as it was trained with."""
+    """Dense smoke with an edge, with as many pixels per length as in the training."""
     density = (plume().density.numpy() > 0.4).astype(np.float32).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     volume = from_array(density, extinction=25.0, voxel=0.0125, origin=(-0.5, 0.0, -0.5))
     settings = CameraSettings(resolution=256, extent=0.6).turned(30.0)
@@ -271,7 +271,7 @@ def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
 
 @pytest.mark.parametrize("voxels", [32, pytest.param(128, marks=pytest.mark.slow)])
 def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
-    """Smooth smoke, on which the network alone loses 10 dB: the gate leaves it out, and never by much too late."""
+    """On smooth smoke the network alone loses 10 dB, and the gate gives it little weight."""
     volume = make_plume(voxels, hot=True, extinction=14.0)
     camera = Camera.around(volume, toward=(0.3, 0.2, 1.0), pixels=96)
     predictor = SmokePredictor()

@@ -33,7 +33,7 @@ def _pool(settings, *, seed, round, device, progress) -> Pool:
 
 
 def _worse(settings, *, round, **options) -> Pool:
-    """After the first round, wrong targets."""
+    """Makes wrong targets after the first round."""
     pool = small_pool(4, 10)
     return pool if round == 0 else replace(pool, targets=1 - pool.targets)
 
@@ -109,7 +109,7 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, te
 
 
 def test_a_killed_training_goes_on_from_its_last_save(tmp_path, monkeypatch):
-    """Nothing is saved on the way out."""
+    """A killed training saves nothing at its end."""
     monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
     profile, path, steps = _profile(steps=4), tmp_path / "parts", []
     _train(tmp_path / "whole", profile, seed=1)
@@ -148,7 +148,7 @@ def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
 
 
 def test_the_best_is_trusted_only_with_its_network(tmp_path):
-    """Where the output is damaged, gone, or another network, the next one validated is kept, though it is worse."""
+    """If the output is damaged, missing or another network, the next validated one is saved, even if it is worse."""
     profile = _profile(steps=8, average=0.0)
     path, partial = tmp_path / "a", tmp_path / "a.partial"
     before = _train(path, profile, make_pool=_worse, minutes=0.0)
@@ -287,7 +287,7 @@ def test_a_plan_takes_each_sample_once_before_any_twice():
 
 
 def _only(pool: Pool, *squares: tuple[int, int, int, int]) -> Pool:
-    """A pool whose first sample has smoke in these alone: first and last row, first and last column."""
+    """Makes a pool whose first sample has smoke only in squares: first and last row, first and last column."""
     targets = pool.targets.clone()
     targets[0, :, OPACITY_PLANE] = 0
     for top, bottom, left, right in squares:
@@ -297,7 +297,7 @@ def _only(pool: Pool, *squares: tuple[int, int, int, int]) -> Pool:
 
 @pytest.mark.parametrize("squares", [[(20, 22, 17, 30)], [(0, 0, 31, 31)], [(1, 2, 1, 2), (30, 31, 30, 31)], []])
 def test_crops_contain_smoke(squares):
-    """All smoke is in some crop; of a sample without any, all pixels are."""
+    """Every pixel of smoke is in some crop; of a sample without smoke, every pixel."""
     pool = _only(small_pool(1), *squares)
     settings = TrainSettings(rounds=1, steps=200, batch=2, crop=16, temporal=1.0)
     plan = plan_round(settings, pool, seed=0, round=0)
@@ -311,7 +311,7 @@ def test_crops_contain_smoke(squares):
 
 
 def test_crops_reach_the_end_of_samples_that_blocks_do_not_divide():
-    """Of 100 pixels, of which the last four are a block of their own."""
+    """An image of 100 pixels ends in a block of four pixels."""
     pool = Pool(
         *(torch.zeros(1, 2, *rest, 100, 100) for rest in ((3,), (8,))), torch.zeros(1, 2, 100, 100), torch.zeros(1)
     )
@@ -342,7 +342,7 @@ def test_a_step_learns_from_crops():
 
 @pytest.mark.parametrize("temporal", [0.0, 0.1])
 def test_one_seed_gives_one_training_on_one_device(device, temporal):
-    """To the bit; on a GPU, images are large enough for it to spread its sums over."""
+    """Weights are equal to the bit, also on a GPU with images large enough for parallel sums."""
     pool, edge, steps = small_pool(4, kind="six").to(device), *((1, 3) if device == "cpu" else (4, 12))
     pool = Pool(
         *(part.repeat(*(1,) * (part.ndim - 2), edge, edge) for part in (pool.guides, pool.targets, pool.motion)),

@@ -23,7 +23,7 @@ FRONT = LightSettings(toward=(0, 0, 1), irradiance=(math.pi,) * 3).light()
 
 
 def _camera(size=32, **settings):
-    """Of the unit box round the origin."""
+    """Makes a camera in front of the unit box around the origin."""
     return make_camera(CameraSettings(resolution=size, **settings), (-0.5, -0.5, -0.5), (1, 1, 1))
 
 
@@ -32,14 +32,14 @@ def _ball(x=0.0, y=0.0, z=0.0, radius=0.2, **more):
 
 
 def draw_obstacles(obstacles, camera, lights, device):
-    """Light and distance of the obstacles alone."""
+    """Returns the light and the distance of the obstacles alone."""
     drawing = Drawing(camera, lights, obstacles=obstacles, device=device)
     drawing.draw_obstacles()
     return drawing.solid_light, drawing.solid_depth
 
 
 def _flat(camera, transparency, light=0.0, device="cpu"):
-    """The same smoke at every pixel."""
+    """Makes uniform smoke."""
     size = (camera.height, camera.width)
     clear = torch.full(size, transparency, device=device)
     return SixWay(torch.full((6, *size), light, device=device), clear, camera=camera)
@@ -55,7 +55,7 @@ def test_bytes():
 @pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("toward", [(0, 0, 1), (0, 1, 0), (1, -2, 0.5)])
 def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
-    """A ball against the rays that meet it, worked out by hand."""
+    """A ball is compared with the rays that hit it."""
     camera = _camera(48, toward=toward, perspective=perspective)
     ball = _ball(0.1, -0.05, 0.2)
     _, depth = draw_obstacles([ball], camera, [], device)

@@ -1,4 +1,4 @@
-"""The light of frames by a graph: on every device the picture of each."""
+"""Lighting in a CUDA graph: each frame equals the picture without a graph."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from wlm.view.smoke_run import Lighting
 
 @pytest.mark.parametrize("lighting", [Lighting(None), Lighting((0.95, 0.9, 0.8))])
 def test_a_graph_draws_each_frame(device, lighting):
-    """Smoke that lies elsewhere each time, and an obstacle that moves; more often than it takes to be captured."""
+    """The smoke changes and an obstacle moves, for more frames than the capture takes."""
     volumes = [plume(frame, hot=True, device=device) for frame in (1, 2, 3)]
     camera = make_camera(CameraSettings(resolution=24), volumes[0].origin, volumes[0].size)
     lights = [LightSettings(toward=toward).light() for toward in ((1, 1, 1), (-1, 0, 1))]
@@ -38,7 +38,7 @@ def test_a_graph_draws_each_frame(device, lighting):
 
 
 def test_a_graph_scatters_all_orders(device):
-    """As without one; smoke of another size is refused."""
+    """The result equals that without a graph; another extinction is refused."""
     volumes = [plume(frame, device=device) for frame in (1, 2, 3, 4)]
     camera = make_camera(CameraSettings(resolution=24), volumes[0].origin, volumes[0].size)
     lights = [LightSettings(toward=(1, 1, 1)).light()]

@@ -169,14 +169,6 @@ def decode(
         Path | None,
         typer.Option(metavar="MAP.dds", help="Also write the texture of the runtime: RGB9E5 texels with mips."),
     ] = None,
-    eight_bit: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FRAME.png",
-            help="Also write 8 bits for a texture cache: radiance = (byte / 255 * bound) ** gamma, with gamma and the "
-            "bound of each tile in the text of the PNG.",
-        ),
-    ] = None,
     layer: Annotated[
         str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first of radiance.")
     ] = None,
@@ -187,22 +179,16 @@ def decode(
     check_output(output, ".exr")
     if texture is not None:
         check_output(texture, ".dds")
-    if eight_bit is not None:
-        check_output(eight_bit, ".png")
     quiet_warp()
     import numpy as np
 
     from wlm.formats.channels import read_channels
     from wlm.formats.exr import HALF_MAX, write_part
-    from wlm.lightmap.runtime_texture import write_8bit, write_texture
+    from wlm.lightmap.runtime_texture import write_texture
     from wlm.system import load
 
     model = load(file, "lightmap")
     sheets = model.layer(layer, atlas)
-    if (eight_bit or texture) and len(sheets) > 1:
-        raise WlmError(
-            f"--eight-bit, --texture: expected a layer of at most three channels, {sheets[0].layer} has more"
-        )
     if texture is not None and sheets[0].linear:
         raise WlmError(f"--texture: expected a layer of light, found {sheets[0].layer}")
     decoder = model.decoder(device)
@@ -211,8 +197,6 @@ def decode(
     planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)
     channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
     write_part(output, channels, read_channels)
-    if eight_bit is not None:
-        write_8bit(eight_bit, decoder.sheets[sheets[0]], time, sheets[0].values)
     if texture is not None:
         write_texture(texture, model.sheets[sheets[0]], time, device)
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
@@ -234,34 +218,20 @@ def export(
 
 def info(
     file: ModelFile,
-    tiles: Annotated[
-        bool, typer.Option("--tiles", help="List each tile: its encoding, bytes, and the reason.")
-    ] = False,
     as_json: AsJson = False,
     device: Device = "cpu",
 ) -> None:
     """Show what a file of lightmaps contains, and its memory on a device."""
-    from wlm.lightmap.tile_report import report_tiles
 
     def facts(model: "LightmapModel") -> dict[str, Any]:
         if not as_json:
             return _facts(model)
-        sheets = []
-        for sheet, own in model.sheets.items():
-            listed = {"each_tile": [vars(tile) for tile in report_tiles(own)]} if tiles else {}
-            sheets.append(vars(sheet) | _sheet(own) | listed)
+        sheets = [vars(sheet) | _sheet(own) for sheet, own in model.sheets.items()]
         return _facts(model) | {"times": model.times.tolist(), "sheets": sheets}
 
     model = models.describe(file, "lightmap", device, as_json, facts)
     if not as_json:
         _show_sheets(model)
-        for sheet, own in model.sheets.items() if tiles else ():
-            columns = ["tile", "row", "column", "encoding", "texels", "bytes", "reason"]
-            rows = table(f"tiles of {sheet.label}", columns, text=["encoding", "reason"])
-            for tile in report_tiles(own):
-                cells = map(str, (tile.number, tile.row, tile.column))
-                rows.add_row(*cells, tile.kind, f"{tile.valid:,}", f"{tile.bytes:,}", escape(tile.why))
-            show(rows)
 
 
 def _load(
@@ -313,13 +283,6 @@ def _show_report(file: Path, report: "Report") -> None:
     scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
     for stamp, *values in zip(report.times, *scores, strict=True):
         rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
-    rows.add_section()
-    for tile, values in enumerate(
-        zip(light.psnr_by_tile.ravel(), light.ssim_by_tile.ravel(), light.flip_by_tile.ravel(), strict=True)
-    ):
-        # Tiles that are empty or not in the file have no score.
-        if any(value == value for value in values):
-            rows.add_row(f"tile {tile}", *map(number, values, (".2f", ".4f", ".4f")))
     show(rows)
     _show_where_shown(report)
     _note_worst(light)
@@ -350,10 +313,6 @@ def _note_worst(report: "SheetReport") -> None:
     for what, worst in (("filtered read", report.worst_seen), ("between times", report.worst_between)):
         if worst is not None:
             note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    if (worst := report.worst_seen_time) is not None:
-        note(f"worst time, mean of filtered reads: {worst['psnr']:.2f} dB at {worst['time']:g}")
-    if (worst := report.worst_seen_tile) is not None:
-        note(f"worst tile, mean of filtered reads: {worst['psnr']:.2f} dB, tile {worst['tile']}")
     if (worst := report.worst_view) is not None:
         place = f"camera {worst['view']} at {worst['time']:g}"
         note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")

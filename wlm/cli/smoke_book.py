@@ -196,14 +196,7 @@ def _source(
     straight: bool,
     device: str,
 ) -> "_Source":
-    """Opens lightmaps or the flip book that the options describe.
-
-    Returns:
-        Whether there is only one frame, and a function of the number of frames that yields them.
-
-    Raises:
-        WlmError: An option has no meaning, or the path is neither.
-    """
+    """Opens lightmaps or a flip book; returns whether there is one frame, and a function that yields some frames."""
     from wlm.interop import check_device
     from wlm.smoke.data import six_way_files, spread
     from wlm.smoke.flipbook.book import Shot, is_straight, read_flipbook, read_shots

@@ -60,11 +60,7 @@ class SmokeOptions:
     device: Device = "cpu"
 
     def open(self, smoke: Path) -> "Frames":
-        """Opens a volume or a folder of frames.
-
-        Raises:
-            WlmError: A setting is wrong, there is no such device, or the smoke cannot be opened.
-        """
+        """Opens a volume or a folder of frames."""
         from wlm.fluid.grids import UPS
         from wlm.interop import check_device
         from wlm.smoke.data import load_frames
@@ -78,11 +74,7 @@ class SmokeOptions:
         return load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
 
     def view(self, frames: "Frames", *, orthographic: bool = True) -> "CameraSettings":
-        """Returns the camera of the scene, or the default one, changed by the options.
-
-        Raises:
-            WlmError: A setting is wrong, or `orthographic` lightmaps are to be made in perspective.
-        """
+        """Returns the camera of the scene, or the default one, changed by the options; errors name the option."""
         from wlm.config import check_settings
         from wlm.smoke.scene import CameraSettings
 
@@ -119,11 +111,7 @@ def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
-    """Reads the values of a repeatable option NAME=VALUE.
-
-    Raises:
-        WlmError: A value has another form or an unknown name.
-    """
+    """Reads the values of a repeatable option NAME=VALUE with known names."""
     values = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
@@ -141,11 +129,7 @@ def _float(option: str, text: str) -> float:
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
-    """Reads three finite numbers from the text of an option.
-
-    Raises:
-        WlmError: The text has another form.
-    """
+    """Reads three finite numbers from the text of an option."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -156,11 +140,7 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
 
 
 def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
-    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples.
-
-    Raises:
-        WlmError: The text has another form.
-    """
+    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples."""
     place, colon, colour = text.partition(":")
     values = [vector(option, place)]
     if colon:
@@ -169,11 +149,7 @@ def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
 
 
 def check_white(white: float) -> None:
-    """Checks the value of `--white`.
-
-    Raises:
-        WlmError: It is not above 0.
-    """
+    """Checks the value of `--white`, which must be above 0."""
     if not 0 < white < float("inf"):
         raise WlmError(f"--white: expected a number above 0, got {white}")
 

@@ -18,11 +18,7 @@ _PIECE = 1024  # tiles that are decoded at once: 192 MiB
 
 
 def gelu_of(model: SheetModel, gelu: str | None) -> str:
-    """Returns the form of the GELU to decode with: `gelu`, or the model's for None.
-
-    Raises:
-        WlmError: There is no such form.
-    """
+    """Returns the form of the GELU to decode with: `gelu`, or the model's for None."""
     gelu = gelu or model.profile.gelu
     if gelu not in GELUS:
         raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
@@ -49,9 +45,6 @@ class SheetDecoder:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
             gelu: Another form of the GELU than the model was trained with, for speed; None: the model's.
-
-        Raises:
-            WlmError: There is no such device or form.
         """
         self.model, self.device = model, interop.check_device(device)
         gelu, self._grid = gelu_of(model, gelu), model.grid
@@ -104,11 +97,7 @@ class SheetDecoder:
         return np.ascontiguousarray(light[top : top + TILE + 2 * border, left : left + TILE + 2 * border])
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0.
-
-        Raises:
-            WlmError: The time is not finite.
-        """
+        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0."""
         self.model.axis.wrap(time)
         out = np.zeros((len(numbers), TILE, TILE, 3), np.float32)
         for tiles in self._tiles:
@@ -123,9 +112,6 @@ class SheetDecoder:
         Returns:
             uint8 [n, 128, 128, 4] and the bound b of each tile, float32 [n]: radiance = (byte / 255 * b) ** gamma.
             Alpha is 255, and 0 in empty tiles.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         self.model.axis.wrap(time)
         out, bounds = np.zeros((len(numbers), TILE, TILE, 4), np.uint8), np.zeros(len(numbers), np.float32)
@@ -143,25 +129,6 @@ class SheetDecoder:
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
         self._gaps.fill(image)
         return image
-
-    def frame_8bit(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes the whole map to 8 bits: uint8 [H, W, 4], and the bound of each tile, float32 [tiles]."""
-        image = np.zeros((self._grid.height, self._grid.width, 4), np.uint8)
-        bounds = np.zeros(self._grid.count, np.float32)
-        for numbers in self._stored():
-            tiles, bounds[numbers] = self.tiles_8bit(numbers.tolist(), time)
-            place(image, tiles, numbers, self._grid)
-        # Each tile has its own bound.
-        target, source = (bounds[self._tile_of(at)] for at in (self._gaps.target, self._gaps.source))
-        factor = np.divide(source, target, out=np.zeros_like(source), where=target > 0)
-        light = image[tuple(self._gaps.source.T)][:, :3] * factor[:, None]
-        image[tuple(self._gaps.target.T)] = 255
-        image[..., :3][tuple(self._gaps.target.T)] = np.minimum(light, 255.0) + 0.5
-        return image, bounds
-
-    def _tile_of(self, at: np.ndarray) -> np.ndarray:
-        """Returns the numbers of the tiles of texels, given as rows and columns [G, 2]."""
-        return at[:, 0] // TILE * self._grid.cols + at[:, 1] // TILE
 
     def _stored(self) -> list[np.ndarray]:
         """Returns the numbers of the tiles that are not empty, in pieces, so that a large map is not in memory
@@ -184,9 +151,6 @@ class Decoder:
         Args:
             model: The model.
             device, gelu: As for `SheetDecoder`.
-
-        Raises:
-            WlmError: There is no such device or form of the GELU.
         """
         self.model = model
         self.sheets: dict[Sheet, SheetDecoder] = {
@@ -217,20 +181,13 @@ class Decoder:
 
         Returns:
             The channels, float32 [H, W, C]: linear radiance, or values. Tiles without a valid texel have the level 0.
-
-        Raises:
-            WlmError: There is no such layer, or the time is not finite.
         """
         sheets = self.model.layer(layer, atlas)
         frames = [sheet.to_values(self.sheets[sheet].frame(time)) for sheet in sheets]
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 
     def frames(self, time: float) -> dict[str, dict[str, np.ndarray]]:
-        """Decodes everything: by atlas and layer the channels, float32 [H, W, C].
-
-        Raises:
-            WlmError: The time is not finite.
-        """
+        """Decodes everything: by atlas and layer the channels, float32 [H, W, C]."""
         result: dict[str, dict[str, np.ndarray]] = {}
         for atlas, layer in dict.fromkeys((sheet.atlas, sheet.layer) for sheet in self.sheets):
             result.setdefault(atlas, {})[layer] = self.frame(time, layer, atlas)

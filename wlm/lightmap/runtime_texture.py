@@ -4,20 +4,15 @@ Tiles of 8 bits have a bound each, so that a filter must not cross from one to t
 also 32 bits a texel, with gaps filled over the whole map and mips of the texels inside charts.
 """
 
-import json
 import os
 
 import numpy as np
 import warp as wp
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_path
 from wlm.formats.dds import MOST_SIDE, write_dds
 from wlm.formats.shared_exponent import unpack_rgb9e5
-from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import runtime_decoders
@@ -84,9 +79,6 @@ class MapDecoder:
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         for decoder in self.decoders:
             decoder.set_time(time)
@@ -133,29 +125,6 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
     texels = b"".join(level.numpy().astype("<u4").tobytes() for level in decoder.levels)
     mips = len(decoder.levels) - 1
     write_dds(path, texels, model.width, model.height, fmt="R9G9B9E5_SHAREDEXP", mips=mips)
-
-
-def write_8bit(
-    path: str | os.PathLike[str], decoder: SheetDecoder, time: float, values: tuple[float, float] | None = None
-) -> None:
-    """Writes a map as a texture cache holds it: a PNG of 8 bits, with gamma and the bound of each tile in its text
-    "wlm".
-
-    Args:
-        path: The PNG.
-        decoder: The decoder of the sheet.
-        time: In the unit of the set's times.
-        values: Values of the levels 0 and 1 of a linear sheet, which the text then has too; None: radiance.
-
-    Raises:
-        WlmError: The time is not finite, or the file can not be written.
-    """
-    pixels, bounds = decoder.frame_8bit(time)
-    text = PngInfo()
-    facts = {"gamma": decoder.model.profile.gamma, "bounds": bounds.tolist()}
-    text.add_text("wlm", json.dumps(facts if values is None else facts | {"values": list(values)}))
-    with atomic_path(path) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG", pnginfo=text)
 
 
 def _halved(weight: np.ndarray) -> np.ndarray:

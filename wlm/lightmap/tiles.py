@@ -70,9 +70,6 @@ class TileGrid:
 
         Args:
             index: Number of the tile in [0, count).
-
-        Raises:
-            WlmError: The number is outside the grid.
         """
         if not 0 <= index < self.count:
             raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
@@ -80,11 +77,7 @@ class TileGrid:
         return row * TILE, column * TILE
 
     def window(self, index: int) -> tuple[slice, slice]:
-        """Returns the rows and the columns of the map that a tile covers.
-
-        Raises:
-            WlmError: The number is outside the grid.
-        """
+        """Returns the rows and the columns of the map that a tile covers."""
         y, x = self.origin(index)
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
 
@@ -166,9 +159,8 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
         The N tiles.
 
     Raises:
-        WlmError: A number is outside the grid or given twice, there is none, or gamma is not above 0.
+        WlmError: A number is outside the grid or given twice, or there is none.
     """
-    _check_gamma(gamma)
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 
@@ -220,10 +212,9 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
     """Computes the pattern of each tile whose product with the means approximates a tile that only changes in strength.
 
-    It is the sum of the colours over time divided by the sum of the means: times count in proportion to their means, so
-    that a nearly black time, whose texels are a few steps of half float apart, hardly counts, and nothing is divided by
-    a mean of 0. `means * pattern` is exact if the tile is the product of one colour per time and a pattern, in gamma
-    space and so in linear space.
+    It is the sum of the colours over time divided by the sum of the means, so that a nearly black time hardly counts
+    and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a colour per time and a
+    pattern.
 
     Args:
         colour: `[N, T, 128, 128, 3]`, as in `TileData`.
@@ -245,12 +236,10 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
     In linear space, over the valid texels:
 
     - `EMPTY`: the tile has no valid texel.
-    - `CONSTANT`: at every time no channel spans more than one step of half float, measured at the channel's least
-      value. A half-float source has nothing finer. An all-zero tile is constant.
-    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at that time
-      as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any texel is off by more
-      than one step of half float. The second condition covers times whose range is zero or so small that the PSNR would
-      measure the half float. A set of one time is such a product exactly.
+    - `CONSTANT`: at every time no channel spans more than one step of half float at its least value.
+    - `STATIC`: `means * static_pattern` has a PSNR of at least the budget at every time, relative to the range of the
+      tile at that time (neural-dynamic-gi, section 10.2), or no channel of any texel is off by more than a step of half
+      float.
     - `DYNAMIC`: all other tiles.
 
     For values that are not light, `peak` replaces the range, and a tile is also constant if at every time the means of
@@ -267,12 +256,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
     Returns:
         `TileKind` of each tile, `[N]` int64.
 
-    Raises:
-        WlmError: Gamma is not above 0, or the budget is NaN.
     """
-    _check_gamma(gamma)
-    if math.isnan(static_budget_db):
-        raise WlmError("tiles: expected static_budget_db in decibels, got NaN")
     means = channel_means(tiles.colour, tiles.mask)
     kinds = np.empty(len(tiles.index), np.int64)
     for n, valid in enumerate(tiles.mask):
@@ -303,33 +287,6 @@ def check_index(index: np.ndarray, grid: TileGrid) -> None:
         raise WlmError(f"tiles: tile {numbers[counts > 1][0]} is given twice")
 
 
-def assemble(tiles: np.ndarray, index: np.ndarray, grid: TileGrid, fill: float = 0.0) -> np.ndarray:
-    """Puts tiles together to a map; the inverse of `split`.
-
-    Args:
-        tiles: `[N, 128, 128, C]`, any dtype.
-        index: `[N]`, number of each tile in the grid.
-        grid: The map's.
-        fill: Value of the texels of tiles that are not in `index`.
-
-    Returns:
-        `[H, W, C]`, of the tiles' dtype. Texels past the map's end are dropped.
-
-    Raises:
-        WlmError: Shapes do not fit, or a number is outside the grid or given twice.
-    """
-    tiles = np.asarray(tiles)
-    index = np.asarray(index)
-    if tiles.ndim != 4 or tiles.shape[1:3] != (TILE, TILE) or index.shape != tiles.shape[:1]:
-        raise WlmError(
-            f"tiles: expected tiles [N, {TILE}, {TILE}, C] and N numbers, got {tiles.shape} and {index.shape}"
-        )
-    check_index(index, grid)
-    image = np.full((grid.height, grid.width, tiles.shape[3]), fill, tiles.dtype)
-    place(image, tiles, index, grid)
-    return image
-
-
 def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGrid) -> None:
     """Writes tiles into a map.
 
@@ -349,11 +306,6 @@ def _whole(valid: np.ndarray) -> np.ndarray:
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask
-
-
-def _check_gamma(gamma: float) -> None:
-    if not (math.isfinite(gamma) and gamma > 0):
-        raise WlmError(f"tiles: expected a finite gamma above 0, got {gamma}")
 
 
 def _half_step(value: np.ndarray) -> np.ndarray:

@@ -4,33 +4,23 @@ The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels 
 elsewhere: it filters, so that texels of the gaps between charts and of neighbouring tiles count too, at any hour. The
 scores here are over the same tiles and times, relative to the same range, that of the tile at that time:
 
-- `seen`: bilinear reads at 4 random points of each valid texel, uniform over its area and the same in every run, from
-  the decoded map and from the original whose gaps hold the nearest valid texel. Both are clamped at the map's ends.
-- `ring`: the texels of the gaps that touch a valid one, corners included, against the same original. A tile with fewer
-  than `wlm.metrics.MIN_VALID_TEXELS` of them has none.
-- `between`: the valid texels half-way between neighbouring stored times, against the mean of the two originals, which
-  is the light of eq. 2 of neural-dynamic-gi; in a set with a period also between the last time and the first.
-- `border`: of the points of `seen`, the ones that read two tiles or more against the other points of the same tiles:
-
-      sqrt(sum n b / sum n i)     n count of the former, b and i both mean squares, summed over tiles and times
-
-  of errors relative to the range of the tile that a texel belongs to, before they are filtered. Relative to the range
-  of the reading tile, a dark tile beside a bright one would be blamed for the other's error: noise of an equal share of
-  every tile's range would score 1.39 and 4.6 on two lightmaps of a game, where no border is visible.
-
+- `seen`: bilinear reads at 4 random points of each valid texel, the same in every run, from the decoded map and from
+  the original whose gaps hold the nearest valid texel. Both are clamped at the ends of the map.
+- `ring`: the texels of gaps that touch a valid texel, corners included, against the same original.
+- `between`: the valid texels half-way between neighbouring stored times, against the mean of both originals (eq. 2 of
+  neural-dynamic-gi); in a set with a period also between the last time and the first.
+- `border`: the RMS error of the points of `seen` that read two tiles or more, divided by that of the other points of
+  the same tiles. Errors are relative to the range of the tile that a texel belongs to, so that a dark tile beside a
+  bright one is not blamed for the error of the other.
 - `flicker`: two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
-  times, spread evenly over the day. With D the decoded and R the original light (eq. 2), the mean over valid texels of
+  times. With D the decoded and R the original light, the mean over valid texels, tiles and steps of
 
       max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
 
-  and over tiles and steps. 0: nothing moves faster than in the original. An interval shorter than the two steps has
-  shorter ones.
-
-Views: cameras are spread evenly on a sphere around the set's mesh (`wlm.ops.views`), each at one of the set's times in
-turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the lightmap's light at its
-surface point, read bilinearly, without shading; the gaps of the original are filled. Both are displayed alike: with the
-exposure of that time, from the valid texels of the original (`wlm.texels.exposure`), Reinhard's curve and sRGB. Pixels
-without a surface are black in both, and do not count.
+Views: cameras are spread evenly on a sphere around the mesh of the set (`wlm.ops.views`), each at one of its times in
+turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the light of the lightmap at its
+surface point, read bilinearly, displayed with the exposure of that time (`wlm.texels.exposure`), Reinhard's curve and
+sRGB. Pixels without a surface do not count.
 """
 
 from __future__ import annotations
@@ -193,8 +183,6 @@ class ShownScore(ViewScore):
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
         worst_seen: The tile and time with the lowest one: `psnr`, `time`, `tile` (its number), `row`, `column`.
-        worst_seen_time: The time with the lowest mean: `psnr`, `time`.
-        worst_seen_tile: The tile with the lowest mean: `psnr`, `tile`, `row`, `column`.
         ring: PSNR of the texels of gaps that touch a chart, dB, mean over tiles and times.
         between: PSNR half-way between stored times, dB, mean over tiles and intervals.
         worst_between: The lowest one, as in `worst_seen`; `time` is the middle.
@@ -207,8 +195,6 @@ class ShownScore(ViewScore):
     seen_by_tile: np.ndarray
     seen_by_time: np.ndarray
     worst_seen: dict[str, float | int] | None
-    worst_seen_time: dict[str, float | int] | None
-    worst_seen_tile: dict[str, float | int] | None
     ring: float
     between: float
     worst_between: dict[str, float | int] | None
@@ -301,16 +287,12 @@ class Tally:
         by_time, by_tile = nanmean(self._seen, axis=(1, 2)), nanmean(self._seen, axis=0)
         across, inside = self._border
         border = math.sqrt(across / inside) if inside > 0 else (math.inf if across > 0 else math.nan)
-        hour = _lowest(by_time)
-        worst_time = None if hour is None else {"psnr": float(by_time[hour]), "time": float(lightmaps.times[hour])}
         return ShownScore(
             **vars(NO_VIEWS if self._views is None else self._views.score()),
             seen=float(nanmean(self._seen)),
             seen_by_tile=by_tile,
             seen_by_time=by_time,
             worst_seen=self._place(self._seen, lightmaps.times),
-            worst_seen_time=worst_time,
-            worst_seen_tile=self._place(by_tile[None]),
             ring=float(nanmean(self._rings)),
             between=float(nanmean(self._between)),
             worst_between=self._place(self._between, self._middles),
@@ -393,24 +375,19 @@ class Tally:
             scale = 3 * self._valid.count * metrics.range
             self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
-    def _place(self, psnr: np.ndarray, times: np.ndarray | None = None) -> dict[str, float | int] | None:
+    def _place(self, psnr: np.ndarray, times: np.ndarray) -> dict[str, float | int] | None:
         """Returns the lowest of PSNRs [n, rows, columns] and its place."""
-        lowest = _lowest(psnr)
-        if lowest is None:
+        if np.isnan(psnr).all():
             return None
+        lowest = int(np.nanargmin(psnr))
         index, tile = divmod(lowest, self._grid.count)
         row, column = divmod(tile, self._grid.cols)
-        when = {} if times is None else {"time": float(times[index])}
-        return {"psnr": float(psnr.flat[lowest]), **when, "tile": tile, "row": row, "column": column}
+        place = {"tile": tile, "row": row, "column": column}
+        return {"psnr": float(psnr.flat[lowest]), "time": float(times[index])} | place
 
 
 class _Texels:
-    """Some texels of a map, and sums over those of each tile.
-
-    Attributes:
-        at: Their rows and columns, int [K] each.
-        count: int [rows, columns] of the grid, number in each tile.
-    """
+    """Some texels of a map, and sums over those of each tile."""
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)
@@ -456,8 +433,3 @@ def _psnr(mse: np.ndarray, span: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Returns `psnr_from_mse` of tiles [rows, columns]; NaN if a tile is not counted."""
     pairs = zip(mse.flat, span.flat, counted.flat, strict=True)
     return np.array([psnr_from_mse(m, s) if c else math.nan for m, s, c in pairs]).reshape(mse.shape)
-
-
-def _lowest(psnr: np.ndarray) -> int | None:
-    """Returns the position of the lowest value in the flat array; None if all are NaN."""
-    return None if np.isnan(psnr).all() else int(np.nanargmin(psnr))

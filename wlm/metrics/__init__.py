@@ -3,7 +3,7 @@
 from wlm.metrics.error import PSNR_CAP_DB, dynamic_range, half_ulp, mse, psnr, psnr_from_mse
 from wlm.metrics.flip import flip_display, flip_exposures
 from wlm.metrics.lost import LostLight
-from wlm.metrics.pictures import Pictures
+from wlm.metrics.pictures import Pictures, picture_error
 from wlm.metrics.structural import SSIM_WINDOW, ssim, ssim_map
 from wlm.metrics.tiled import (
     FORMAT_LIMITED_ULPS,
@@ -31,6 +31,7 @@ __all__ = [
     "flip_exposures",
     "half_ulp",
     "mse",
+    "picture_error",
     "psnr",
     "psnr_from_mse",
     "ssim",

@@ -58,8 +58,7 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
     """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
-    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights: 1.5 times too bright on average, as path
-    tracing shows. The squares sum to 1, and engines use them.
+    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights; the squares, as in engines, sum to 1.
 
     Args:
         toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.

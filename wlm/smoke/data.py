@@ -177,11 +177,7 @@ def load_frames(
 
 
 def _sequence(folder: Path) -> dict[int, Path]:
-    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal.
-
-    Raises:
-        WlmError: There are no volumes, several sequences, or two volumes of one number.
-    """
+    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal."""
     found: dict[tuple[str, str], dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
         match = _NUMBERED.fullmatch(path.name)
@@ -203,9 +199,6 @@ def _sequence(folder: Path) -> dict[int, Path]:
 
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
     """Prepares a folder for the frames of a simulation.
-
-    Frames are useful separately and appear one after the other beside the checkpoint, so they are not staged by
-    `wlm.formats.folder`.
 
     Args:
         folder: The folder; created if its parent exists.
@@ -345,7 +338,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
 
 
 def is_six_way(path: Path) -> bool:
-    """Whether a file is an EXR with a channel for each direction.
+    """Returns whether a file is an EXR with a channel for each direction.
 
     Raises:
         WlmError: The file is named .exr and cannot be read.

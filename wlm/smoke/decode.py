@@ -2,9 +2,8 @@
 
 The adapters' weights are folded, which changes only rounding: a norm's scale and shift are merged into the following
 1 x 1 convolution, beta and gamma into the preceding one; the channel attention multiplies the weights of the following
-convolution, which are fewer than the pixels. The adapters run in one batch, and their heads as one convolution. Pixels
-are rows of channels, so that 1 x 1 convolutions are matrix products. The kernels of `wlm_kernels.smoke.naf_block` run
-between these, and those of `wlm_kernels.smoke.planes` after the heads.
+convolution. The adapters run in one batch, and their heads as one convolution. Pixels are rows of channels, so that
+1 x 1 convolutions are matrix products.
 """
 
 from collections.abc import Sequence

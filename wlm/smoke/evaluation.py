@@ -13,10 +13,10 @@ no samples, or planes of another size  error
 import copy
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -29,7 +29,7 @@ from wlm.smoke.decode import Decoder
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation, pool_of_volume
 from wlm.smoke.network.losses import residual
-from wlm.smoke.network.planes import OPACITY_PLANE, PLANES
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
 from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import Meter, OnProgress
@@ -37,8 +37,8 @@ from wlm.system import Meter, OnProgress
 Method = Callable[[Pool, slice], torch.Tensor]
 """Function that predicts planes [n, 2, 8, H, W] of both frames of a slice of a pool; `score` clamps them."""
 
-NETWORK, HALF = "network", "network, half floats"
-"""Names of a network's methods in a `Comparison`."""
+NETWORK, HALF, COARSE = "network", "network, half floats", "coarse march"
+"""Names of the methods in a `Comparison`."""
 
 DENSITIES = (0.5, 1.0, 2.0)
 """Factors of the density, those of the paper's ablation (figure 5)."""
@@ -196,44 +196,6 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Test samples of one smoke: all frame pairs, each from all views.
-
-    Attributes:
-        whole: All samples, ordered by frame pair and then by view; the views turn about the box's centre.
-        keep: bool [N], samples that are scored: those that are not almost empty.
-        settings: Settings of the samples.
-        make: Makes the samples with other settings.
-    """
-
-    whole: Pool
-    keep: torch.Tensor
-    settings: DatasetSettings
-    make: Callable[[DatasetSettings], Pool]
-
-    def pool(self, guide: str) -> Pool:
-        """Returns the scored samples, with guiding maps of a kind."""
-        same = guide == self.settings.guide
-        return (self.whole if same else self.make(_with_guide(self.settings, guide))).take(self.keep)
-
-
-class Entry(NamedTuple):
-    """A method, with the samples on which it is scored.
-
-    Attributes:
-        pool: The samples, with the guiding maps that the method reads; may be empty.
-        method: The method.
-    """
-
-    pool: Pool
-    method: Method
-
-
-Contender = Callable[[HeldOut], Entry]
-"""Function that returns the entry of a method for test samples."""
-
-
-@dataclass(frozen=True, eq=False)
 class Comparison:
     """Scores of several methods on one test set.
 
@@ -264,18 +226,16 @@ def compare(
     settings: DatasetSettings | None = None,
     volumes: Sequence[str | os.PathLike[str]] = (),
     *,
-    rivals: Mapping[str, Contender] | None = None,
     densities: Sequence[float] = DENSITIES,
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> list[Comparison]:
-    """Scores a network and other methods on the test set at several densities, and on volumes.
+    """Scores a network, and the coarse march if that is its guide, on the test set at several densities and on volumes.
 
     Args:
         model: The network.
         settings: Settings of the test set; None: those of the network's training.
         volumes: Files for `pool_of_volume`.
-        rivals: Other methods, by name.
         densities: Factors of the test set's extinction.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called after each set, with the network's "PSNR dB".
@@ -291,46 +251,41 @@ def compare(
     settings = _with_guide(settings or model.dataset, guide)
     network = copy.deepcopy(model.network).to(device)
 
-    def at_run_time(held_out: HeldOut) -> Entry:
-        pool = held_out.pool(guide)
-        return Entry(pool, _at_run_time(model, device, pool))
-
-    contenders: dict[str, Contender] = {NETWORK: lambda held_out: Entry(held_out.pool(guide), of_network(network))}
+    methods: dict[str, Callable[[Pool], Method]] = {NETWORK: lambda pool: of_network(network)}
     if device != "cpu":
-        contenders[HALF] = at_run_time
-    contenders |= rivals or {}
-    # All frames are made, so that each has its first view; almost empty frames are not scored, except in volumes.
-    complete = settings.model_copy(update={"kept_empty": 1.0})
-    sets = {
-        f"density x {scale:g}": (
-            partial(make_validation, device=device, test=True, scale=scale),
-            settings.least_coverage,
+        methods[HALF] = partial(_at_run_time, model, device)
+    if guide == "six":
+        methods[COARSE] = lambda pool: coarse
+    # Almost empty frames of the test set are not scored.
+    sets: dict[str, Callable[[], Pool]] = {
+        f"density x {scale:g}": partial(
+            make_validation, settings.model_copy(update={"kept_empty": 0.0}), device, test=True, scale=scale
         )
         for scale in densities
     }
-    sets |= {os.fspath(path): (partial(pool_of_volume, path, device=device), -1.0) for path in volumes}
+    sets |= {os.fspath(path): partial(pool_of_volume, path, settings, device=device) for path in volumes}
     meter = Meter(progress, "evaluate", len(sets))
     comparisons = []
-    for name, (make, least_coverage) in sets.items():
-        whole = make(complete)
-        held_out = HeldOut(whole, whole.covered() > least_coverage, complete, make)
-        if not held_out.keep.any():
+    for name, make in sets.items():
+        pool = make()
+        if not len(pool):
             raise WlmError(f"{name}: expected frames with smoke, found none")
-        comparisons.append(_compare(name, held_out, contenders))
-        meter.report(len(comparisons), PSNR_dB=comparisons[-1].methods[NETWORK].psnr)
+        scores = {method: score(of_pool(pool), pool) for method, of_pool in methods.items()}
+        comparisons.append(Comparison(name, len(pool), scores))
+        meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
     return comparisons
 
 
-@torch.no_grad()
-def _compare(name: str, held_out: HeldOut, contenders: Mapping[str, Contender]) -> Comparison:
-    """Scores methods on one smoke."""
-    scores = {}
-    for method_name, contender in contenders.items():
-        # One method at a time: each pool is a copy.
-        pool, method = contender(held_out)
-        if len(pool):
-            scores[method_name] = score(method, pool)
-    return Comparison(name, int(held_out.keep.sum()), scores)
+def coarse(pool: Pool, part: slice) -> torch.Tensor:
+    """Returns the coarse march of six lights, which is a pool's guide of kind "six"; a `Method`.
+
+    Raises:
+        ValueError: The pool's guides are of another kind.
+    """
+    six = GUIDES["six"]
+    if pool.guides.shape[2] != len(six):
+        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(six)}, H, W]")
+    return pool.guides[part][:, :, [six.index(name) for name in PLANES]].float()
 
 
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:

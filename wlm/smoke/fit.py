@@ -98,7 +98,7 @@ def train(
         output: The network's file.
         seed: Seed of the initial weights, the pools and the order of samples.
         device: "cpu", "cuda" or "cuda:N".
-        minutes: Time limit at which the training stops with a checkpoint, after at least `_CHUNK` steps; None: none.
+        minutes: Time after which the training stops with a checkpoint; None: no limit.
         resume: Whether to continue from the checkpoint, if it exists.
         checkpoint_every: Seconds between checkpoints during the steps; 0: after every `_CHUNK` steps. There is also one
             at the end of each round.
@@ -156,7 +156,8 @@ class _Run:
         seed: int,
         minutes: float | None,
     ) -> None:
-        self.profile, self.settings, self.output, self.checkpoint = profile, profile.training, output, checkpoint
+        self.settings, self.output, self.checkpoint = profile.training, output, checkpoint
+        self.facts = {"profile": profile.name, "seed": seed, "dataset": profile.dataset.model_dump(mode="json")}
         self.meter, self.seed, self.device = meter, seed, device
         self.trainer = Trainer(profile.network, profile.training, seed=seed, device=device)
         self.limit = math.inf if minutes is None else 60.0 * minutes
@@ -282,14 +283,12 @@ class _Run:
 
     def _save_network(self) -> None:
         summary = {
-            "profile": self.profile.name,
-            "seed": self.seed,
+            **self.facts,
             "steps": self.trainer.step,
             "seconds": round(self.seconds, 1),
             "device": "cpu" if self.device == "cpu" else torch.cuda.get_device_name(self.device),
             **self.score.to_json(),
             "training": self.settings.model_dump(mode="json"),
-            "dataset": self.profile.dataset.model_dump(mode="json"),
         }
         SmokeModel(self.trainer.average, summary).save(self.output)
 

@@ -21,8 +21,7 @@ from wlm.smoke.transport.lights import checked_albedo, checked_colour
 class StepError:
     """Change of a result when the step is halved.
 
-    It bounds the error of the finer result if the error falls at least in proportion to the step. In practice the error
-    falls with the square of the step, so that a third of this change remains.
+    The error falls with the square of the step, so that about a third of this change remains in the finer result.
 
     Attributes:
         largest: Largest difference of a pixel in any lightmap.

@@ -50,5 +50,5 @@ class SmokeModel(Model):
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Number of trained parameters."""
+    """Returns the number of trained parameters."""
     return sum(parameter.numel() for parameter in network.parameters())

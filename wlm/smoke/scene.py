@@ -4,17 +4,12 @@ Lengths are in metres, times in seconds, directions in the world, with +y up by 
 if the object that is made from it has the plain name. Special cases:
 
 =======================================  =============================================================
-a number NaN, infinite or beyond 1e18    error that names the field
 a cell not of 1e-9 to 1e9 metres         error
 more than 1,000,000 steps a frame        error that says what asks for them
-an unknown or a repeated key             error
 a path whose times do not increase       error
-a source that ends before its start      error
 no inlet, no source                      valid: the box stays empty
 an obstacle over an inlet                valid: no inflow through the covered part
 a camera or a light along an axis        valid, also along the vertical
-a light without a direction              error
-a box of one cell                        valid
 an obstacle or an inlet too fast for     error in the simulation, which names the obstacle or the inlet
 the time step
 =======================================  =============================================================
@@ -195,7 +190,7 @@ class _Timed(_Settings):
         return self
 
     def active(self, time: float) -> bool:
-        """Whether the source is active at a time in seconds."""
+        """Returns whether the source is active at a time in seconds."""
         return self.start <= time and (self.stop is None or time < self.stop)
 
 

@@ -6,15 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import warp as wp
 
-from wlm.interop import torch_memory
 from wlm.smoke.camera import Camera
-from wlm_kernels.smoke import shadow
-from wlm_kernels.smoke.march import View
-
-SHADOW_MAP = 512
-"""Texels along an edge of a shadow map."""
 
 
 @dataclass(frozen=True)
@@ -60,34 +53,3 @@ class Ramp:
 def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
     """Returns the rows of three axes, 9 numbers, of which the third points to a light."""
     return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
-
-
-def cast_shadow(
-    points: wp.array,
-    triangles: wp.array,
-    axes: Sequence[float],
-    view: View,
-    depth: wp.array,
-    out: wp.array,
-    resolution: int = SHADOW_MAP,
-    bias: float | None = None,
-) -> None:
-    """Computes the share of a light that reaches the smoke's surface past obstacles, by a shadow map (section 4.5).
-
-    The map is rendered from the light, and each pixel is looked up at the depth of its smoke's surface, bilinearly
-    between four texels. A CUDA graph can capture the call.
-
-    Args:
-        points, triangles: Corners of the obstacles in the world, vec3 [V], and their triangles int32 [F, 3], at least
-            one.
-        axes: Result of `light_axes`.
-        view: Result of `Camera.in_world`.
-        depth: float [H, W], distance along the ray to the smoke's surface; 0: none, which counts as lit.
-        out: float [H, W], written: in [0, 1].
-        resolution: Texels along an edge of the shadow map, at least 8.
-        bias: Distance in the world's unit by which an obstacle must be nearer to the light to shadow the surface;
-            None: 1.5 texels.
-    """
-    options = {"resolution": resolution, "bias": -1.0 if bias is None else bias}
-    memory = torch_memory(wp.device_to_torch(depth.device))
-    shadow.visibility(points, triangles, axes, view, depth, out, **options, empty=memory)

@@ -7,16 +7,17 @@ import numpy as np
 import torch
 import warp as wp
 
-from wlm.interop import device_name, stream, to_warp
+from wlm.interop import device_name, stream, to_warp, torch_memory
 from wlm.ops.raster import rasterize
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, cast_shadow, light_axes
+from wlm.smoke.shading import Light, Ramp, light_axes
 from wlm.smoke.transport.lighting import LitSmoke
 from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm_kernels.smoke import picture as kernels
+from wlm_kernels.smoke import shadow
 
 # Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
 _AMBIENT = 0.2
@@ -146,7 +147,8 @@ class Drawing:
                 surface, mesh = to_warp(seen.depth.contiguous()), self._as_solids()
                 for axes, own in zip(self._axes, self._visibility, strict=True):
                     if axes is not None:
-                        cast_shadow(mesh.points, mesh.triangles, axes, self._camera.in_world(), surface, to_warp(own))
+                        mesh_and_light = mesh.points, mesh.triangles, axes, self._camera.in_world()
+                        shadow.visibility(*mesh_and_light, surface, to_warp(own), empty=torch_memory(own.device))
                 solids = surface, to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
             glow = self._glow_of(seen.emission, None if six is not None else seen.thrown)
             transparency = to_warp(seen.transparency.float().contiguous())
@@ -163,7 +165,7 @@ class Drawing:
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Light that the smoke emits, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
+        """Returns emitted light, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
         if emission is None:
             return None
         ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))

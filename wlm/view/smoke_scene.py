@@ -30,12 +30,8 @@ _GLOW = np.array([1.0, 0.45, 0.12], np.float32)  # colour of heat, as on the HTM
 _DARK, _BRIGHT, _SQUARES = 0.03, 0.06, 8  # checkerboard behind the smoke: its two levels, and its squares along a side
 _MOST_VOXELS, _MOST_LIT = 4_000_000, 250_000  # voxels that are drawn, and voxels that the light is marched through
 _AMBIENT = 0.15  # share of the light everywhere in the smoke, so that its dark side is visible
-# The sheet of planes: columns, least width of a plane in pixels, and size of a name relative to a plane.
-_COLUMNS, _LEAST_PLANE, _NAME = (
-    3,
-    160,
-    1 / 12,
-)  # sheet of planes: columns, least width in pixels, and size of a name relative to a plane
+_COLUMNS, _LEAST_PLANE = 3, 160  # columns of the sheet of planes, and least width of a plane in pixels
+_NAME = 1 / 12  # size of a plane's name relative to its width
 _EMPTY = "#5a5d63"  # colour of the sheet's empty cells
 _PLANES, _SMOKE, _BOX = "planes", "smoke", "box"
 
@@ -190,7 +186,7 @@ class _VolumeScene(Scene):
         return f"{shape} voxels{drawn}, extinction {volume.extinction:g}{frames}"
 
     def _world(self, state: State) -> np.ndarray:
-        """Direction to the light in the world; a turn of 0 is along the last axis that is not up."""
+        """Returns the direction to the light in the world; a turn of 0 is along the last axis that is not up."""
         x, y, z = _toward(state)
         return np.array([x, y, z] if self.up == 1 else [x, -z, y])
 
@@ -204,7 +200,7 @@ class _VolumeScene(Scene):
 
 
 def _toward(state: State) -> np.ndarray:
-    """Unit vector to the light: right, up and towards the viewer."""
+    """Returns the unit vector to the light: right, up and towards the viewer."""
     turn, height = (math.radians(state.values[name]) for name in ("turn", "height"))
     return np.array([math.sin(turn) * math.cos(height), math.sin(height), math.cos(turn) * math.cos(height)])
 
@@ -223,7 +219,7 @@ def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
 
 
 def _squares(height: int, width: int) -> np.ndarray:
-    """A checkerboard, float32 [height, width, 3]."""
+    """Makes a checkerboard, float32 [height, width, 3]."""
     side = max(height, width) / _SQUARES
     rows, columns = (np.arange(n) // side for n in (height, width))
     odd = (rows[:, None] + columns) % 2
@@ -231,7 +227,7 @@ def _squares(height: int, width: int) -> np.ndarray:
 
 
 def _sheet(frame: SixWay, display: Display) -> np.ndarray:
-    """A sheet of the lightmaps, the opacity and the emission with their names, uint8 [H, W, 3]."""
+    """Draws a sheet of the lightmaps, the opacity and the emission with their names, uint8 [H, W, 3]."""
     planes = {name: display.picture(frame[name].numpy()) for name in DIRECTIONS}
     planes["alpha"] = Display().picture(1.0 - frame.transparency.numpy())
     if frame.emission is not None:

@@ -8,9 +8,8 @@ light is sampled (next event estimation). The sky is sampled too, and is also re
 the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
 for e / majorant.
 
-Units are those of `march`. Light of order n has been scattered n times. Random numbers belong to a pixel, so that the
-result depends on the seed alone. Read `scattered_twice` of `tests/reference/transport.py` first: the second order by
-quadrature.
+Units are those of `march`. Random numbers belong to a pixel, so that the result depends on the seed alone. Read
+`scattered_twice` of `tests/reference/transport.py` first: the second order by quadrature.
 """
 
 import math

@@ -12,6 +12,10 @@ import warp as wp
 from wlm_kernels.smoke.march import Empty, View, ray
 
 wp.set_module_options({"enable_backward": False})
+
+RESOLUTION = 512
+"""Texels along an edge of a shadow map."""
+
 _BORDER = wp.constant(4.0)  # texels of the empty border, sum of both sides
 _LINES = wp.constant(32)  # threads per triangle, each of which draws every 32nd row
 _CORNERS = wp.constant(64)  # corners per thread of `_bound`
@@ -181,22 +185,25 @@ def visibility(
     depth: wp.array,
     out: wp.array,
     *,
-    resolution: int,
-    bias: float,
     empty: Empty,
+    resolution: int = RESOLUTION,
+    bias: float = -1.0,
 ) -> None:
-    """Computes the share of a directional light that reaches a surface past obstacles.
+    """Computes the share of a directional light that reaches the smoke's surface past obstacles.
+
+    Each pixel is looked up at the depth of its smoke's surface alone, bilinearly between four texels of the map.
 
     Args:
-        points: vec3 [V], corners.
+        points: vec3 [V], corners of the obstacles in the world.
         triangles: int32 [F, 3], rows of the points; at least one.
         axes: 9 numbers, rows of a rotation to axes of which the third points to the light.
         view: The camera in the world; its `voxel` and `moved` are not used.
         depth: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
         out: float [H, W], written: in [0, 1].
-        resolution: Texels along the map's edge.
-        bias: Distance by which an obstacle must be nearer to the light; below 0: 1.5 texels.
         empty: Allocates buffers.
+        resolution: Texels along the map's edge, at least 8.
+        bias: Distance in the world's unit by which an obstacle must be nearer to the light to shadow the surface; below
+            0: 1.5 texels.
     """
     heights, bounds = empty((resolution, resolution), float), empty((6,), float)
     turn, device, faces = wp.mat33(*axes), depth.device, triangles.shape[0]

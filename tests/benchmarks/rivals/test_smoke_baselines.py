@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 import torch
 from builders.smoke_plumes import plume
-from builders.smoke_samples import small_pool
 
-from benchmarks.rivals.smoke import billboard, coarse, flip_book
-from wlm.fluid.volume import DensityVolume, save_volume
+from benchmarks.rivals.smoke import billboard
+from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
-from wlm.smoke.evaluation import HeldOut, score
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.fine import bake
-from wlm.smoke.network.dataset import fixed_cameras, pool_of_volume
-from wlm.smoke.network.planes import GUIDES, PLANES, encode_lightmaps
-from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import CameraSettings, make_camera
 
 
@@ -80,39 +75,3 @@ def test_billboard_wrong_use(device: str):
         billboard(SixWay(baked.lightmaps[:, 1:], None), camera, camera, volume.centre)
     with pytest.raises(ValueError, match="transparency"):
         billboard(SixWay(baked.lightmaps, None), camera, camera, volume.centre)
-
-
-def test_the_coarse_march_is_its_guide():
-    pool = small_pool(2, kind="six")
-    for name, plane in zip(PLANES, coarse(pool, slice(0, 2)).unbind(2), strict=True):
-        assert torch.equal(plane, pool.guides[:, :, GUIDES["six"].index(name)].float())
-    assert score(coarse, pool).psnr > 20
-    with pytest.raises(ValueError, match="kind six"):
-        coarse(small_pool(2), slice(0, 2))
-
-
-def test_a_flip_book_is_the_billboard(tmp_path, device):
-    """It shows the side that was baked from all others; samples that don't count are left out."""
-    save_volume(tmp_path / "a.npz", plume())
-    settings = DatasetSettings(cells=16, resolution=24, views=3)
-    pool = pool_of_volume(tmp_path / "a.npz", settings, device=device, extinction=8.0)
-
-    def held_out(keep: list[bool], views: int = 3) -> HeldOut:
-        changed = settings.model_copy(update={"views": views})
-        return HeldOut(pool, torch.tensor(keep, device=device), changed, lambda settings: pool)
-
-    numbers, others, method = flip_book(held_out([True, True, True]))
-    assert numbers.tolist() == [1, 2]
-    assert len(pool) == 3 and len(others) == 2 and torch.equal(others.targets, pool.targets[1:])
-    volume = plume(device=device)
-    first, *rest = fixed_cameras(settings, volume.origin, volume.voxel * np.array(volume.shape))
-    baked = bake(volume, first, step=settings.reference_step, estimate=False)
-    for planes, camera in zip(method(others, slice(0, 2)), rest, strict=True):
-        expected = encode_lightmaps(billboard(baked, first, camera, volume.centre))
-        assert (planes - expected).abs().max() < 4e-3
-    numbers, others, method = flip_book(held_out([False, False, True]))
-    assert numbers.tolist() == [2] and len(others) == 1
-    assert torch.equal(method(others, slice(0, 4)), pool.targets[:1].float())
-    assert len(flip_book(held_out([True] * 3, views=1)).pool) == 0
-    with pytest.raises(ValueError, match="whole sets of 2 views, got 3"):
-        flip_book(held_out([True] * 3, views=2))

@@ -55,7 +55,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def _facts(bundle: Bundle) -> dict[str, str]:
-    """Parts of the READMEs that describe the flip book."""
+    """Returns the parts of the READMEs that describe the flip book."""
     book = bundle.document
     width, height = book["frame_size"]
     cells = f"{book['rows']} x {book['columns']} cells of {width} x {height} pixels, padded by {book['padding']}"

@@ -81,11 +81,7 @@ class Encoding(ABC):
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately.
-
-        Raises:
-            WlmError: The arrays can not be stored.
-        """
+        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately."""
         return []
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
@@ -122,10 +118,6 @@ class Encoding(ABC):
             times: Stored times, or any times if networks interpolate.
             records: float32 [times, tiles, fours, 4], written; the first number of each record is set already.
         """
-
-    @abstractmethod
-    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
-        """Explains why a tile of this kind is stored in this way, in a sentence without a full stop."""
 
 
 def inverse_of(bounds: np.ndarray) -> np.ndarray:

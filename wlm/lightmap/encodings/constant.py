@@ -57,6 +57,3 @@ class Constant(Encoding):
             before, after, share = sheet.axis.neighbours(time)
             light = (1.0 - share) * colours[:, before] + share * colours[:, after]
             table[numbers, 1, :3] = light ** (1.0 / sheet.profile.gamma)
-
-    def reason(self, sheet: SheetModel, kind: TileKind) -> str:
-        return "all valid texels have one colour at each time"

@@ -334,7 +334,7 @@ def read_flipbook(
 
 
 def is_straight(frames: Sequence[SixWay]) -> bool:
-    """Whether there is light where there is no smoke, which suggests straight alpha; False without opacity."""
+    """Returns whether there is light where there is no smoke, which suggests straight alpha; False without opacity."""
     bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
     light = torch.cat(bare) if bare else torch.zeros(0)
     return len(light) > 0 and float(light.mean()) > _LIT

@@ -102,8 +102,7 @@ def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
-    """Multiplies a motion [2, H, W] at each pixel by the share for which the second frame is most similar to the first;
-    motion of less than a pixel becomes 0."""
+    """Multiplies a motion [2, H, W] by the share, at each pixel, for which the two frames are most similar."""
     before, after = _planes(one).cpu(), _planes(other).cpu()
     off = []
     for share in _SHARES:

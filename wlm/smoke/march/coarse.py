@@ -1,10 +1,8 @@
 """Marches in large steps: the paper's guiding maps (section 4.2), and six-way lightmaps at the same cost.
 
 The paper marches in steps of 10 voxels for the sum of three lights, and a network recovers six lightmaps from it. The
-same march can compute six separate lightmaps: optical depths to the lights from the sides are computed along the lines
-of a lattice, once for all pixels; light from the front and the back follows exactly from the ray's transparency T, as
-(1 - T^2) / 2 and -T ln T. The errors are those of the steps along the rays, of the interpolation between the lattice's
-nodes, and of the steps to the lights, all of which are settings of `March`.
+same march can compute six separate lightmaps. The errors are those of the steps along the rays, of the interpolation
+between the nodes of the lattice, and of the steps to the lights, all of which are settings of `March`.
 """
 
 from dataclasses import dataclass, replace

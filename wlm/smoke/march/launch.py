@@ -20,17 +20,10 @@ def run(
     *arguments: Any,
     **options: Any,
 ) -> torch.Tensor:
-    """Runs a march.
-
-    Args:
-        launch: Function of `wlm_kernels.smoke`, called as `launch(medium, view, *arguments, out, **options)`.
-        volume: The smoke.
-        camera: The view.
-        planes: Leading dimensions of the result.
-        arguments, options: Further arguments; lengths in voxels.
+    """Runs a function of `wlm_kernels.smoke` as `launch(medium, view, *arguments, out, **options)`.
 
     Returns:
-        float32 [*planes, H, W] on the smoke's device.
+        `out`, float32 [*planes, H, W] on the smoke's device.
     """
     with stream(device_name(volume.device)):
         size = (*planes, camera.height, camera.width)

@@ -5,10 +5,8 @@ a round. Scenes are drawn at random, simulated, and rendered from several sides.
 frames, each with its guiding map and its lightmaps, and the motion between them. Images show only smoke: obstacles
 shape it but are not rendered (section 5).
 
-The paper's sizes, 400^3 voxels, 512^2 pixels and steps of 10 voxels, are larger than needed. Lengths are shares of the
-box, so that a smaller grid gives the same images: the guiding map's step is 1/40 of the edge, and so is the density
-from which smoke counts as a surface. A trained network's guiding maps must be made with its own
-`DatasetSettings.look`. Special cases:
+Lengths are shares of the box, so that a smaller grid gives the same images. A trained network's guiding maps must be
+made with its own `DatasetSettings.look`. Special cases:
 
 =======================================  =============================================================
 an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn instead
@@ -240,7 +238,7 @@ class _Maker:
         return guides, targets, moved
 
     def _shots(self, scene: Scene, random: np.random.Generator) -> list[_Shot]:
-        """The views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
+        """Returns the views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
         settings = self._settings
         if self._validation:
             seeds = random.integers(2**30, size=settings.views)

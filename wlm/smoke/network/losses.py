@@ -99,7 +99,7 @@ def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) 
 
 
 def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
-    """The temporal loss: L1 between the changes of prediction and target along the motion (in place of eq. 9).
+    """Computes the temporal loss: L1 between the changes of prediction and target along the motion (in place of eq. 9).
 
     Warping is linear, so that the difference of the two changes is the change of the error and takes one warp.
 

@@ -124,7 +124,7 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """Inverse of `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
+    """Inverts `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
 
     Args:
         planes: [8, H, W].

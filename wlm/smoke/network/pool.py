@@ -50,7 +50,7 @@ class Pool:
         return self.guides.device
 
     def covered(self) -> torch.Tensor:
-        """Share of the image that shows smoke, [N]; the smaller of the two frames."""
+        """Returns the share of the image that shows smoke, [N], the smaller of the two frames."""
         return (self.targets[:, :, OPACITY_PLANE] > VISIBLE).float().mean((-2, -1)).amin(1)
 
     def take(self, which: torch.Tensor) -> Pool:

@@ -204,7 +204,7 @@ class TrainSettings(BaseModel):
         return ("mse", "temporal") if self.temporal > 0 else ("mse",)
 
     def rate_at(self, step: int) -> float:
-        """The learning rate of a step; steps count from 0."""
+        """Returns the learning rate of a step; steps count from 0."""
         rise = min(1.0, (step + 1) / (self.warmup + 1))
         return rise * self.rate * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * step / self.total)))
 
@@ -234,7 +234,7 @@ class Profile(Settings):
         return self
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """As `Settings.override`, also within the parts: `{"training": {"steps": 500}}` keeps its other settings.
+        """Overrides settings, also within the parts: `{"training": {"steps": 500}}` keeps the other training settings.
 
         Raises:
             WlmError: A setting is unknown or out of range.

@@ -45,10 +45,7 @@ _START = {
 
 
 class ChannelNorm(nn.Module):
-    """Layer norm over the channels of each pixel, [N, C, H, W].
-
-    torch's own norm needs the channels contiguous in memory, and uses a block of GPU threads per pixel for 16 numbers.
-    """
+    """Layer norm over the channels of each pixel, [N, C, H, W]; torch's own needs the channels contiguous in memory."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

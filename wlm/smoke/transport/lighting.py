@@ -1,8 +1,7 @@
 """Smoke under lights from any direction and point lights: one march per light, instead of weighted lightmaps.
 
-Six weighted lightmaps have an error of 30% for lights between the axes. The same march with its lattice turned towards
-a light costs as much for this light and the opposite light as for two of the six, and has only the error of its step.
-`wlm.smoke.transport.orders` computes light of all orders from such planes.
+Six weighted lightmaps have an error for lights between the axes. The same march with its lattice turned towards a light
+has only the error of its step. `wlm.smoke.transport.orders` computes light of all orders from such planes.
 """
 
 import math
@@ -166,11 +165,11 @@ class Marching:
     shadow: float
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
-        """Optical depths to a light, see `depth_lattice.reach`."""
+        """Computes optical depths to a light, see `depth_lattice.reach`."""
         return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
-        """Light scattered once, see `marches.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
+        """Computes single scattering, see `marches.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
         marches.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
     def unlit(self) -> torch.Tensor:

@@ -4,8 +4,7 @@ Multiply scattered light diffuses, except at the smoke's edges, where it leaves,
 be predicted per pixel from light scattered once, from the same under the opposite light, from opacity, and from the
 share of thin smoke in these. R, all light except the first order, is a weighted sum of such features. The weights
 depend on the angle between light and camera and on the smoke's mean depth, and were fitted to path-traced light by
-least squares (`learning`). A network with two hidden layers of 32 units, trained on the same data, did not generalise
-better.
+least squares (`learning`).
 
 At albedo a all light is a S + a^2 R(a), where S was scattered once. Weights are known at `ALBEDOS` and are linear in
 between."""
@@ -97,8 +96,7 @@ def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
     """Returns the march for light of all orders.
 
     Its step is 1/130 of the smoke's longest edge, at least a quarter of a voxel. The nodes of its lattice have the same
-    spacing, but at least a voxel or, on small grids, 1/64 of the edge: a finer lattice takes far longer and gains 0.1
-    dB.
+    spacing, but at least a voxel or, on small grids, 1/64 of the edge.
     """
     edge = max(volume.shape)
     step = max(_SHORTEST, edge / _STEPS)

@@ -1,7 +1,7 @@
 """Six-way lightmaps with the least error for lights from any direction, instead of no error along the six axes.
 
-Shaders weight six lightmaps by the squares of a light's direction, which has an error between the axes. A least squares
-fit over lights from all directions minimises the error for a random light, at the cost of an error along the axes.
+A least squares fit over lights from all directions minimises the error for a random light, at the cost of an error
+along the axes.
 """
 
 import numpy as np
