@@ -48,7 +48,7 @@ from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.errors import WlmError
 
-PROFILES = ("standard", "bc6h", "astc", "cascade", "paper")
+PROFILES = ("standard", "astc", "cascade", "paper")
 """Profiles of a run; the first has the bits of the first cascade too."""
 
 _RIVALS = {

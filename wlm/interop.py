@@ -214,10 +214,7 @@ class StepGraph:
 
 @cache
 def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
-    """Creates the single side stream of a device, as a torch and as a Warp object.
-
-    All uses share it, because torch's allocator keeps a pool of memory for every stream.
-    """
+    """Creates the single side stream of a device: torch's allocator keeps a pool of memory for every stream."""
     # Warp looks up a stream's device in a table created at initialisation, and this may be the first Warp call.
     wp.init()
     side = torch.cuda.Stream(device)

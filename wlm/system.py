@@ -67,11 +67,8 @@ class Settings(BaseModel):
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
-        """Loads a profile.
-
-        Args:
-            profile: A name (`configs/FILES-NAME.yaml`), the path of a YAML file, or settings, which are returned as
-                they are.
+        """Loads a profile by its name (`configs/FILES-NAME.yaml`) or the path of a YAML file; settings are returned as
+        they are.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.
@@ -131,12 +128,8 @@ class Meter:
     """
 
     def __init__(self, progress: OnProgress | None, stage: str, total: int, every: float = _REPORT_EVERY) -> None:
-        """Starts the clock.
-
-        Args:
-            progress: The callback, or None for no reports.
-            stage, total: Values of the attributes of `Progress`.
-            every: Seconds between two reports.
+        """Starts the clock; `every` is the number of seconds between two reports, and without a callback there are
+        none.
         """
         self._progress, self._stage, self._total, self._every = progress, stage, total, every
         self._start = self._last = time.perf_counter()

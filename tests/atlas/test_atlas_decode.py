@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from builders.atlas_meshes import charts, sheet, write_files
+from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, MIXED
 
 import wlm
@@ -121,25 +121,6 @@ def test_the_lightmap_in_its_own_layout(device: str):
     exact = models(charts)["plain with uv"]
     # A texel with its centre in no triangle has its neighbour's light.
     assert np.abs(Decoder(exact, device).lightmap() - mesh.sheets[0].lightmap)[mesh.sheets[0].mask].mean() < 0.02
-
-
-def test_the_front_door(tmp_path, monkeypatch):
-    """The snippet of the README, as it stands there."""
-    glb, exr = write_files(tmp_path, sheet())
-    glb.rename(tmp_path / "room.glb"), exr.rename(tmp_path / "room.exr")
-    monkeypatch.chdir(tmp_path)
-    uv = torch.rand(100, 2)
-
-    mesh = wlm.atlas.load("room.glb", "room.exr")
-    model = wlm.atlas.compress(mesh, "standard")
-    light = model.decoder("cpu").read(uv)  # [N, 2] -> [N, 3]
-
-    assert light.shape == (100, 3)
-    model.save("room.wlm")
-    assert torch.equal(wlm.load("room.wlm").decoder("cpu").read(uv), light)
-    assert wlm.atlas.evaluate(model, mesh, views=2, resolution=64).psnr > 30.0
-    assert "colour" in model.bundle().textures and "mesh.glb" in model.bundle().files
-    assert all(getattr(wlm.atlas, name) is not None for name in wlm.atlas.__all__)
 
 
 def test_another_mesh_is_refused():

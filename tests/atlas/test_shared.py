@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from builders.atlas_meshes import sheet
 from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 
@@ -21,6 +22,7 @@ from wlm.atlas.shader import glsl
 from wlm.atlas.shared import curves, sharing
 from wlm.atlas.shared.mixture import find_mixtures, moments
 from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
+from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.system import Meter
 
@@ -115,10 +117,10 @@ def test_mips(scene, model, device):
     decoder = model.decoder(device)
     row, column = np.mgrid[:12, :12].reshape(2, -1)
     uv = torch.from_numpy(np.stack([(column + 0.5) / 12, (row + 0.5) / 12], 1).astype(np.float32)).to(device)
-    for number, sheet in enumerate(scene.sheets):
-        mask = sheet.mask.reshape(12, 4, 12, 4).sum((1, 3))
-        for state, frame in enumerate(sheet.lightmaps):
-            sums = (frame * sheet.mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3))
+    for number, own in enumerate(scene.sheets):
+        mask = own.mask.reshape(12, 4, 12, 4).sum((1, 3))
+        for state, frame in enumerate(own.lightmaps):
+            sums = (frame * own.mask[..., None]).reshape(12, 4, 12, 4, 3).sum((1, 3))
             means = sums / mask.clip(min=1)[..., None]
             which = torch.full((144,), number, device=device)
             light = decoder.read(uv, which, state, torch.full((144,), 2.0, device=device)).cpu().numpy()
@@ -130,6 +132,17 @@ def test_mips(scene, model, device):
     assert torch.equal(light[0], decoder.read(uv[:1], torch.zeros(1, device=device), 1.0)[0])
     with pytest.raises(ValueError, match="lod: expected a model with mips"):
         bare.decoder().read(uv[:1].cpu(), 0, 0, torch.zeros(1))
+
+
+def test_mips_of_one_lightmap_are_shared_tiles():
+    model = compress(sheet(), views=1, budget=0.4, mips=True)
+    assert model.method == "shared" and len(model.levels) == 4 and model.compression_ratio >= 0.6
+    for settings, words in (
+        ({"method": "cascade", "colour": "rgb9e5"}, "method: expected tiles"),
+        ({"colour": "astc"}, "colour: expected"),
+    ):
+        with pytest.raises(WlmError, match=f"{words} .*several lightmaps or mips"):
+            compress(sheet(), views=1, mips=True, **settings)
 
 
 def test_views_of_the_scene_decide(scene):

@@ -133,14 +133,9 @@ class Checkpoint:
         return self._running.get(number)
 
     def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
-        """Restores the state of a batch that was running.
+        """Restores the state of a batch that was running, and returns whether there was one.
 
-        Args:
-            number: The batch.
-            load: Restores a state; it raises ValueError, before it changes anything, for an invalid one.
-
-        Returns:
-            Whether a state was restored.
+        `load` restores a state; for an invalid one it raises ValueError before it changes anything.
 
         Raises:
             WlmError: The state is invalid.

@@ -33,18 +33,15 @@ _NOTE = "wlm"  # the header's attribute
 def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the colour channels of a single-part EXR file, over its data window.
 
-    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values
-    are returned unchanged, NaN and infinity included: the caller checks them.
-
-    Args:
-        path: The EXR file.
+    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values are
+    returned unchanged, NaN and infinity included.
 
     Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channels' names, ("R", "G", "B") or ("R", "G", "B", "A").
+        The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data,
-            or lacks one of R, G and B.
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data, or
+            lacks one of R, G and B.
     """
     channels = read_part(path).channels
     if any(name not in channels for name in _COLOUR):
@@ -125,9 +122,6 @@ def write_planes(
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Reads all channels of a single-part EXR file.
-
-    Args:
-        path: The EXR file.
 
     Returns:
         The planes by name, float32 [H, W], unchanged, NaN included; and the note of the header, empty if the file has

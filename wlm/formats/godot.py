@@ -156,9 +156,6 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Reads the light probes of a Godot 4 lightmap bake.
 
-    Args:
-        path: The `.lmbake` file.
-
     Returns:
         The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
         description defines them); N is at least 1.
@@ -172,14 +169,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
-    """Replaces the light of the probes of a bake and keeps everything else.
-
-    Args:
-        path: The `.lmbake`, not compressed.
-        sh: [N, 9, 3], coefficients for each of its N probes, as stored in the file.
-
-    Returns:
-        The new content of the file.
+    """Replaces the coefficients [N, 9, 3] of the N probes of a bake, and returns the new content of the file.
 
     Raises:
         WlmError: See `read_lmbake`; or the bake is compressed.

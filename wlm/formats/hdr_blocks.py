@@ -43,12 +43,10 @@ def need(package: str, extra: str) -> ModuleType:
 
 
 def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
-    """Encodes unsigned BC6H by Intel's ISPC texture compressor.
+    """Encodes texels, half [H, W, 3], finite and not negative, as unsigned BC6H by Intel's ISPC texture compressor.
 
-    Args:
-        texels: half [H, W, 3], finite, not negative; H and W multiples of 4.
-        profile: One of `BC6H_PROFILES`, from the fastest to the best.
-        extra: Name of the optional extra for the error message.
+    H and W are multiples of 4, `profile` is one of `BC6H_PROFILES`, and `extra` is the optional extra for the error
+    message.
 
     Raises:
         WlmError: The package is missing.
