@@ -74,32 +74,24 @@ def _distances(rows: np.ndarray, cubes: Cubes, support: str) -> np.ndarray:
     return np.array(nearest).reshape(len(low), len(rows)) / CUT
 
 
-@pytest.mark.parametrize("support", ["ellipsoid", "sphere"])
-def test_lists_hold_what_meets_the_cube(device: str, support: str):
-    """The lists agree with float64, for ellipsoids with a solver of bounded least squares."""
-    rows = _gaussians(30, 20.0)
+@pytest.mark.parametrize(
+    ("anisotropy", "longest", "support"),
+    [(20.0, 0.2, "ellipsoid"), (20.0, 0.2, "sphere"), (1.0, 0.1, "ellipsoid"), (300.0, 0.4, "ellipsoid")]
+    + [(30000.0, 0.4, "ellipsoid")],
+)
+def test_lists_hold_the_gaussians_that_meet_the_cube(device: str, anisotropy: float, longest: float, support: str):
+    """The lists agree with float64, for ellipsoids with a solver of bounded least squares; sheets are among them."""
+    rows = _gaussians(24, anisotropy, longest)
+    rows[::2, 4] = rows[::2, 3]
     cubes = probe_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3)
     assert [*cubes.counts] == [4, 3, 3]
     far = _distances(rows, cubes, support)
     listed = _table(cubes, len(rows))
     assert listed[far <= 1.0].all()
-    assert not listed[far > 1.0 + LOOSE].any()
-    assert 0.02 < listed.mean() < 0.98
-
-
-@pytest.mark.parametrize(("anisotropy", "longest"), [(1.0, 0.1), (300.0, 0.4), (30000.0, 0.4)])
-def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longest: float):
-    """The nearest point of a cube, where the ellipsoid's axes differ by more than float32 can tell."""
-    rows = _gaussians(16, anisotropy, longest)
-    rows[::2, 4] = rows[::2, 3]
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25)
-    far = _distances(rows, cubes, "ellipsoid")
-    listed = _table(cubes, len(rows))
-    assert listed[far <= 1.0].all()
     # A cube is a little larger than it should be; to a sheet of 1e-5 that is far.
     slack = LOOSE + 4e-6 / (CUT * np.exp(rows[:, 3:6].min(1)))
     assert not listed[far > 1.0 + slack].any()
-    assert 0.02 < listed.mean() < 0.9
+    assert 0.02 < listed.mean() < 0.98
 
 
 def _reached(row: np.ndarray, random: np.random.Generator, count: int = 60) -> np.ndarray:
