@@ -1,7 +1,5 @@
 """Bundles: textures that hold the model's numbers exactly, a mesh with both UVs, a shader that compiles."""
 
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -101,30 +99,6 @@ def test_a_texture_beyond_a_gpu():
     model = replace(random_model(sheet(), "plain"), texels=np.zeros((1, 1, 16385, 3), np.float16))
     with pytest.raises(WlmError, match="sheet: colour: expected at most 16384 texels along a side, found 16385"):
         bundle(model)
-
-
-CALLER = """
-{layout}in vec2 place;
-{layout}out vec4 light;
-void main() {{ light = vec4(wlm_atlas(place), 1.0); }}
-"""
-BOUND = "#define WLM_ATLAS_COLOUR_BINDING 0\n#define WLM_ATLAS_LUT_BINDING 1\n"
-
-
-@pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
-@pytest.mark.parametrize("exact", ["", "#define WLM_ATLAS_EXACT\n"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_shader_compiles(kind, exact, tmp_path):
-    text = glsl(random_model(sheet(), kind))
-    for version, options, layout, defined in (
-        (330, [], "", ""),
-        (450, ["-V", "-o", "shader.spv"], "layout(location = 0) ", BOUND),
-    ):
-        shader = f"#version {version}\n{defined}{exact}{text}{CALLER.format(layout=layout)}"
-        (tmp_path / "shader.frag").write_text(shader)
-        words = ["glslangValidator", *options, "shader.frag"]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
 def test_the_shader_names_the_uvs_that_it_takes():

@@ -257,20 +257,6 @@ def test_triangles_that_are_not_active():
         assert _model_error(box, model, model.uv[:12]) < 0.1
 
 
-def test_blocks_of_the_colours():
-    """T_p as blocks: as the model says, and what they decode to."""
-    pytest.importorskip("ispc_texcomp")
-    mesh = _box()
-    half, blocks = (
-        fit_cascade(mesh, None, _profile(colour_scale=1.0, colour=colour), 0, Stages("cpu"))
-        for colour in ("half", "bc6h")
-    )
-    rows, columns = (-(-n // 4) for n in blocks.texels.shape[1:3])
-    assert blocks.colour == "bc6h" and blocks.blocks.shape == (1, rows * columns, 16)
-    close(blocks.texels.astype(np.float32), half.texels.astype(np.float32), 0.1)
-    assert (blocks.texels != half.texels).any()
-
-
 def test_a_cuda_step_is_captured(device: str):
     """From the fourth on it is replayed."""
     if device == "cpu":

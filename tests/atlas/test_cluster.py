@@ -88,7 +88,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
     )
     patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
     _sound(clusters, count)
-    assert clusters.stats.edges == edges.sum() // 2 > 20
+    assert edges.sum() // 2 > 20
     members = [np.flatnonzero(clusters.group == group).tolist() for group in range(len(clusters.representative))]
     assert list(zip(clusters.representative.tolist(), members, strict=True)) == groups
     np.testing.assert_array_equal(clusters.excluded, ~active)
@@ -109,7 +109,7 @@ def test_many_triangles_are_grouped_by_samples(device: str, monkeypatch: pytest.
     reports = []
     clusters = cluster(uv, triangle, lightmap, largest=65, device=device, progress=reports.append)
     _sound(clusters, count)
-    assert clusters.distance.max() < 0.03 and clusters.stats.edges < 0.5 * exact.stats.edges
+    assert clusters.distance.max() < 0.03
     patches, edges, _ = _naive(uv, triangle, lightmap, 0.03, 0.09, 2.0, np.ones(count, bool))
     assert not edges[np.ix_(clusters.representative, clusters.representative)].any()
     assert len(clusters.representative) <= 1.2 * len(exact.representative) < 0.7 * count
@@ -149,7 +149,6 @@ def test_sizes_are_those_of_texels():
 def test_no_triangle(device: str):
     clusters = cluster(np.zeros((0, 2)), np.zeros((0, 3), int), _lightmap(), device=device)
     assert clusters.group.shape == clusters.representative.shape == (0,)
-    assert (clusters.stats.compared, clusters.stats.edges) == (0, 0)
 
 
 def test_one_triangle(device: str):
@@ -160,13 +159,11 @@ def test_one_triangle(device: str):
 
 @pytest.mark.parametrize("colour", [0.0, 0.3, 2.0])
 def test_one_colour(device: str, colour: float):
-    """All are alike: one group, of the first; every pair is an edge, and no sample is looked at."""
+    """All are alike: one group, of the first."""
     count = 2000
     clusters = cluster(*_mesh(count, longest=20), np.full((*SIDE, 3), colour), device=device)
     _sound(clusters, count)
-    pairs = count * (count - 1) // 2
     assert clusters.representative.tolist() == [0]
-    assert (clusters.stats.compared, clusters.stats.edges) == (0, pairs)
 
 
 def test_degenerate_triangles(device: str):
@@ -236,32 +233,6 @@ def test_largest(device: str):
     assert cluster(*inputs, largest=2, device=device).group.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"uv": np.zeros((6, 3))}, "uv"),
-        ({"uv": np.full((6, 2), np.nan)}, "uv"),
-        ({"uv": np.full((6, 2), 1e9)}, "uv"),
-        ({"triangle": np.zeros((2, 3))}, "triangle"),
-        ({"triangle": np.full((2, 3), 6)}, "triangle"),
-        ({"triangle": np.full((2, 3), -1)}, "triangle"),
-        ({"lightmap": np.zeros((4, 4))}, "lightmap"),
-        ({"lightmap": np.zeros((0, 4, 3))}, "lightmap"),
-        ({"lightmap": np.full((4, 4, 3), np.inf)}, "lightmap"),
-        ({"threshold": 0.0}, "threshold"),
-        ({"threshold": float("nan")}, "threshold"),
-        ({"colour_threshold": -0.1}, "colour_threshold"),
-        ({"max_radiance": 0.0}, "max_radiance"),
-        ({"active": np.ones(3, bool)}, "active"),
-        ({"largest": 64}, "largest"),
-    ],
-)
-def test_wrong_use(change: dict, field: str):
-    inputs = {"uv": np.zeros((6, 2)), "triangle": np.arange(6).reshape(2, 3), "lightmap": np.zeros((4, 4, 3))}
-    with pytest.raises(ValueError, match=f"^{field}:"):
-        cluster(**(inputs | change))
-
-
 @pytest.mark.slow
 def test_many_triangles_of_one_colour():
     """132,000 triangles, all alike, with patches of 65: within 8 GB."""
@@ -270,5 +241,4 @@ def test_many_triangles_of_one_colour():
     count = 132_000
     clusters = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), largest=65)
     assert len(clusters.representative) == 1
-    assert clusters.stats.edges == clustering.SAMPLE * (clustering.SAMPLE - 1) // 2
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 8e6  # KiB

@@ -63,17 +63,10 @@ def test_bc6h_is_what_another_decoder_reads():
 
 def test_what_is_refused():
     texels = _smooth(8, 8)
-    with pytest.raises(ValueError, match="'bc7'"):
-        encode(texels, "bc7")
-    for bad in (texels[..., 0], texels[..., :2], np.zeros((0, 4, 3))):
-        with pytest.raises(ValueError, match=r"\[H, W, 3\]"):
-            encode(bad, "bc6h")
     texels[3, 2, 1] = np.nan
     with pytest.raises(ValueError, match="1 are NaN"):
         encode(texels, "astc")
     blocks, _ = encode(_smooth(8, 8), "astc")
-    with pytest.raises(ValueError, match="'half'"):
-        decode(blocks, 8, 8, "half")
     for bad in (blocks[:3], blocks.astype(np.int32), blocks.ravel()):
         with pytest.raises(ValueError, match=r"expected uint8 \[4, 16\]"):
             decode(bad, 8, 8, "astc")

@@ -8,18 +8,17 @@ import pytest
 from builders.resigned import GONE, rewrite
 
 from wlm.atlas import codec
-from wlm.atlas.cascade.cluster import Clusters, Stats
+from wlm.atlas.cascade.cluster import Clusters
 from wlm.atlas.colour import quantise
-from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import (
-    MOST_SIZE,
     AtlasModel,
     Profile,
     SheetPlace,
     first_block_code,
     pack_entries,
     pack_tiles,
+    snapped,
     tile_counts,
 )
 from wlm.atlas.stored import store
@@ -27,25 +26,23 @@ from wlm.atlas.stored import store
 KINDS = ("tiles", "cascade", "plain", "plain with uv")
 MIXED = "tiles mixed"
 """Tiles in two textures; it has no other colour."""
-WIDE = "tiles wide"
-"""Tiles in BC6H, in a texture with more texels along a side than an entry can name: it names blocks."""
 
 
 def random_model(scene: LightmappedScene, kind: str, colour: str = "half", seed: int = 0, tile: int = 7) -> AtlasModel:
-    """Makes a model of one of `KINDS`, `MIXED` or `WIDE`, for a scene of one sheet."""
+    """Makes a model of one of `KINDS` or `MIXED`, for a scene of one sheet."""
     random = np.random.default_rng(seed)
     (sheet,) = scene.sheets
     size = sheet.mask.shape
-    method, colour = kind.split(maxsplit=1)[0], {MIXED: "mixed", WIDE: "bc6h"}.get(kind, colour)
+    method, colour = kind.split(maxsplit=1)[0], "mixed" if kind == MIXED else colour
     profile = Profile(name="random", method="tiles" if method == "tiles" else "cascade", tile=tile, colour=colour)
-    shape = (16, MOST_SIZE + 4) if kind == WIDE else (18, 23)
+    shape = (18, 23)
     texels, lut = random.random((*shape, 3)) * 3.0, np.empty((0, 0, 2), np.uint16)
     second = {}
     if method == "tiles":
         counts = tile_counts(*size, tile)
         side = random.integers(1, tile + 2, (*counts, 2))
         first, blocks = random.integers(0, np.array(shape[::-1]) - side + 1), False
-        if kind == WIDE:
+        if colour in ("bc6h", "astc"):
             whole = random.integers(1, 4, (*counts, 2))
             first, side, blocks = 4 * random.integers(0, np.array(shape[::-1]) // 4 - whole + 1), 4 * whole, True
         elif colour == "mixed":
@@ -55,7 +52,7 @@ def random_model(scene: LightmappedScene, kind: str, colour: str = "half", seed:
             whole = random.integers(1, 4, (*counts, 2))
             side = np.where(blocks[..., None], 4 * whole, side)
             first = np.where(blocks[..., None], 4 * random.integers(0, np.array([5, 4]) - whole + 1), first)
-        lut = pack_entries(first, side, blocks, first_block_code(colour, shape))
+        lut = pack_entries(first, side, blocks, first_block_code(colour))
     elif method == "cascade":
         lut = random.integers(0, 65536, (9, 13, 2)).astype(np.uint16)
     triangles = len(sheet.triangle) if method == "cascade" or kind.endswith("uv") else 0
@@ -119,5 +116,4 @@ def grouped(representative: Sequence[int], order: Sequence[int] | None = None) -
         np.zeros(count, np.int8) if order is None else np.array(order, np.int8),
         np.zeros(count),
         np.zeros(count, bool),
-        Stats(0, 0),
     )

@@ -68,9 +68,8 @@ def _atlas(kind: str, colour: str) -> Kept:
     from builders.atlas_models import random_model, save_plainly
 
     free = {"lut": "sizes" if kind == "cascade" else "", "mesh": "size"}
-    # Places and triangles beyond those that are named do no harm.
-    free |= dict.fromkeys(("uv_place", "uv_triangle"), "size size size")
-    ranges = {"lut": (0, 65535)} if kind == "tiles" else {"uv_order": (0, 6), "uv_index": (0, 255)}
+    free["uv"] = "size" if kind == "cascade" else "size missing"  # a plain model may keep the UVs of the mesh
+    ranges = {"lut": (0, 65535)} if kind == "tiles" else {}
     ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
     content = _written(lambda path: save_plainly(random_model(sheet(), kind, colour), path))
     return Kept(content, wlm.load, free, ranges)

@@ -13,10 +13,9 @@ from PIL import Image
 import wlm.atlas.codec
 import wlm.atlas.fit
 from wlm.atlas.data import load
-from wlm.atlas.evaluation import compare, evaluate
+from wlm.atlas.evaluation import compare, evaluate, original
 from wlm.atlas.fit import compress
 from wlm.formats.exr import read_exr, write_exr
-from wlm.view.atlas import original
 
 CASCADE = {"name": "short", "method": "cascade", "fallback": False, "steps": 20, "resolution": 64}
 QUICK = ("--views", 2)

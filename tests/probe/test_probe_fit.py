@@ -8,9 +8,9 @@ from builders.probe_sets import synthetic
 
 import wlm
 from wlm.errors import WlmError
-from wlm.probe.data import from_arrays, save_probes
+from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import evaluate
-from wlm.probe.fit import compress, open_checkpoint
+from wlm.probe.fit import compress
 from wlm.probe.gaussian import trainer as training
 from wlm.probe.gaussian.trainer import Trainer, first_gaussians, local_spread
 from wlm.probe.model import Profile, box_of
@@ -34,34 +34,6 @@ def test_it_learns_and_says_how_well():
     assert reports[-1].done == reports[-1].total == 600
     # The last report is of the model before it is packed, which may cost a little, and fits what a short fit has left.
     assert psnr - 1.0 < reports[-1].figures["PSNR dB"] < psnr + 0.1
-
-
-def test_from_file_to_light_by_the_public_names(tmp_path):
-    probes = synthetic(60)
-    save_probes(tmp_path / "street.npz", probes.position, probes.values, key="sh_12.00")
-    probes = wlm.probe.load(tmp_path / "street.npz", key="12.00")
-    model = wlm.probe.compress(probes, "small", steps=20, method="gaussians")
-    assert (model.profile.name, model.profile.hidden, model.profile.steps) == ("small", 24, 20)
-    points = RANDOM.random((5, 3))
-    light = model.decoder("cpu").decode(points)  # [M, 3] -> [M, 27]
-    assert light.shape == (5, 27) and np.isfinite(light).all()
-    model.save(tmp_path / "street.wlm")
-    np.testing.assert_array_equal(wlm.load(tmp_path / "street.wlm").decoder("cpu").decode(points), light)
-
-
-def test_an_interrupt_is_kept(tmp_path):
-    probes = synthetic(130)
-    checkpoint = open_checkpoint(tmp_path / "a.wlm", probes, SMALL)
-
-    def stop(now):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        compress(probes, SMALL, progress=stop, checkpoint=checkpoint)
-    with pytest.raises(WlmError, match="seed"):
-        open_checkpoint(tmp_path / "a.wlm", probes, SMALL, seed=1, resume=True)
-    stored = open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True)
-    assert stored.running(0)["control"][0] == 60  # a short fit reports at its end
 
 
 def _input(probes):

@@ -8,7 +8,6 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, whole_mode
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.probe.exact import decode64
 from wlm.probe.gaussian.model import (
@@ -107,31 +106,9 @@ def test_sizes_are_those_of_the_paper():
     assert pytest.approx(50.1, rel=0.2) == (2 * 19 * 750 + 2 * (13 * 64 + 65 * 64 + 65 * 27)) / 1024
 
 
-def test_the_profiles_that_are_there():
-    assert {"compact", "paper", "pca", "small", "standard"} == set(profile_names("probe"))
-    for name in ("compact", "paper", "standard"):
-        assert Profile.load(name).name == name
-    paper = Profile.load("paper")
-    assert (paper.ratio, paper.latent, paper.hidden) == (0.05, 9, 64)
-    assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)
-
-
 @pytest.mark.parametrize(
     "settings",
-    [
-        {"ratio": 0.0},
-        {"ratio": 1.1},
-        {"ratio": float("nan")},
-        {"method": "transform"},
-        {"latent": 0},
-        {"hidden": 20},
-        {"support": "cube"},
-        {"optimiser": "sgd"},
-        {"steps": 9},
-        {"net_rate": 0.0},
-        {"gain": 0.0},
-        {"colour": 1},
-    ],
+    [{"ratio": 0.0}, {"ratio": float("nan")}, {"method": "transform"}, {"hidden": 20}, {"steps": 9}, {"colour": 1}],
     ids=str,
 )
 def test_settings_out_of_range(settings):
@@ -186,3 +163,9 @@ def test_a_model_without_error_gets_fine_steps():
     found = pack_model(plain, position, plain.decoder().decode(position), "cpu")
     assert found.content.whole is not None
     np.testing.assert_allclose(found.decoder().decode(position), plain.decoder().decode(position), atol=1e-3)
+
+
+def test_the_profile_of_the_paper():
+    paper = Profile.load("paper")
+    assert (paper.ratio, paper.latent, paper.hidden) == (0.05, 9, 64)
+    assert (paper.support, paper.optimiser, paper.steps) == ("sphere", "adan", 12000)

@@ -6,9 +6,10 @@ import torch
 from builders.atlas_meshes import charts, constant, sheet, triangle
 from PIL import Image
 
+from wlm.atlas.evaluation import original
 from wlm.errors import WlmError
 from wlm.ops.views import View
-from wlm.view.atlas import comparison, draw, original
+from wlm.view.atlas import comparison, draw
 from wlm.view.display import white_of
 from wlm.view.pictures import encode, save_png
 

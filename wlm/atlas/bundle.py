@@ -1,4 +1,4 @@
-"""The GPU form of an atlas model: the lookup texture, the colour textures, mips, the shader and the mesh."""
+"""The GPU form of an atlas model: the lookup texture, the colour textures, the shader and the mesh."""
 
 import math
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import BLOCKS, TEXELS, AtlasModel, tail_codec, tail_shapes
+from wlm.atlas.model import BLOCKS, TEXELS, AtlasModel
 from wlm.atlas.shader import EXACT, glsl
 from wlm.atlas.stored import mesh_file
 from wlm.bundle import Bundle, Texture
@@ -43,7 +43,7 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         device: "cpu" or "cuda:N", where the reference is decoded.
 
     Returns:
-        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, `tail`, and with shared
+        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, and with shared
         tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first
         sheet's in the first state.
 
@@ -62,9 +62,6 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         sheets, factors = sheet_texels(model), np.pad(model.factor.astype("<f4"), ((0, 0), (0, 0), (0, 1)))
         textures["sheets"] = Texture.from_texels(sheets, "R16G16B16A16_UINT")
         textures["factors"] = Texture.from_texels(factors, "R32G32B32A32_FLOAT")
-    if len(model.tail):
-        (rows, columns), *rest = tail_shapes(*model.sheets[0].size)
-        textures["tail"] = Texture(model.tail, _FORMATS[tail_codec(model.colour)], columns, rows, mips=len(rest))
     for name, texture in textures.items():
         side = max(texture.width, texture.height)
         if side > MOST_SIDE:

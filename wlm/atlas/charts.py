@@ -6,17 +6,9 @@ from scipy.sparse.csgraph import connected_components
 
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Numbers the corners so that those with equal position and UV have one number.
+    """Numbers the corners, int32 [F, 3] from 0, so that those with equal position [V, 3] and UV [V, 2] have one number.
 
     A file splits vertices where any attribute differs, a normal for example; a lightmap has no seam there.
-
-    Args:
-        position: [V, 3].
-        uv: [V, 2].
-        triangle: int [F, 3], vertices.
-
-    Returns:
-        int32 [F, 3], numbers from 0.
     """
     # Adding 0 turns -0 into 0, which has other bits.
     values = np.ascontiguousarray(np.concatenate([position, uv], 1, dtype=np.float64) + 0.0)
@@ -25,15 +17,10 @@ def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.nda
 
 
 def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-    """Numbers the charts: triangles that share an edge are in one chart, but not triangles that share only a corner.
+    """Numbers the charts of triangles with `welded` corners [F, 3], int32 [F], in the order of their first triangles;
+    -1 where a triangle isn't active.
 
-    Args:
-        corner: int [F, 3], the corners' numbers, `welded`.
-        active: bool [F], triangles that take part; None: all.
-
-    Returns:
-        int32 [F], the number of each triangle's chart, in the order of their first triangles; -1 where it isn't
-        active.
+    Triangles that share an edge are in one chart, but not triangles that share only a corner.
     """
     corner = np.asarray(corner)
     count = len(corner)

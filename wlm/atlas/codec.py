@@ -3,8 +3,8 @@
 Parts: `colour` (half [pages, Hp, Wp, 3], uint32 [pages, Hp, Wp] for RGB9E5, or uint8 [1, B, 16] where T_p is stored as
 blocks), `mesh` (uint8, a `.glb` file), `mask` (uint8, the bits of all masks) and, where the model has them, `lut`
 (uint16 [Hc, Wc, 2 or 4]), `blocks` (uint8 [pages, B, 16], the second texture of "mixed"), `factor` (float32
-[M, C, 3]), `sheets` (int32 [rows, 7], `AtlasModel.table`), `tail` (uint8 [B, 16], the mips) and those of `corners`.
-Each is a zstd frame where that is smaller.
+[M, C, 3]), `sheets` (int32 [rows, 7], `AtlasModel.table`) and `uv` (uint16 [F, 3, 2], new UVs times 65,535). Each is a
+zstd frame where that is smaller.
 """
 
 import math
@@ -14,12 +14,12 @@ import numpy as np
 from pydantic import Field, JsonValue
 
 from wlm.atlas import colour
-from wlm.atlas.corners import PARTS, decode_corners, encode_corners
 from wlm.atlas.data import Placed
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
     ENTRY,
+    LUT_STEPS,
     MOST_SIZE,
     SHORT_ENTRY,
     AtlasModel,
@@ -27,8 +27,7 @@ from wlm.atlas.model import (
     SheetPlace,
     check_area,
     extent,
-    tail_blocks,
-    tail_shapes,
+    snapped,
     tile_counts,
     unpack_entries,
     unpack_tiles,
@@ -84,7 +83,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     """Returns the settings, parts and source of a model's file. Times are left out, so that one seed gives one file.
 
     Raises:
-        ValueError: The model stores no triangles.
+        ValueError: The model stores no triangles, or its UVs are not `snapped`.
     """
     stored = model.stored
     if stored is None:
@@ -107,8 +106,10 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         "hides": stored.hides,
         "report": {name: value for name, value in model.report.items() if name != "seconds"},
     }
-    parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor, "tail": model.tail}
-    parts |= encode_corners(model.uv)
+    parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor}
+    if not np.array_equal(snapped(model.uv), model.uv):
+        raise ValueError(f"{model.name}: expected new UVs of 16 bits")
+    parts["uv"] = np.rint(model.uv * LUT_STEPS).astype(np.uint16)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
     elif model.colour != "half":
@@ -177,8 +178,7 @@ def decode(artifact: Artifact) -> AtlasModel:
         factor=parts["factor"],
         levels=tuple(places[count:stride]),
         later=tuple(places[stride:]),
-        tail=parts["tail"],
-        uv=decode_corners({name: parts[name] for name in PARTS}),
+        uv=(parts["uv"] / LUT_STEPS).astype(np.float32),
         stored=kept,
         report=header.report,
         **textures,
@@ -219,7 +219,6 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
         "plain": (0, 0, 2),
         "shared": (None, None, None),
     }
-    tail = sum(tail_blocks(*shape) for shape in tail_shapes(height, width))
     factors = (len(header.states), None, 3) if shared else (0, 0, 3)
     rows = (None, 7) if shared else (0, 7)
     bits = sum(math.prod(size) for size in header.sizes)
@@ -229,16 +228,15 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
         "factor": Part(np.float32, factors, least=-_MOST_FACTOR, most=_MOST_FACTOR, optional=not shared),
         "sheets": Part(np.int32, rows, least=0, optional=not shared),
         "blocks": Part(np.uint8, (pages, math.prod(second or (0,)) // BLOCK_SIDE**2, 16), optional=second is None),
-        "tail": Part(np.uint8, (tail, 16), optional=True),
         "mesh": Part(np.uint8, (None,)),
         "mask": Part(np.uint8, (-(-bits // 8),)),
-        **PARTS,
+        "uv": Part(np.uint16, (None, 3, 2), optional=method != "cascade"),
     }
     parts = check_parts(unpack_parts(artifact.tensors, header.parts, table), table)
     if not parts["colour"].size or (method == "cascade" and not parts["lut"].size):
         raise ValueError("part colour, part lut: expected textures, found an empty one")
-    if shared and (len(parts["tail"]) or not all(parts[name].size for name in ("lut", "factor", "sheets"))):
-        raise ValueError("part lut, part factor, part sheets: expected all of them for shared tiles, and no tail")
+    if shared and not all(parts[name].size for name in ("lut", "factor", "sheets")):
+        raise ValueError("part lut, part factor, part sheets: expected all of them for shared tiles")
     if shared and parts["lut"].shape[2] not in (SHORT_ENTRY, ENTRY):
         raise ValueError(f"part lut: expected entries of 2 or 4 numbers, found {parts['lut'].shape[2]}")
     return parts

@@ -13,16 +13,9 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Finds the texels whose square intersects some triangle's inside, however little.
-
-    Args:
-        uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
-        triangle: int [F, 3], with area in UV.
-        height, width: Texels.
-
-    Returns:
-        bool [height, width]. A triangle that ends exactly at a texel's side doesn't touch the texel.
-    """
+    """Finds the texels whose square intersects some triangle's inside, however little, bool [height, width]. UVs are
+    float64 [V, 2] in [0, 1]; each triangle has an area. One that ends exactly at a texel's side doesn't touch the
+    texel."""
     change = np.zeros((height, width + 1), np.int32)
     for corner, row in _rows(uv, triangle, height, width, centres=False):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -44,31 +37,13 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Counts for every texel the triangles that contain its centre.
-
-    A centre on an edge that two triangles share is in exactly one of them.
-
-    Args:
-        uv: float64 [V, 2] in [0, 1]; u right, v down from the top row.
-        triangle: int [F, 3].
-        height, width: Texels.
-
-    Returns:
-        int32 [height, width].
-    """
+    """Counts for every texel the triangles that contain its centre, int32 [height, width]. A centre on an edge that two
+    triangles share is in exactly one of them."""
     return covered_on(uv, triangle, height, width, "cpu").numpy()
 
 
 def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str) -> torch.Tensor:
-    """Computes `covered_texels` on a device: the host finds the ends of spans, and the device fills them.
-
-    Args:
-        uv, triangle, height, width: As `covered_texels` takes them.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        int32 [height, width], on the device.
-    """
+    """Computes `covered_texels` on a device: the host finds the ends of spans, and the device fills them."""
     change = torch.zeros((height, width + 1), dtype=torch.int32, device=device)
     flat = change.view(-1)
     for row, first, stop in _centre_spans(uv, triangle, height, width):

@@ -4,53 +4,10 @@ A scene has sheets. A sheet is one layout of charts with a lightmap for each sta
 shadow mask); the triangles of one object or of many read it. One mesh with one lightmap is a scene of one sheet and one
 state.
 
-The table states the behaviours. "Inside" means inside the mask. Each kind of repair or oddity is one line of `warnings`
-with its count.
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-no triangle, no UVs                   error
-several meshes that overlap in UV     the mesh that the lightmap fits best is used (`matching`); warning.
-                                      Error where none fits clearly better: `node` selects one
-a lightmap that fits its charts       warning: `flip` turns it
-better upside down
-six times as long as wide             warning: it may be the cube faces of a reflection probe
-a primitive without the UV set        left out, and written unchanged; warning
-nodes without a lightmap, beside a    hide what is behind them, and nothing else
-list of lightmaps
-a node that the list names and the    error that lists the nodes that the mesh has
-mesh lacks
-a sheet that no triangle reads        error
-lightmaps of one sheet that differ    error that names the file
-in size
-a position or UV NaN or infinite,     error that names the primitive and the vertex
-a position beyond float32
-a UV outside [0, 1]                   clamped to it, as a lightmap is read clamped; warning
-triangles without area, in space or   kept, but not `active`: they are ignored; warning
-in UV
-no triangle with area                 error
-UVs of less than a texel in all       warning
-overlapping UVs, a mesh drawn twice   read: all that share texels have the same light; warning
-NaN, Inf inside                       the texel takes the value of the nearest finite one inside; warning
-a speck inside, less than 3 texels    the same
-wide, above 16 times the light's
-99.5th percentile
-NaN, Inf or above 4 times the light   the same, without a warning
-beside it, in a texel that a triangle
-touches, its centre outside
-no finite texel inside                error
-negative inside                       the channel is clamped to 0; warning
-above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
-any of these outside                  replaced by the nearest texel inside, without a warning
-a mask of another size                error that names both files
-an empty mask                         error
-a mask that misses over 1% of the     warning: it may belong to another UV set
-texels whose centres are in triangles
-no mask                               derived: texels whose centre is in a triangle, and those that a
-                                      triangle touches at all unless they are 0 in every state, as texels
-                                      that were never baked are
-====================================  ================================================================
+Input that contradicts itself is refused with one line; a flaw that can be repaired is repaired, with one line of
+`warnings` for each kind and its count. Both are listed in docs/atlas.md, "Hard cases". Texels outside of charts are
+replaced by the nearest texel in a chart. Without a mask it is derived: texels whose centre is in a triangle, and those
+that a triangle touches at all unless they are 0 in every state, as texels that were never baked are.
 
 The method's inputs: lightmap-uv-clustering-cascade, section 3 (mesh, UVs and an HDR lightmap).
 """
@@ -83,13 +40,7 @@ _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warn
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Position of one primitive's vertices and triangles in a sheet, in their original order.
-
-    Attributes:
-        primitive: The primitive.
-        vertex: Number of its first vertex in the sheet.
-        triangle: Number of its first triangle in the sheet.
-    """
+    """The number of one primitive's first vertex and first triangle in a sheet."""
 
     primitive: GltfPrimitive
     vertex: int
@@ -165,7 +116,7 @@ class Triangles:
 
 @dataclass(frozen=True, eq=False)
 class LightmappedScene:
-    """Triangles and their lightmaps, checked and repaired as the module's table says.
+    """Triangles and their lightmaps, checked and repaired.
 
     Attributes:
         name: Its name, for messages.
@@ -250,8 +201,8 @@ def load(
             (`wlm.formats.limits`).
 
     Raises:
-        WlmError: One line that names the file and the field, for each error of the module's table, and where a file
-            is missing or damaged.
+        WlmError: One line that names the file and the field: the input contradicts itself, or a file is missing or
+            damaged.
     """
     path = Path(mesh_path)
     document, primitives, metres = _read_triangles(path, trust)
@@ -317,7 +268,7 @@ def from_arrays(
         The scene. Vertices that no triangle uses are left out.
 
     Raises:
-        WlmError: A shape is wrong, or an error of the module's table.
+        WlmError: A shape is wrong, or the input contradicts itself.
     """
     light = np.asarray(lightmap)
     light = light[None] if light.ndim == 3 else light
@@ -371,20 +322,11 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
 def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
-    """Makes the sheets of a model, without lightmaps, from the triangles in its file.
-
-    Args:
-        where: The file, for messages.
-        primitives: The primitives of the file.
-        uv_set: n of the lightmaps' `TEXCOORD_n`.
-        objects: The nodes that read the sheets, in the order of the sheets.
-        masks: bool [H, W] for each sheet.
-
-    Returns:
-        The sheets, and the triangles of all other nodes, float64 [B, 3, 3].
+    """Makes the sheets of a model, without lightmaps, from the triangles in its file; also returns the triangles of all
+    other nodes, float64 [B, 3, 3].
 
     Raises:
-        WlmError: A sheet has no triangle, or an error of the module's table.
+        WlmError: A sheet has no triangle, or the triangles can't be read.
     """
     by_node: dict[int, list[GltfPrimitive]] = {}
     for each in primitives:
@@ -533,17 +475,8 @@ def _checked(
     names: Sequence[str],
     warnings: Sequence[str] = (),
 ) -> Sheet:
-    """Applies the module's table to the triangles and lightmaps of a sheet.
-
-    Args:
-        where, name: The mesh file and the sheet, for messages.
-        primitives: The primitives that read the sheet, with its UVs.
-        uv_set: n of `TEXCOORD_n`.
-        lightmaps: float32 [M, H, W, 3]. With M = 0 the mask is required, and no light is checked.
-        mask: bool [H, W]; None: derived.
-        names: Names of the M lightmaps and of the mask, for messages.
-        warnings: Lines that come first.
-    """
+    """Checks and repairs the triangles and lightmaps [M, H, W, 3] of a sheet. With M = 0 the mask is required, and no
+    light is checked. `names` are the files of the lightmaps and of the mask, for messages."""
     warnings, parts, vertices, triangles = list(warnings), [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)

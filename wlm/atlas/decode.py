@@ -6,8 +6,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.atlas.data import Sheet
-from wlm.atlas.mips import Tail
-from wlm.atlas.model import LUT_STEPS, TAIL_OCTAVES, AtlasModel, tail_codec
+from wlm.atlas.model import LUT_STEPS, MIP_OCTAVES, AtlasModel
 from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
@@ -47,15 +46,6 @@ class Decoder:
             self._texels = wp.array(model.texels[0].astype(np.float32), dtype=float, device=self.device)
             self._lut = wp.array(lut, dtype=float, device=self.device)
         self._corner = torch.tensor(model.uv, device=self.device)
-        self._tail = None
-        if len(model.tail):
-            self._tail = Tail(model.tail, *model.sheets[0].size, tail_codec(model.colour), self.device)
-
-    @property
-    def device_bytes(self) -> int:
-        """Memory that textures, tables and UVs take on the device, in bytes."""
-        arrays = {id(each): each for each in vars(self).values() if isinstance(each, wp.array)}
-        return sum(each.capacity for each in arrays.values()) + self._corner.nbytes + self.model.tail.nbytes
 
     def _halves(self, texels: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
@@ -79,7 +69,6 @@ class Decoder:
         sheet: torch.Tensor | int = 0,
         state: float = 0.0,
         lod: torch.Tensor | None = None,
-        own: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Reads light at coordinates, as a shader does.
 
@@ -89,13 +78,12 @@ class Decoder:
             state: 0 to M - 1, or between two states.
             lod: float32 [N], base-2 logarithm of lightmap texels per pixel, for a model with mips; None: full
                 resolution.
-            own: With `lod` and new UVs: the sheet's original UVs, with which the mips are read.
 
         Returns:
             float32 [N, 3].
 
         Raises:
-            ValueError: No such state, the model has no mips, or the sheet's original UVs are missing.
+            ValueError: No such state, or the model has no mips.
         """
         if lod is not None and not self.model.mips:
             raise ValueError("lod: expected a model with mips")
@@ -107,20 +95,11 @@ class Decoder:
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
             self.run(interop.to_warp(uv, wp.vec2), out)
-        if lod is None:
-            return out
-        if own is None and len(self._corner):
-            raise ValueError("own: expected the sheet's own UVs beside the new ones, found none")
-        far = self._tail.read(uv if own is None else own, lod)
-        return out + (lod - TAIL_OCTAVES + 1).clamp(0.0, 1.0)[:, None] * (far - out)
+        return out
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
-        """Reads light of a model with one lightmap into an existing array; on CUDA the work is queued, not awaited.
-
-        Args:
-            uv: vec2 [N], N at least 1.
-            out: float32 [N, 3], written.
-        """
+        """Reads light of a model with one lightmap at vec2 [N], N at least 1, into float32 [N, 3]; on CUDA the work is
+        queued, not awaited."""
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
@@ -157,7 +136,7 @@ class Decoder:
     ) -> torch.Tensor:
         """Reads light of rows of the table of sheets, with a state's factors."""
         if lod is not None:
-            return self._between(uv, row.long(), factors, (lod - TAIL_OCTAVES + 1).clamp(0.0, 32.0))
+            return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
@@ -183,15 +162,8 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the texels of a sheet's mask, with the values of `lightmap`.
-
-        Args:
-            sheet: The sheet that was compressed.
-            number: The sheet's number.
-            state: As for `read`.
-
-        Returns:
-            float32 [K, 3], row by row, on the decoder's device.
+        """Decodes the texels of a sheet's mask, with the values of `lightmap`: float32 [K, 3], row by row, on the
+        decoder's device.
 
         Raises:
             WlmError: The sheet has another size than the model's.

@@ -13,21 +13,8 @@ above twice the 99.9th percentile counts as that: one bright texel must not make
 Errors are also measured as displayed on a screen: light is exposed so that nearly all of the original's charts are
 below white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
 
-The stated behaviours:
-
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-decoded exactly                       PSNR is `PSNR_CAP_DB`, 120 dB, in a view as in the mean;
-                                      1 - SSIM is 0; the seam ratio is NaN
-the reference is one grey, to within  the peak is 0, PSNR and SSIM are NaN, null in JSON: there is no
-a millionth                           range to measure against
-nothing covered in any view           the same, and the errors are NaN too
-no seam on any screen                 `seam_error` and `seam_ratio` are NaN
-an error at seams alone               `seam_ratio` is infinite, null in JSON
-FLIP of no covered view               NaN, null in JSON: FLIP uses only some of the views
-NaN or Inf in decoded colours         error that names the decoder
-====================================  ================================================================
+A figure without a meaning is NaN, null in JSON: PSNR and SSIM where the reference is one grey, to within a millionth,
+or nothing is covered, and seams where no border is in any view. An exact decoder has a PSNR of 120 dB (`PSNR_CAP_DB`).
 """
 
 import math
@@ -151,7 +138,6 @@ class Report(Score):
         geometry_bytes: Size of the triangles and masks in the file.
         gpu_bytes: Size of its textures and tables on a GPU.
         cr: Compression ratio of the textures (eq. 9).
-        cr_disk: Compression ratio of the file without triangles and masks.
     """
 
     method: str
@@ -160,7 +146,6 @@ class Report(Score):
     geometry_bytes: int
     gpu_bytes: int
     cr: float
-    cr_disk: float
 
 
 def evaluate(
@@ -172,14 +157,9 @@ def evaluate(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Report:
-    """Compares a model with the original lightmaps.
+    """Compares a model with the original lightmaps of the scene, with options as for `compare`.
 
     Seams are the borders of the new UVs' charts, or of the lightmaps' where the mesh keeps its UVs.
-
-    Args:
-        model: The model.
-        scene: The scene that was compressed, with its original lightmaps.
-        views, resolution, device, progress: As for `compare`.
 
     Raises:
         WlmError: There is no such device, or the model was made from another scene.
@@ -201,7 +181,6 @@ def evaluate(
         geometry_bytes=geometry,
         gpu_bytes=-(-model.bits // 8),
         cr=model.compression_ratio,
-        cr_disk=model.disk_ratio(whole - geometry),
     )
 
 
@@ -217,8 +196,6 @@ def compare(
 ) -> dict[str, Score]:
     """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders together.
 
-    On the CPU torch uses one thread meanwhile: 50 views of 512² take some seconds, and FLIP as long again per decoder.
-
     Args:
         scene: The scene with its original lightmaps.
         decoders: By name; see `Sampler`.
@@ -226,10 +203,8 @@ def compare(
             or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For some decoders, numbers of their charts or tiles: their seams are where these change.
-            Seams of the others are the borders of the lightmaps' charts. Either way a border lies between neighbouring
-            pixels that show one triangle or two that share a corner in space, so that an outline in front of
-            another surface is no border.
+        labels: For some decoders, numbers of their charts or tiles: their seams are where these change. Seams of the
+            others are the borders of the lightmaps' charts. An outline in front of another surface is no border.
         progress: Called with the views done.
 
     Returns:
@@ -284,13 +259,7 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes the labels for `compare` from the charts of a model's own UVs.
-
-    Args:
-        model: A model with `uv`.
-        scene: The scene that was compressed.
-        device: "cpu" or "cuda:N", where the points will be.
-    """
+    """Makes the labels for `compare` from the charts of a model's own UVs; the points will be on the device."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -309,6 +278,11 @@ def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
     return result
 
 
+def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
+    """Makes a decoder of the lightmaps themselves, read bilinearly."""
+    return _Reference(scene, check_device(device)).light
+
+
 class _Reference:
     """The original lightmaps, on the device unless they are too large."""
 
@@ -319,7 +293,7 @@ class _Reference:
             self._images = [image.to(device) for image in self._images]
         self._charts = [sheet.lightmaps[:, sheet.mask] for sheet in scene.sheets]
 
-    def light(self, points: Points, state: int) -> torch.Tensor:
+    def light(self, points: Points, state: int = 0) -> torch.Tensor:
         """Reads the lightmaps bilinearly at points, float32 [N, 3]."""
         if len(self._images) == 1:
             return raster.texture(self._image(0, state), points.uv)
@@ -391,49 +365,31 @@ def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
 
 @dataclass
 class _Tally:
-    """The errors of a decoder, and sums over views and states."""
+    """The errors of a decoder: sums, and rows of view, state, MSE, SSIM, MSE on a screen and FLIP."""
 
     states: int
-    view: list[int] = field(default_factory=list)
-    state: list[int] = field(default_factory=list)
-    mse: list[float] = field(default_factory=list)
-    ssim: list[float] = field(default_factory=list)
-    tone_mse: list[float] = field(default_factory=list)
-    flip: list[float] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
     pixels: int = 0
     seam: float = 0.0
     seam_pixels: int = 0
     rest: float = 0.0
 
-    def add(
-        self,
-        view: int,
-        state: int,
-        error: torch.Tensor,
-        border: torch.Tensor,
-        ssim: float,
-        tone_mse: float,
-        flip: float,
-    ) -> None:
+    def add(self, view: int, state: int, error: torch.Tensor, border: torch.Tensor, *figures: float) -> None:
         absolute = error.abs().mean(dim=1)
-        self.view.append(view)
-        self.state.append(state)
-        self.mse.append(float(error.square().mean()))
-        self.ssim.append(ssim)
-        self.tone_mse.append(tone_mse)
-        self.flip.append(flip)
+        self.rows.append((view, state, float(error.square().mean()), *figures))
         self.pixels += len(error)
         self.seam += float(absolute[border].sum())
         self.rest += float(absolute[~border].sum())
         self.seam_pixels += int(border.sum())
 
     def score(self, facts: dict[str, Any], texel_mse: Sequence[float], inside: Sequence[bool]) -> Score:
+        views, of_state, mse, ssim, tone_mse, flip = zip(*self.rows, strict=True) if self.rows else [()] * 6
         peaks, states = facts["peaks"], range(self.states)
-        psnr = [psnr_from_mse(mse, peaks[state]) for mse, state in zip(self.mse, self.state, strict=True)]
-        pairs = list(zip(psnr, self.view, self.state, strict=True))
+        psnr = [psnr_from_mse(mse, peaks[state]) for mse, state in zip(mse, of_state, strict=True)]
+        pairs = list(zip(psnr, views, of_state, strict=True))
         known = [(value, view) for value, view, _ in pairs if not math.isnan(value)]
         seam, rest = _ratio(self.seam, self.seam_pixels), _ratio(self.rest, self.pixels - self.seam_pixels)
-        seen = set(self.view)
+        seen = set(views)
         return Score(
             **facts,
             peak=_mean(peaks),
@@ -446,13 +402,13 @@ class _Tally:
             inside_views=sum(inside[view] for view in seen),
             psnr_worst=min(known)[0] if known else math.nan,
             worst_view=min(known)[1] if known else -1,
-            one_minus_ssim=1.0 - _mean(self.ssim),
+            one_minus_ssim=1.0 - _mean(ssim),
             seam_error=seam,
             rest_error=rest,
             seam_ratio=math.inf if rest == 0.0 and seam > 0.0 else _ratio(seam, rest),
             texel_psnr=_mean([psnr_from_mse(mse, peak) for mse, peak in zip(texel_mse, peaks, strict=True)]),
-            tone_psnr=_mean([psnr_from_mse(mse, 1.0) for mse in self.tone_mse]),
-            flip=_mean(self.flip),
+            tone_psnr=_mean([psnr_from_mse(mse, 1.0) for mse in tone_mse]),
+            flip=_mean(flip),
         )
 
 
@@ -490,16 +446,8 @@ def _texel_errors(
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Finds the pixels within 2 pixels of a border.
-
-    Args:
-        visible: int [h, w], triangles, -1 for none.
-        label: int [h, w], which differs on the two sides of a border.
-        place: int [F, 3], numbers of the corners' places in space.
-
-    Returns:
-        bool [h, w].
-    """
+    """Finds the pixels within 2 pixels of a border, bool [h, w]: of triangles, -1 for none, whose labels differ and
+    that share a place in space, int [F, 3]."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1

@@ -7,7 +7,6 @@ replaces the model where that has no larger error. Several lightmaps, of several
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +18,6 @@ from wlm.atlas import colour
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
-from wlm.atlas.mips import make_tail
 from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
@@ -29,8 +27,6 @@ from wlm.atlas.model import (
     Profile,
     SheetPlace,
     check_area,
-    tail_bits,
-    tail_codec,
 )
 from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.shared.fit import fit_shared
@@ -95,8 +91,13 @@ def compress(
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
     if method == "shared":
-        with one_thread(device), _flushing(checkpoint):
-            model = fit_shared(scene, profile, seed, stages)
+        try:
+            with one_thread(device):
+                model = fit_shared(scene, profile, seed, stages)
+        except KeyboardInterrupt:
+            if checkpoint is not None:
+                checkpoint.flush()  # finished batches that are not written yet
+            raise
     else:
         model = _fit_one(scene, profile, method, seed, stages)
     for place in model.rows:
@@ -121,12 +122,9 @@ def open_checkpoint(
 ) -> Checkpoint:
     """Opens the checkpoint of a compression, the file `OUTPUT.partial`.
 
-    It stores slow results: errors of the tiles' sizes and components, groups of triangles and the state of a fit. The
-    other stages are repeated.
-
     Args:
         output: The file that the compression is for.
-        scene, profile, seed, settings: As for `compress`; the compression depends on them.
+        scene, profile, seed, settings: As for `compress`.
         device: Only its kind matters: a compression may resume on another GPU.
         resume: Whether to go on from the file, if there is one.
         every: Seconds between two saves of a running stage; 0: after every few steps.
@@ -143,24 +141,11 @@ def open_checkpoint(
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, scene.source, resume=resume, every=every)
 
 
-@contextmanager
-def _flushing(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Writes finished batches that are not written yet if the block is interrupted."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if checkpoint is not None:
-            checkpoint.flush()
-        raise
-
-
 def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
-    """Compresses one lightmap by tiles or by the cascade, compares it with a plain one, and adds mips."""
+    """Compresses one lightmap by tiles or by the cascade, and compares it with a plain one."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)
     if method == "tiles":
-        if profile.mips and tail_bits(*sheet.mask.shape) >= profile.budget * sheet.mask.size * SOURCE_BITS:
-            raise WlmError(f"budget: {profile.budget:g} is less than mips take: expected more, or no mips")
         model = fit_tiles(scene, grid, profile, seed, stages)
     else:
         model = fit_cascade(scene, group_triangles(sheet, profile, stages), profile, seed, stages)
@@ -172,9 +157,6 @@ def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, 
             model = with_fallback(scene, grid, model, profile, weight)
     elif model is None:
         raise WlmError(_NO_ROOM.format(profile.budget, *sheet.mask.shape[::-1]))
-    if profile.mips:
-        with stages("mips"):
-            model = replace(model, tail=make_tail(sheet, tail_codec(model.colour), device))
     return model
 
 
@@ -194,18 +176,12 @@ def with_fallback(
 ) -> AtlasModel:
     """Returns the model, or a smaller lightmap with at most as many bits and no larger weighted error.
 
-    Args:
-        scene: A scene of one sheet and one state.
-        grid: The fine grid of its sheet.
-        model: The model, still without mips; None: the smaller lightmap has the budget's bits, and a texel, or a
-            block, at least.
-        profile: `budget`, `colour` and `mips`.
-        weight: float64 [2 H, 2 W], the weight of each cell; not used without a model.
+    The weights of cells are float64 [2 H, 2 W]. Without a model the smaller lightmap has the budget's bits, and a
+    texel, or a block, at least.
     """
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
-    mips = tail_bits(height, width) if profile.mips else 0
-    bits = profile.budget * sheet.mask.size * SOURCE_BITS - mips if model is None else model.bits
+    bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits
     format = BLOCKS if profile.colour == "mixed" else profile.colour
     block = BLOCK_SIDE if format in colour.BLOCK_CODECS else 1
     size = fitting_size(height, width, bits, (block, block), COLOUR_BITS[format])

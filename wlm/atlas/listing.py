@@ -1,26 +1,10 @@
 """Lists of a scene's lightmaps: the files of each sheet, and the node that reads each part of a sheet.
 
-A JSON file:
-
-    {
-     "states": ["noon", "night"],
-     "sheets": [{"files": ["wall_noon.exr", "wall_night.exr"]}, ...],
-     "objects": [{"node": "Wall", "sheet": 0, "scale_offset": [0.5, 0.5, 0, 0]}, ...],
-     "convention": "gltf"
-    }
-
-A sheet is one layout of charts and has a file for each state. Its fields `name`, `encoding`, `flip` and `mask` mean the
-same as in `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
-UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits
-(`matching`).
-`convention` states how the rectangles are written:
-
-    gltf     v runs down, as in glTF.
-    unity    v runs up: `lightmapIndex` and `lightmapScaleOffset` (x, y, z, w) of a `Renderer` may be written
-             unchanged, in place of `sheet` and `scale_offset`. The glTF file's v is 1 - Unity's, as its exporters
-             write it.
-    godot    `path`, `slice_index` and `uv_scale` (x, y, width, height) of the users of `LightmapGIData`, v down; the
-             last name of the path is the node's.
+docs/atlas.md shows the JSON file. A sheet is one layout of charts and has a file for each state; its other fields mean
+the same as in `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
+UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits (`matching`).
+`convention` states how the rectangles are written: v runs down in glTF and Godot, and up in Unity, whose glTF
+exporters write 1 - v.
 
 Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stack of slices or of directional layers has
 to be cut first); a `set.json` of `wlm lightmap`, which is one sheet with a state for each time; and a folder, which

@@ -33,19 +33,10 @@ _FRINGE, _REACH = 4.0, 5  # limit over the brightest chart texel nearby, and the
 def choose_mesh(
     where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
 ) -> tuple[list[GltfPrimitive], list[str]]:
-    """Chooses the meshes of a scene for which a lightmap was baked.
+    """Chooses the primitives of a scene for which a lightmap was baked, and makes lines that say what was left out.
 
-    Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts
-    the lightmap is smoothest is chosen; a mesh that several nodes draw counts once.
-
-    Args:
-        where, name: The file and the mesh, for messages.
-        primitives: With the UV set.
-        uv_set: n of `TEXCOORD_n`.
-        lightmap: float [H, W, 3].
-
-    Returns:
-        The primitives, and lines that say what was left out.
+    Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts the lightmap is
+    smoothest is chosen; a mesh that several nodes draw counts once.
 
     Raises:
         WlmError: No mesh fits clearly better than the next.
@@ -104,14 +95,9 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 
 
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
-    """Computes the mean step, in octaves, between neighbouring texels of one chart; infinite if there are none.
-
-    A large lightmap is sampled in evenly spread bands of rows, `_LOOKED_AT` texels in all.
-
-    Args:
-        lightmap: float [H, W, 3]; NaN and infinity are steps.
-        chart: int [H, W], `chart_map`.
-    """
+    """Computes the mean step, in octaves, between neighbouring texels of one chart (`chart_map`); infinite if there are
+    none. NaN and infinity are steps. A large lightmap is sampled in evenly spread bands of rows, `_LOOKED_AT` texels in
+    all."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
@@ -141,12 +127,7 @@ def _bands(height: int, width: int) -> list[slice]:
 
 
 def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
-    """Tests whether a lightmap fits its charts clearly better upside down.
-
-    Args:
-        lightmap: float [H, W, 3].
-        chart: int [H, W], `chart_map`.
-    """
+    """Tests whether a lightmap fits its charts (`chart_map`) clearly better upside down."""
     if np.count_nonzero(chart >= 0) < _FEWEST:
         return False
     flipped, rough = roughness(lightmap[::-1], chart), roughness(lightmap, chart)
@@ -154,19 +135,11 @@ def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
 
 
 def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:
-    """Replaces stray texels by the nearest valid texel, in place.
+    """Replaces stray texels of float32 [H, W, 3] by the nearest valid texel, in place; returns the number of specks.
 
     A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4 times as bright as the
     brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values in gutters. Other
     texels are stray in a speck: less than 3 texels wide, above 16 times the 99.5th percentile of all of them.
-
-    Args:
-        lightmap: float32 [H, W, 3].
-        mask: bool [H, W], the texels that count.
-        covered: bool [H, W], the texels with their centre in a triangle.
-
-    Returns:
-        Number of specks.
     """
     brightest = lightmap.max(axis=2)
     finite = np.isfinite(lightmap).all(axis=2)

@@ -19,7 +19,7 @@ lookup texture, T_p the colour texture, and F by the method:
              texels. Where states have little in common, a sheet has *separate* tiles with one component in each
              state, and light is interpolated linearly between two states.
 
-With mips, `shared` has smaller levels of each sheet, read in the same way; the other methods have a tail (`mips`).
+With mips a model is `shared` and has smaller levels of each sheet, which are read in the same way.
 """
 
 import math
@@ -53,7 +53,7 @@ LUT_BITS = 32
 """Bits per entry of T_c of two numbers."""
 
 LUT_STEPS = 65535.0
-"""The integer that is a coordinate of 1 in T_c of method "cascade"."""
+"""The integer that is a coordinate of 1 in T_c of method "cascade", and in new UVs."""
 
 FACTOR_BITS = 128
 """Bits of a component's factors in one state: three floats, stored in a texel of four floats."""
@@ -75,8 +75,8 @@ ones, and the remaining bits the page."""
 
 MOST_PAGES, MOST_COARSE = 1 << (16 - COUNT_BITS - COARSE_BITS), (1 << COARSE_BITS) - 1
 
-TAIL_OCTAVES = 2
-"""Octaves from a lightmap to the first level of its mips, whose sides are a quarter as long."""
+MIP_OCTAVES = 2
+"""Octaves from a lightmap to the first of its smaller levels, whose sides are a quarter as long."""
 
 FIRST_BLOCK_CODE, NO_BLOCKS = 12, 1 << SIDE_BITS
 """The size code from which on an entry of colour "mixed" names 1 to 4 blocks along an axis instead of texels; and a
@@ -111,7 +111,7 @@ class Profile(Settings):
     """For one lightmap: share of the weight that applies to the relative error; the rest applies to the error in
     linear light."""
     mips: bool = False
-    """Store smaller levels for surfaces that are far away; for tiles their bits are part of the budget."""
+    """Store smaller levels, within the budget, for surfaces that are far away; the model then has shared tiles."""
     fallback: bool = True
     """For one lightmap: replace the result by a plain smaller lightmap of as many bits if its error is no larger."""
     threshold: float = Field(0.03, ge=0.0, le=1.0)
@@ -171,14 +171,15 @@ class Profile(Settings):
         Raises:
             WlmError: The method or colour can't have several lightmaps.
         """
-        if lightmaps == 1:
-            budget = self.budget or (_BUDGET if self.method == "tiles" else None)
-            return self.model_copy(update={"budget": budget}), self.method
+        budget = self.budget or (_BUDGET if lightmaps == 1 else _SHARED_BUDGET)
+        filled = self.model_copy(update={"budget": budget if self.method == "tiles" else None})
+        if lightmaps == 1 and not self.mips:
+            return filled, self.method
         if self.method != "tiles":
-            raise WlmError(f"method: {self.method} takes one lightmap, found {lightmaps}: expected tiles")
+            raise WlmError(f"method: expected tiles for several lightmaps or mips, found {self.method}")
         if self.colour not in (TEXELS, "mixed"):
-            raise WlmError(f"colour: expected rgb9e5 or mixed for several lightmaps, found {self.colour}")
-        return self.model_copy(update={"budget": self.budget or _SHARED_BUDGET}), "shared"
+            raise WlmError(f"colour: expected rgb9e5 or mixed for several lightmaps or mips, found {self.colour}")
+        return filled, "shared"
 
 
 @dataclass(frozen=True)
@@ -236,8 +237,7 @@ class AtlasModel(Model):
             its components; else [0, 0, 3].
         levels: For "shared" with mips, the smaller levels of all sheets, for each sheet a quarter, then halves.
         later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
-        tail: uint8 [B, 16], the other methods' mips, level by level, ASTC beside ASTC and else BC6H; [0, 16] for none.
-        uv: float32 [F, 3, 2] in [0, 1], the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
+        uv: float32 [F, 3, 2] in [0, 1], `snapped`, the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
         stored: The scene's triangles and masks; None for a model without a file.
         report: Facts about the compression for the user: "seconds" by stage (not saved, since they differ from run to
             run), groups, and the reason why the method is plain.
@@ -259,7 +259,6 @@ class AtlasModel(Model):
     factor: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
     levels: tuple[SheetPlace, ...] = ()
     later: tuple[SheetPlace, ...] = ()
-    tail: np.ndarray = field(default_factory=lambda: np.empty((0, 16), np.uint8))
     uv: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 2), np.float32))
     stored: Any = None
     report: dict[str, Any] = field(default_factory=dict)
@@ -277,22 +276,21 @@ class AtlasModel(Model):
     @property
     def mips(self) -> bool:
         """Whether the model has smaller levels."""
-        return bool(self.levels) or len(self.tail) > 0
+        return bool(self.levels)
 
     @property
     def first_block_code(self) -> int:
         """`first_block_code` of the entries of T_c."""
-        return first_block_code(self.colour, self.texels.shape[1:3])
+        return first_block_code(self.colour)
 
     @property
     def bits(self) -> int:
-        """Bits on a GPU: T_p, T_c and mips and, for "shared", factors and the table of sheets."""
+        """Bits on a GPU: T_p, T_c and, for "shared", factors and the table of sheets."""
         side = BLOCK_SIDE if self.colour in ("bc6h", "astc") else 1
         pages, rows, columns = self.texels.shape[:3]
         first = COLOUR_BITS[TEXELS if self.colour == "mixed" else self.colour]
         bits = pages * -(-rows // side) * -(-columns // side) * side**2 * first
         bits += math.prod(self.block_texels.shape[:3]) * COLOUR_BITS[BLOCKS] + self.lut.nbytes * 8
-        bits += len(self.tail) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
         if self.method == "shared":
             bits += self.factor.size // 3 * FACTOR_BITS + len(self.rows) * SHEET_BITS
         return bits
@@ -307,14 +305,6 @@ class AtlasModel(Model):
         """CR of eq. 9 over all lightmaps: 1 minus the ratio of bits on a GPU to source bits."""
         return 1.0 - self.bits / self.source_bits
 
-    def disk_ratio(self, file_bytes: int) -> float:
-        """CR of a file without its triangles and masks: 1 minus the ratio of its bits to those of the lightmaps.
-
-        Args:
-            file_bytes: Size of the file less `stored_bytes`.
-        """
-        return 1.0 - file_bytes * 8 / self.source_bits
-
     @cached_property
     def scene(self) -> Any:
         """Reads the `LightmappedScene`, without lightmaps, from the stored triangles and masks.
@@ -327,11 +317,10 @@ class AtlasModel(Model):
         return import_module("wlm.atlas.stored").restore(self)
 
     def table(self) -> np.ndarray:
-        """Makes the table of sheets for kernels and shaders, int32 [rows, 7].
+        """Makes the table of sheets for kernels and shaders, int32 [rows, 7]: rows and columns of texels, the first row
+        and column in T_c, rows and columns of tiles, and the row number of the next smaller level.
 
-        Sheets come first, then levels; with separate tiles both are listed for each state in turn. A row contains the
-        rows and columns of texels, the first row and column in T_c, the rows and columns of tiles, and the row number
-        of the next smaller level.
+        Sheets come first, then levels; with separate tiles both are listed for each state in turn.
         """
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
@@ -340,16 +329,12 @@ class AtlasModel(Model):
         """Returns the model without its smaller levels; the texels of shared levels stay in the textures."""
         kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
         sheets, later = (tuple(replace(row, smaller=0) for row in rows) for rows in (self.sheets, kept))
-        return replace(self, sheets=sheets, levels=(), later=later, tail=self.tail[:0])
+        return replace(self, sheets=sheets, levels=(), later=later)
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that the lightmap's size is plausible for its textures: a file of a few bytes must not claim gigabytes.
-
-    Args:
-        size: Rows and columns of the lightmap.
-        texels: Number of texels of T_p.
-        entries: Number of entries of T_c.
+    """Checks that the lightmap's size is plausible for its numbers of texels and entries: a file of a few bytes must
+    not claim gigabytes.
 
     Raises:
         WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels in all,
@@ -364,37 +349,9 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
         )
 
 
-def tail_shapes(height: int, width: int) -> list[tuple[int, int]]:
-    """Lists rows and columns of a lightmap's mips: a quarter in whole blocks, then halves, rounded down, to one texel.
-
-    Direct3D and browsers require whole blocks, so the first level is padded where a quarter of the lightmap does not
-    consist of whole blocks; `tail_share` is the fraction that the lightmap covers.
-    """
-    step = BLOCK_SIDE << TAIL_OCTAVES
-    height, width = (-(-side // step) * BLOCK_SIDE for side in (height, width))
-    levels = max(height, width).bit_length()
-    return [(max(height >> level, 1), max(width >> level, 1)) for level in range(levels)]
-
-
-def tail_share(height: int, width: int) -> tuple[float, float]:
-    """Fractions of the mips that the lightmap covers, starting at the first texel, along v and u."""
-    first = tail_shapes(height, width)[0]
-    return height / (first[0] << TAIL_OCTAVES), width / (first[1] << TAIL_OCTAVES)
-
-
-def tail_codec(colour: str) -> str:
-    """Block format of the mips: the one that GPUs with the colour texture's format support."""
-    return "astc" if colour == "astc" else BLOCKS
-
-
-def tail_blocks(height: int, width: int) -> int:
-    """Returns the number of blocks of a level."""
-    return -(-height // BLOCK_SIDE) * -(-width // BLOCK_SIDE)
-
-
-def tail_bits(height: int, width: int) -> int:
-    """Returns the bits of the mips of a lightmap on a GPU."""
-    return sum(tail_blocks(*shape) for shape in tail_shapes(height, width)) * BLOCK_SIDE**2 * COLOUR_BITS[BLOCKS]
+def snapped(uv: np.ndarray) -> np.ndarray:
+    """Rounds UVs in [0, 1] to the nearest multiples of 1 / `LUT_STEPS`, which a file stores, float32."""
+    return (np.rint(np.asarray(uv, np.float64) * LUT_STEPS) / LUT_STEPS).astype(np.float32)
 
 
 def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
@@ -405,17 +362,9 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
     return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
 
 
-def first_block_code(colour: str, shape: tuple[int, ...]) -> int:
-    """Returns the smallest size code with which an entry of T_c names blocks instead of texels, or `NO_BLOCKS`.
-
-    Args:
-        colour: Format of T_p, as in `Profile`.
-        shape: Rows and columns of T_p. With BC6H and ASTC all entries name blocks where it has more than `MOST_SIZE`
-            texels along a side, for lightmaps above some 5,000 x 5,000.
-    """
-    if colour == "mixed":
-        return FIRST_BLOCK_CODE
-    return 0 if colour in ("bc6h", "astc") and max(shape) > MOST_SIZE else NO_BLOCKS
+def first_block_code(colour: str) -> int:
+    """Returns the smallest size code with which an entry of T_c names blocks instead of texels, or `NO_BLOCKS`."""
+    return {"mixed": FIRST_BLOCK_CODE, "bc6h": 0, "astc": 0}.get(colour, NO_BLOCKS)
 
 
 def pack_entries(
@@ -449,16 +398,8 @@ def pack_entries(
 
 
 def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decodes `pack_entries`.
-
-    Args:
-        lut: uint16 [..., 2].
-        code: `first_block_code`.
-
-    Returns:
-        First texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2], which is equal along
-        both axes in a valid file.
-    """
+    """Decodes `pack_entries`: first texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2],
+    which is equal along both axes in a valid file."""
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
@@ -492,15 +433,8 @@ def pack_tiles(
 
 
 def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
-    """Decodes `pack_tiles`, or entries of two numbers, which have one component.
-
-    Args:
-        lut: uint16 [..., 2 or 4].
-        code: `first_block_code`.
-
-    Returns:
-        Arrays in the order of the arguments of `pack_tiles`: int64, except `blocks`, which is bool [...].
-    """
+    """Decodes `pack_tiles`, or entries of two numbers, which have one component, to the arguments of `pack_tiles` in
+    their order: int64, except `blocks`, which is bool [...]."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
@@ -512,16 +446,8 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
-    """Computes the place of a coarse component of a tile; these are stacked in columns beside the other components.
-
-    Args:
-        size: int [..., 2], texels of the other components along x and y.
-        whole: int [...], number of the other components.
-        number: int [...], number of the coarse component, from 0.
-
-    Returns:
-        int [..., 2], x and y of the first texel relative to that of the tile's first component.
-    """
+    """Computes the place of a coarse component of a tile, int [..., 2], relative to the tile's first texel; these are
+    stacked in columns beside the `whole` other components of a size."""
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
 

@@ -15,17 +15,8 @@ _PULL = 1e-4
 
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
-    """Finds the largest size of a given aspect ratio whose blocks are within a budget.
-
-    Args:
-        height, width: The shape, which is also the largest size.
-        budget: Bits.
-        block: Rows and columns of texels in a block, 1 and 1 for none.
-        bits: Bits per texel; blocks count whole.
-
-    Returns:
-        Rows and columns; None if not even one block fits.
-    """
+    """Finds the largest rows and columns of a given aspect ratio, at most height and width, whose whole blocks of a
+    number of bits per texel are within a budget of bits; None if not even one block fits."""
     longest = max(height, width)
     for side in range(longest, 0, -1):
         rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
@@ -37,18 +28,10 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
 def resized(
     filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
 ) -> torch.Tensor:
-    """Makes a smaller lightmap, to be read bilinearly.
+    """Makes a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504], from one without gaps.
 
-    Args:
-        filled: float32 [H, W, 3], in [0, 65504], gaps filled.
-        mask: bool [H, W], true where a texel counts.
-        height, width: 1 to H and 1 to W.
-        filter: "box" averages the lightmap over the new texels' squares; "fit" has the least squared error when it is
-            read at the mask's texels.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        float64 [height, width, 3] in [0, 65504], on the device; at the lightmap's own size it is the lightmap.
+    The filter "box" averages the lightmap over the new texels' squares; "fit" has the least squared error when it is
+    read at the mask's texels. At the lightmap's own size the result is the lightmap.
     """
     light = torch.from_numpy(filled).to(device).double()
     if (height, width) == mask.shape:
@@ -114,8 +97,5 @@ def _box(new: int, old: int) -> sparse.csr_matrix:
     """Makes the matrix [new, old] that averages `old` texels over the squares of `new` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
-    return _normalised(np.maximum(weight, 0.0))
-
-
-def _normalised(weight: np.ndarray) -> sparse.csr_matrix:
+    weight = np.maximum(weight, 0.0)
     return sparse.csr_matrix(weight / weight.sum(axis=1, keepdims=True))

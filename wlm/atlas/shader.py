@@ -5,10 +5,10 @@ from wlm.atlas.model import (
     COARSE_BITS,
     COUNT_BITS,
     FIRST_BLOCK_CODE,
+    MIP_OCTAVES,
     MOST_COARSE,
     SHORT_ENTRY,
     SIDE_BITS,
-    TAIL_OCTAVES,
     AtlasModel,
 )
 from wlm.bundle import sampler
@@ -24,42 +24,18 @@ _HEAD = """\
 // at the first texel of the first row.
 //
 {textures}
-// {mips} have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
+// They have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
 // sampler mixes four texels, in one fetch, with the 8 or so bits that a GPU gives to a place between two of them.
 
 """
-
-_GRAD = """
-{comment}
-vec3 wlm_atlas_grad({parameters}, vec2 dx, vec2 dy)
-{{
-    vec2 size = vec2({width}.0, {height}.0); // of the lightmap, in texels
-    float texels = max(length(dx * size), length(dy * size)); // along the pixel
-    // A bilinear read still meets all texels where a pixel is two of them.
-    float share = log2(max(texels, 1.0)) - {octaves}.0;
-    if (share <= 0.0)
-        return wlm_atlas(uv);
-    // The lightmap is a part of the tail, from its first texel on: the tail's sides are those of whole blocks.
-    vec2 part = size / ({scale}.0 * vec2(textureSize(WLM_ATLAS_TAIL, 0)));
-    vec3 far = textureGrad(WLM_ATLAS_TAIL, {own} * part, dx * part, dy * part).rgb;
-    return share < 1.0 ? mix(wlm_atlas(uv), far, share) : far;
-}}
-"""
-
-_NEAR = """\
-// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_atlas(uv)."""
-_NEAR_OWN = """\
-// Light where a pixel is large: own is the lightmap's UVs as the mesh had them, beside the new ones, dx and dy are
-// dFdx(own) and dFdy(own). Up close it is wlm_atlas(uv)."""
 
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
     "tiles": "// lut: the lookup texture of tiles, usampler2D, two unsigned integers an entry, filter nearest.",
     "mixed": "// blocks: the small texture's blocks, sampler2D, filter linear, clamped to its edge.",
-    "tail": "// tail: smaller levels, sampler2D, filter linear, between mips too, clamped to its edge, anisotropic.",
     "cascade": "// lut: the lookup texture of coordinates, sampler2D, filter linear, clamped to its edge.",
 }
-"""Texture declarations of each method, of colour "mixed" and of mips; every model has those of "plain"."""
+"""Texture declarations of each method and of colour "mixed"; every model has those of "plain"."""
 
 # Coordinates are in texels, so that arithmetic within a tile stays exact.
 _READ = """
@@ -141,21 +117,18 @@ def _one_lightmap(model: AtlasModel) -> str:
     """Generates the text for a model with one lightmap, with the sizes of lightmap and tiles as constants."""
     height, width = model.sheets[0].size
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
-    kinds = ["plain", *(["mixed"] if mixed else []), *(["tail"] if len(model.tail) else []), model.method]
+    kinds = ["plain", *(["mixed"] if mixed else []), model.method]
     textures = [_TEXTURES[kind] for kind in kinds]
     text = _HEAD.format(
         what=_WHAT[model.method],
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
         textures="\n".join(dict.fromkeys(textures)),
-        mips="All but the tail" if len(model.tail) else "They",
     )
     text += sampler("wlm_atlas_colour", "sampler2D")
     if tiles or cascade:
         text += sampler("wlm_atlas_lut", "usampler2D" if tiles else "sampler2D")
     if mixed:
         text += sampler("wlm_atlas_blocks", "sampler2D")
-    if len(model.tail):
-        text += sampler("wlm_atlas_tail", "sampler2D")
     text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
     if mixed:
         text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")
@@ -173,15 +146,6 @@ def _one_lightmap(model: AtlasModel) -> str:
         )
     elif cascade:
         body = _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
-    if len(model.tail):
-        names = ("vec2 uv, vec2 own", "own", _NEAR_OWN) if len(model.uv) else ("vec2 uv", "uv", _NEAR)
-        body += _GRAD.format(
-            **dict(zip(("parameters", "own", "comment"), names, strict=True)),
-            width=width,
-            height=height,
-            scale=1 << TAIL_OCTAVES,
-            octaves=TAIL_OCTAVES - 1,
-        )
     return text + body
 
 
@@ -353,7 +317,7 @@ def _shared(model: AtlasModel) -> str:
         **numbers,
     )
     if model.levels:
-        text += _SHARED_GRAD.format(octaves=TAIL_OCTAVES - 1, name=names["wlm_scene_grad"], read=names["wlm_scene"])
+        text += _SHARED_GRAD.format(octaves=MIP_OCTAVES - 1, name=names["wlm_scene_grad"], read=names["wlm_scene"])
     if not model.later:
         return text
     states = {"last": len(model.states) - 1, "stride": model.stride}
@@ -369,6 +333,6 @@ def glsl(model: AtlasModel) -> str:
     Returns:
         GLSL 3.30, which is also valid Vulkan GLSL if the bindings are defined: `wlm_atlas(uv)` for one lightmap,
         `wlm_scene(uv, sheet, state)` and `wlm_object(uv, place, sheet, state)` for several; with mips also
-        `wlm_atlas_grad` or `wlm_scene_grad`.
+        `wlm_scene_grad`.
     """
     return _shared(model) + _OBJECT if model.method == "shared" else _one_lightmap(model)

@@ -17,16 +17,9 @@ from wlm.formats.gltf_writer import Replacement, encode_glb
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """Triangles and masks of a scene.
-
-    Attributes:
-        glb: The bytes of a `.glb` file.
-        objects: The nodes that read the sheets.
-        uv_set: n of the lightmaps' `TEXCOORD_n`.
-        metres: Whether the unit is known to be the metre.
-        hides: Whether the other nodes hide what is behind them.
-        masks: bool [H, W] for each sheet, true where a texel belongs to a chart.
-    """
+    """Triangles and masks of a scene: the bytes of a `.glb` file, the nodes that read the sheets, n of their
+    `TEXCOORD_n`, whether the unit is known to be the metre, whether the other nodes hide what is behind them, and for
+    each sheet bool [H, W], true where a texel belongs to a chart."""
 
     glb: bytes
     objects: tuple[Placed, ...]
@@ -72,31 +65,16 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 
 def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
-    """Makes the mesh for an engine: the stored document and, where the model has new UVs, an additional UV set.
-
-    Corners of one vertex that have the same new UV stay one vertex; the others become separate vertices with the same
-    attributes.
-
-    Returns:
-        The bytes of a `.glb` file, and n of the `TEXCOORD_n` under which the model is read.
-
-    Raises:
-        WlmError: The document is damaged, as in `restore`.
-    """
+    """Makes the mesh for an engine: the bytes of the stored document and, where the model has new UVs, an additional UV
+    set; and n of the `TEXCOORD_n` under which the model is read."""
     if not len(model.uv):
         return model.stored.glb, model.stored.uv_set
     return with_uvs(model.scene, model.uv)
 
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
-    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one.
-
-    Args:
-        scene: The scene.
-        corner_uv: [F, 3, 2], the new UV of each triangle's corners; u right, v down; stored as float32.
-
-    Returns:
-        The bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
+    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one, of the corners' new UVs
+    [F, 3, 2]; returns the bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
 
     Raises:
         ValueError: The shape is wrong, or a UV isn't finite.

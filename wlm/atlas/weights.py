@@ -22,13 +22,7 @@ _SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
-    """A sheet's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once.
-
-    Attributes:
-        sheet: The sheet.
-        device: "cpu" or "cuda:N".
-        height, width: Cells, 2 H and 2 W.
-    """
+    """A sheet's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once."""
 
     def __init__(self, sheet: Sheet, device: str) -> None:
         self.sheet, self.device = sheet, device
@@ -85,12 +79,8 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
 
 
 def weights(scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
-    """Counts for each cell of a scene's only sheet the pixels that show it in random views, see `spread`.
-
-    Views from inside count as much as views from around.
-
-    Returns:
-        float64 [2 H, 2 W] on the grid's device, 0 where there is no triangle; at least one is above 0.
+    """Counts for each cell of a scene's only sheet the pixels that show it in random views, float64 [2 H, 2 W] on the
+    grid's device, see `spread`. Views from inside count as much as views from around; at least one weight is above 0.
     """
     count, shape = profile.views, (grid.height, grid.width, grid.device)
     views = scene_views(scene, count, seed)
@@ -108,17 +98,9 @@ def spread(
     relative: float = 0.0,
     mean: float | None = None,
 ) -> torch.Tensor:
-    """Turns pixel counts into weights: unseen cells get a small weight, and borders of charts a larger one.
-
-    Args:
-        grid: The grid.
-        visible: float64 [2 H, 2 W] on its device, pixels that show each cell.
-        unseen, border, relative: As in `Profile`.
-        mean: Mean count of a cell, which scales the weight of unseen cells; None: that of this sheet.
-
-    Returns:
-        The same array as from `weights`.
-    """
+    """Turns pixel counts, float64 [2 H, 2 W], into weights: unseen cells get a small weight, and borders of charts a
+    larger one, as in `Profile`. `mean` is the mean count of a cell, which scales the weight of unseen cells; None: that
+    of this sheet."""
     # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it

@@ -235,7 +235,7 @@ def _show_report(file: Path, model: "AtlasModel", report: "Report") -> None:
     for label, value in (
         ("GPU bytes", f"{report.gpu_bytes:,}"),
         ("GPU bytes saved", f"{report.cr:.2%}"),
-        ("bytes on disk, without the mesh", f"{report.bytes:,}"),
+        ("bytes on disk, without the mesh", f"{report.bytes - report.geometry_bytes:,}"),
         ("PSNR of the views, dB", number(report.psnr, ".2f")),
         ("  from around, dB", number(report.around_psnr, ".2f")),
         ("  from inside, dB", number(report.inside_psnr, ".2f")),

@@ -7,29 +7,12 @@ import numpy as np
 import torch
 
 from wlm.atlas.data import LightmappedScene
-from wlm.atlas.evaluation import Sampler
-from wlm.atlas.views import Points, points_at, visible_uv
+from wlm.atlas.evaluation import Sampler, original
+from wlm.atlas.views import points_at, visible_uv
 from wlm.errors import WlmError
-from wlm.interop import check_device
-from wlm.ops import raster
 from wlm.ops.views import View
 from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
-
-
-def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
-    """The lightmaps themselves as a decoder: read bilinearly, their gaps filled."""
-    device = check_device(device)
-
-    def sample(points: Points, state: int = 0) -> torch.Tensor:
-        light = torch.empty((len(points), 3), dtype=torch.float32, device=points.uv.device)
-        for number in torch.unique(points.sheet).tolist():
-            at = points.sheet == number
-            image = torch.from_numpy(scene.sheets[number].lightmaps[state]).to(device)
-            light[at] = raster.texture(image, points.uv[at].contiguous())
-        return light
-
-    return sample
 
 
 def draw(

@@ -223,47 +223,24 @@ def _check(colour, lut) -> None:
 
 
 def sample(colour, lut, uv, out) -> None:
-    """Reads C(u) at any points (eq. 7).
+    """Reads C(u), float [N, 3], at points vec2 [N] (eq. 7): u right, v down, clamped to [0, 1]; NaN reads NaN.
 
-    Args:
-        colour: float [Hp, Wp, 3], T_p.
-        lut: float [Hc, Wc, 2], T_c, coordinates x and y of T_p, any numbers; [0, 0, 2]: none.
-        uv: vec2 [N], u right, v down, clamped to [0, 1]. NaN reads NaN.
-        out: float [N, 3], written.
-
-    Raises:
-        ValueError: A texture's shape is wrong.
+    T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y of T_p, any numbers; [0, 0, 2]: none.
     """
     _check(colour, lut)
     wp.launch(_sample, uv.shape, inputs=[colour, lut, uv], outputs=[out], device=colour.device)
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
-    """Backward pass of `sample`: the gradients of its textures.
-
-    Args:
-        colour, lut, uv: As for `sample`.
-        grad_out: float [N, 3].
-        grad_colour: float [Hp, Wp, 3], added to.
-        grad_lut: float [Hc, Wc, 2] as `lut`, added to.
-
-    Raises:
-        ValueError: A texture's shape is wrong.
-    """
+    """Adds the gradients of the textures of `sample`, for the gradient of its result, float [N, 3]."""
     _check(colour, lut)
     inputs = [colour, lut, uv, grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_colour, grad_lut], device=colour.device)
 
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
-    """Interpolates coordinates at points in triangles.
-
-    Args:
-        triangle: int [N], the triangle of each point, -1: none.
-        barycentric: vec2 [N], weights of its corners 0 and 1.
-        corner: vec2 [F, 3], coordinates of the corners.
-        uv: vec2 [N], written; NaN where there is no triangle.
-    """
+    """Interpolates coordinates vec2 [N] at points in triangles int [N], from weights of the corners 0 and 1, vec2 [N],
+    and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1."""
     wp.launch(
         _corner_points, triangle.shape, inputs=[triangle, barycentric, corner], outputs=[uv], device=triangle.device
     )
@@ -291,25 +268,15 @@ def image_loss(difference, weight: float, grad) -> None:
     """Computes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3).
 
     The loss is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of
-    neighbours p and q, horizontal and vertical.
-
-    Args:
-        difference: float [H, W, 3], d, the image minus the reference; NaN, which counts as 0, where neither shows the
-            mesh.
-        weight: Weight of the second sum.
-        grad: float [H, W, 3], written; 0 where d is NaN.
+    neighbours p and q, horizontal and vertical. d, float [H, W, 3], is the image minus the reference; NaN, which counts
+    as 0, where neither shows the mesh.
     """
     device = difference.device
     wp.launch(_image_loss, difference.shape, inputs=[difference, weight], outputs=[grad], device=device)
 
 
 def pair_loss(difference, weight: float, grad) -> None:
-    """Computes the gradient of the loss of pairs of points: the sums of |d| and of `weight` |d_i - d_(N + i)|.
-
-    Args:
-        difference: float [2 N, 3], d; NaN counts as 0.
-        weight: Weight of the second sum.
-        grad: float [2 N, 3], written.
-    """
+    """Computes the gradient of the loss of pairs of points: the sums of |d| and of `weight` |d_i - d_(N + i)|, for d
+    float [2 N, 3]; NaN counts as 0."""
     size = (difference.shape[0] // 2, 3)
     wp.launch(_pair_loss, size, inputs=[difference, weight], outputs=[grad], device=difference.device)

@@ -152,12 +152,12 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 @wp.func
 def _alike(
     samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
-) -> int:
-    """Tests if Dist is below lambda in any order (eq. 3, 4): odd if it is, above 1 if samples had to be compared."""
+) -> bool:
+    """Tests if Dist is below lambda in any order (eq. 3, 4)."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
-        return 0
+        return False
     # Interpolation stays within a patch's range, so bounds from two ranges are valid for all samples and orders.
     most = int(0)
     least = int(0)
@@ -167,9 +167,9 @@ def _alike(
         most += wp.max(up, down)
         least += wp.max(0, wp.max(-up, -down))
     if most < rule.whole:
-        return 1
+        return True
     if least >= rule.whole:
-        return 0
+        return False
     large = x
     small = y
     if a.level < b.level:
@@ -186,14 +186,14 @@ def _alike(
     for order in range(6):
         bound = _along(above, order) / 3.0 + f.residual + g.residual
         if bound < rule.level - _MARGIN:
-            return 1
+            return True
         if bound < closest:
             closest = bound
             first = order
         if _along(below, order) < rule.level + _MARGIN:
             undecided += 1 << order
     if undecided == 0:
-        return 0
+        return False
     limit = rule.mixed[level]
     if a.level == b.level:
         limit = rule.same[level]
@@ -202,8 +202,8 @@ def _alike(
         order = (first + i) % 6
         if ((undecided >> order) & 1) == 1:
             if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
-                return 3
-    return 2
+                return True
+    return False
 
 
 @wp.kernel(enable_backward=False)
@@ -258,22 +258,16 @@ def _edges(
     offset: int,
     # out:
     edge: wp.array2d[wp.uint8],
-    compared: wp.array1d[wp.int64],
 ):
     """One patch per thread; each pair once, by the thread of the first."""
     a = offset + wp.tid()
     last = high[a] + rule.level + _MARGIN
-    count = wp.int64(0)
     for b in range(a + 1, low.shape[0]):
         if low[b] > last:
             break
-        alike = _alike(samples, patches, bounds, rule, a, b)
-        if alike > 1:
-            count += wp.int64(1)
-        if (alike & 1) == 1:
+        if _alike(samples, patches, bounds, rule, a, b):
             edge[a, b] = wp.uint8(1)
             edge[b, a] = wp.uint8(1)
-    compared[a] = count
 
 
 @wp.kernel(enable_backward=False)
@@ -303,19 +297,14 @@ def _join(
         if head_low[k] > high[a] + margin:
             break
         if rank[k] < best:
-            if (_alike(samples, patches, bounds, rule, heads[k], a) & 1) == 1:
+            if _alike(samples, patches, bounds, rule, heads[k], a):
                 best = rank[k]
     joined[i] = best
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """Makes the thresholds, with settings interpreted as the exact decimal fractions that they print as.
-
-    Args:
-        threshold: lambda (eq. 4); Dist must be less.
-        colour_threshold: lambda_h (section 3.2.1), the largest distance of two dominant colours.
-        device: Where the arrays go.
-    """
+    """Makes the thresholds lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest distance of two
+    dominant colours), interpreted as the exact decimal fractions that they print as."""
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
@@ -329,12 +318,7 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
 
 
 def bounds(samples, patches, levels: int):
-    """Computes `Bounds` [F, levels] of patches.
-
-    Args:
-        samples, patches: Results of `sample`.
-        levels: One more than the highest level of a patch.
-    """
+    """Computes `Bounds` [F, levels] of patches, for one level more than the highest of a patch."""
     out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
     wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
     return out
@@ -345,10 +329,7 @@ class Graph:
     """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
 
     Attributes:
-        samples: int, samples of all patches.
-        patches: Patch [M], by rising `low`.
-        bounds: Bounds [M, levels].
-        rule: Rule.
+        samples, patches, bounds, rule: The samples of all patches; and of the M nodes, by rising `low`.
         low, high: float [M], least and largest mean level on any lattice; the means of two patches that are alike on
             any lattice differ by less than lambda.
         means: float32 [M], `low` on the host.
@@ -369,11 +350,7 @@ class Graph:
 
 
 def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of some patches.
-
-    Returns:
-        The graph, and the number of each of its nodes among the patches, int64 [M].
-    """
+    """Makes the graph of some patches; also returns the number of each of its nodes among them, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
     wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
@@ -400,30 +377,15 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
     return out, out_bounds
 
 
-def find_edges(graph: Graph, begin: int, end: int, edge, compared) -> None:
-    """Finds the edges between patches `begin` to `end` - 1 and any later one.
-
-    Args:
-        graph: The graph.
-        begin, end: The range.
-        edge: uint8 [M, M], 0; set to 1 in both places of an edge.
-        compared: int64 [M], written in the range: pairs that the bounds did not settle.
-    """
+def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
+    """Finds the edges between patches `begin` to `end` - 1 and any later one: 1 in both places of uint8 [M, M], which
+    is 0."""
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
-    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge, compared], device=edge.device)
+    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
-    """Finds for some nodes the first of the heads that they are like.
-
-    Args:
-        graph: The graph.
-        nodes: int [N].
-        begin, end: The range of nodes to process.
-        heads: int [H], nodes, ascending.
-        head_low: float [H], their `low`.
-        rank: int [H], the order in which heads are compared.
-        joined: int [N], written in the range: the rank of the head, H for none.
-    """
+    """Writes for nodes `begin` to `end` - 1, int [N], the rank of the first head that they are like, H for none. Heads,
+    int [H], are ascending nodes, `head_low` their `low`, and `rank` the order in which they are compared."""
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

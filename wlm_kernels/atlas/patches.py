@@ -333,8 +333,8 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
         device: Where the arrays go.
 
     Returns:
-        The samples of all patches, int [sum of `samples_of(SIZES[level])`]; Patch [F], without their dominant
-        colours; and uint8 [F], 1 where a patch reads a texel that is too bright.
+        The samples of all patches, int; Patch [F], without their dominant colours; and uint8 [F], 1 where a patch reads
+        a texel that is too bright.
 
     Raises:
         ValueError: There are more samples than 32 bits can count.
@@ -356,25 +356,17 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 
 
 def dominant(samples, patches) -> None:
-    """Finds the dominant colours, the most frequent of 32 x 32 x 32 bins, and the lowest of equally frequent ones
-    (section 3.2.1).
-
-    Args:
-        samples, patches: Results of `sample`; the latter's `colour` is written.
-    """
+    """Writes the dominant colours of `sample`'s patches: the most frequent of 32 x 32 x 32 bins, and the lowest of
+    equally frequent ones (section 3.2.1)."""
     wp.launch(_dominant, patches.shape, inputs=[samples], outputs=[patches], device=samples.device)
 
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the order with the least distance of each pair, the first of equals, and that distance (eq. 2 and 3).
+    """Finds the order with the least distance of each pair of patches, the first of equals, and that distance (eq. 2
+    and 3).
 
-    Args:
-        samples, patches: Results of `sample`.
-        member, representative: int [N], numbers of patches.
-
-    Returns:
-        int8 [N], o such that vertex k of the member maps to vertex `ORDERS[o][k]` of the representative; and
-        float64 [N], Dist, in [0, 1].
+    Returns int8 [N], o such that vertex k of the member maps to vertex `ORDERS[o][k]` of the representative; and
+    float64 [N], Dist, in [0, 1].
     """
     device, count = samples.device, member.shape[0]
     order = wp.empty(count, dtype=wp.int8, device=device)

@@ -243,14 +243,8 @@ def _errors(
 
 
 def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System) -> None:
-    """Gathers the normal equations.
-
-    Args:
-        weight: float [T, m * m], weights of the points' squared errors.
-        scale: float [T], factor of each tile's weights.
-        grid: The samples.
-        system: The equations, written.
-    """
+    """Gathers the normal equations from the weights of the points' squared errors, float [T, m * m], times the tiles'
+    factors, float [T]."""
     wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
 
 
@@ -271,16 +265,8 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the equations from a start, with ridge regularisation towards it.
-
-    Args:
-        light, weight, scale, grid, system: Arguments and result of `gather` and `gather_system`.
-        ridge: Number added to the diagonal of the equations.
-        rounds: Rounds of conjugate gradients.
-        start: float [T, 3, S].
-        work: Three work arrays of the shape of `start`.
-        out: float [T, 3, S], written.
-    """
+    """Solves the equations from a start, float [T, 3, S], with ridge regularisation towards it, by rounds of conjugate
+    gradients. `work` are three arrays of the same shape."""
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
 

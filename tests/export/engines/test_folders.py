@@ -1,6 +1,5 @@
 """Folders for engines: few files, whose shaders and scripts compile or parse by what pip and Debian have."""
 
-import dataclasses
 import json
 import os
 import re
@@ -19,7 +18,6 @@ from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
 from wlm.atlas.exact import decode64
-from wlm.atlas.mips import make_tail
 from wlm.export import ENGINES, export
 from wlm.formats.light import read_light
 from wlm.inspection import inspect
@@ -63,17 +61,12 @@ def test_one_engines_files_take_the_place_of_anothers(tmp_path):
 
 
 def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
-    """Of a model with mips too: their texture goes with the shader that reads it."""
-    mesh = sheet()
-    model = random_atlas(mesh, MIXED)
-    model = dataclasses.replace(model, tail=make_tail(mesh.sheets[0], "bc6h"))
+    model = random_atlas(sheet(), MIXED)
     for engine in (*ENGINES, None):
         paths = export(model, tmp_path / "out", engine)
         info = json.loads(paths[-1].read_text())
         text = "".join(path.read_text() for path in paths if path.suffix in TEXTS - {".md", ".cs"})
-        assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks|tail)\b", text)) == set(info["textures"])
-    assert info["textures"]["tail"]["file"] == "tail.dds"
-    assert (tmp_path / "out" / "tail.dds").read_bytes().endswith(model.tail.tobytes())
+        assert set(re.findall(r"\bwlm_atlas_(colour|lut|blocks)\b", text)) == set(info["textures"])
 
 
 def test_sheets_of_light_have_a_folder_each(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts
-from builders.atlas_models import KINDS, MIXED, WIDE
+from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
 from builders.exported import read_export
 from builders.metal import run_metal
@@ -47,8 +47,8 @@ def lightmap(kinds, folder, **settings) -> Subject:
     return Subject(text, main, expected, uniforms | hour(2), "WLM_LIGHTMAP_EXACT", 0.01 * step, step)
 
 
-def atlas(kind, _) -> Subject:
-    model = random_atlas(charts(), kind)
+def atlas(kind, _, colour="half") -> Subject:
+    model = random_atlas(charts(), kind, colour)
     uv = np.random.default_rng(0).uniform(-0.1, 1.1, (1000, 2)).astype(np.float32)
     uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
     if model.method == "tiles":
@@ -67,32 +67,6 @@ def atlas(kind, _) -> Subject:
     # too its own 512th is one of 65,535 steps' span, up to all 22 texels of the other texture.
     filtered = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
     return Subject(atlas_glsl(model), main, decode64(model, uv)[None], bound, "WLM_ATLAS_EXACT", 3e-4, filtered)
-
-
-def mips(kind, _) -> Subject:
-    """The light of the model where a pixel is small, of the tail where it is large, in between of both.
-
-    The tail has a margin, and rises along u where the lightmap is.
-    """
-    near = atlas(kind, None)
-    model = replace(random_atlas(charts(), kind), tail=np.zeros((1, 16), np.uint8))
-    texels = np.array([0.0, 2.0**1.5, 8.0])[np.arange(near.expected.shape[1]) % 3]  # along a pixel
-    height, width = model.sheets[0].size
-    near.bound["u_change"] = points_of(np.stack([texels / width, 0 * texels], 1))
-    rows, columns = -(-height // 16) * 4 + 4, -(-width // 16) * 4 + 4
-    tail = np.zeros((rows, columns, 4), np.float16)
-    tail[:] = (np.arange(columns) / columns)[None, :, None]
-    near.bound["wlm_atlas_tail"] = tail
-    points = near.bound["u_points"][0, :, :2]
-    place = points[:, 0].astype(np.float64) * width / 4 - 0.5
-    far = (np.clip(place, 0, columns - 1) / columns)[:, None]
-    place = "texelFetch(u_points, pixel, 0).xy, texelFetch(u_change, pixel, 0).xy, vec2(0.0)"
-    if len(model.uv):
-        place = f"vec2(texelFetch(u_points, pixel, 0).xy), {place}"
-    main = f"vec4 shown(ivec2 pixel) {{ return vec4(wlm_atlas_grad({place}), 1.0); }}\n"
-    share = np.clip(np.log2(np.maximum(texels, 1.0)) - 1.0, 0.0, 1.0)[:, None]
-    expected = (1.0 - share) * near.expected + share * far
-    return replace(near, text=atlas_glsl(model), main=f"{POINTS}uniform sampler2D u_change;\n{main}", expected=expected)
 
 
 def rgba(texels: np.ndarray) -> np.ndarray:
@@ -262,9 +236,8 @@ PROBES = "".join(
 SUBJECTS: dict[str, Callable[..., Subject]] = {
     "lightmap": lambda folder: lightmap((4, 3, 2, 1), folder),
     "lightmap of odd sizes": lambda folder: lightmap((4, 3, 4, 0), folder, gelu="exact", period=None, hidden=10),
-    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED, WIDE)},
-    "atlas mips": partial(mips, MIXED),
-    "atlas cascade mips": partial(mips, "cascade"),
+    **{f"atlas {kind}": lambda folder, kind=kind: atlas(kind, folder) for kind in (*KINDS, MIXED)},
+    "atlas tiles of blocks": lambda folder: atlas("tiles", folder, "bc6h"),
     "scene": partial(scene, False, False, False),
     "scene of one component": partial(scene, True, False, False),
     "scene mixed": partial(scene, False, True, False),
@@ -326,7 +299,6 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
         "lightmap",
         "atlas cascade",
         "atlas tiles mixed",
-        "atlas mips",
         "scene",
         "smoke unity",
         "smoke billboard",

@@ -6,34 +6,18 @@ group: itself and its neighbours. The group is removed and the edges of the rest
 left (eq. 6).
 
 That is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of that size, all others
-join the first representative that they are like, and the same is repeated with the rest. The time is proportional to
-triangles times groups, each triangle is still like its representative, and no two representatives are alike. On 41,472
-triangles of a synthetic lightmap there are 1.6% more groups, in a sixth of the time; 991,232 triangles take 8 s on one
-core.
-
-Edges are stored within a sample alone, so that memory grows with the triangles and the texels that they cover: at most
-`samples_of(largest)` words per triangle.
+join the first representative that they are like, and the same is repeated with the rest. Each triangle is still like
+its representative, and no two representatives are alike. Edges are stored within a sample alone, so that memory grows
+with the triangles and the texels that they cover.
 
 The following points are not specified by the paper or differ from it:
 
 - The sizes of patches are 2 ** k + 1, the smallest one not below R_s (eq. 1), and at most `largest`.
 - R_s uses lengths in texels, which is also right where the lightmap isn't square.
-- A triangle is excluded if its patch reads a texel above `max_radiance` in any channel; one at exactly that isn't.
-  The samples of a triangle larger than `largest` lie more than a texel apart, and texels between them are not read.
-- Colours are fractions of `max_radiance`, and so are lambda and lambda_h: a dark map needs a lower maximum.
-
-The stated behaviours:
-
-=========================================  ===========================================================
-input                                      behaviour
-=========================================  ===========================================================
-no triangle                                no group
-a triangle of no area, or within a texel   a patch of the texels that it touches, like any other
-a map of one colour                        one group
-UVs outside [0, 1]                         the border's texels
-negative radiance                          counts as 0
-NaN, Inf, UVs beyond +-65536               ValueError: the loader lets none pass
-=========================================  ===========================================================
+- A triangle is excluded if its patch reads a texel above `max_radiance` in any channel. The samples of a triangle
+  larger than `largest` lie more than a texel apart, and texels between them are not read.
+- Colours are fractions of `max_radiance`, and so are lambda and lambda_h: a dark map needs a lower maximum. Negative
+  radiance counts as 0.
 """
 
 from collections.abc import Iterator
@@ -47,29 +31,13 @@ from wlm_kernels.atlas import patch_graph as graphs
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import SIZES
 
-# Against 65, measured on six meshes with lightmaps of 512 x 512, lambda = 0.03, 0.01 and 0.003: mostly 2 to 6 times as
-# fast; edges within 1%; groups within a seventh, or within one group where there are ten or fewer.
+# Against 65 this is mostly 2 to 6 times as fast; edges are within 1%, and groups within a seventh.
 LARGEST = 17
-_FARTHEST = 65536.0
 
 SAMPLE = 8192
 """Triangles among which groups are formed at once."""
 
 _PAIRS_AT_ONCE = 1 << 24  # pairs between two progress reports
-
-
-@dataclass(frozen=True)
-class Stats:
-    """Figures of the graph.
-
-    Attributes:
-        compared: Pairs whose samples had to be compared, since bounds did not decide; rounding may make the number
-            differ between devices.
-        edges: Pairs that are alike; with more than `SAMPLE` triangles both numbers count only pairs within samples.
-    """
-
-    compared: int
-    edges: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +52,6 @@ class Clusters:
             `wlm_kernels.atlas.patches`. The first of equally good orders; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
         excluded: bool [F], too bright or not active: each is a separate group.
-        stats: Figures of the graph.
     """
 
     group: np.ndarray
@@ -92,7 +59,6 @@ class Clusters:
     order: np.ndarray
     distance: np.ndarray
     excluded: np.ndarray
-    stats: Stats
 
 
 def cluster(
@@ -111,32 +77,21 @@ def cluster(
     """Groups triangles whose patches are alike.
 
     Args:
-        uv: [V, 2], of the lightmap; v = 0 is the top of row 0.
+        uv: [V, 2], of the lightmap, finite; v = 0 is the top of row 0. Outside [0, 1] the border's texels are read.
         triangle: int [F, 3], vertices.
-        lightmap: [H, W, 3], linear RGB.
-        threshold: lambda of eq. 4, a fraction of `max_radiance`: the largest mean difference of two patches' samples
-            and channels; above 0.
-        colour_threshold: lambda_h, the largest distance of two dominant colours (section 3.2.1); at least 0.
+        lightmap: [H, W, 3], linear RGB, finite.
+        threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
         max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
         active: bool [F], which triangles take part; None for all.
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
-        progress: Called with the triangles done, in stage "compare patches" while edges are counted, then in stage
-            "cluster" while groups are formed; with more than `SAMPLE` triangles these alternate.
-
-    Returns:
-        The groups.
+        progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
 
     Raises:
-        ValueError: A shape, a type or a range is wrong; a number isn't finite.
+        ValueError: The patches have more samples than 32 bits can count.
     """
-    uv, triangle, lightmap = np.asarray(uv, np.float64), np.asarray(triangle), np.asarray(lightmap)
-    _check(uv, triangle, lightmap, threshold, colour_threshold, max_radiance, largest)
     count = len(triangle)
-    excluded = np.zeros(count, bool) if active is None else ~np.asarray(active, bool)
-    if excluded.shape != (count,):
-        raise ValueError(f"active: expected [{count}], got {excluded.shape}")
-
+    excluded = np.zeros(count, bool) if active is None else ~active
     corner = _corners(uv, triangle, lightmap.shape)
     level = _levels(corner, largest)
     samples, patches, bright = kernels.sample(_texels(lightmap, max_radiance), corner, level, device)
@@ -148,7 +103,7 @@ def cluster(
     bounds = graphs.bounds(samples, nodes, int(level.max(initial=0)) + 1)
     graph, order = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
     number = included[order]  # the triangle of each node
-    groups, stats = _groups(graph, number, progress)
+    groups = _groups(graph, number, progress)
     head = np.arange(count, dtype=np.int32)  # the representative of each triangle
     heads = [number[node] for node, _ in groups]
     for node, members in groups:
@@ -161,30 +116,7 @@ def cluster(
 
     pairs = [wp.array(values, dtype=int, device=device) for values in (np.arange(count, dtype=np.int32), head)]
     order, distance = kernels.compare(samples, patches, *pairs)
-    return Clusters(group[head], representative, order, distance, excluded, stats)
-
-
-def _check(uv, triangle, lightmap, threshold, colour_threshold, max_radiance, largest) -> None:
-    if uv.ndim != 2 or uv.shape[1] != 2:
-        raise ValueError(f"uv: expected [V, 2], got {uv.shape}")
-    if triangle.ndim != 2 or triangle.shape[1] != 3 or triangle.dtype.kind not in "iu":
-        raise ValueError(f"triangle: expected integers [F, 3], got {triangle.dtype} {triangle.shape}")
-    if triangle.size and not 0 <= triangle.min() <= triangle.max() < len(uv):
-        raise ValueError(f"triangle: expected vertices from 0 to {len(uv) - 1}, got {triangle.min()}..{triangle.max()}")
-    if lightmap.ndim != 3 or lightmap.shape[2] != 3 or 0 in lightmap.shape:
-        raise ValueError(f"lightmap: expected [H, W, 3], got {lightmap.shape}")
-    if not np.isfinite(lightmap).all():
-        raise ValueError("lightmap: expected finite numbers")
-    if not (np.abs(uv) <= _FARTHEST).all():
-        raise ValueError(f"uv: expected numbers within +-{_FARTHEST:g}")
-    if not 0.0 < threshold <= 1.0:
-        raise ValueError(f"threshold: expected above 0 and at most 1, got {threshold}")
-    if not 0.0 <= colour_threshold <= 2.0:
-        raise ValueError(f"colour_threshold: expected from 0 to 2, got {colour_threshold}")
-    if not 0.0 < max_radiance < np.inf:
-        raise ValueError(f"max_radiance: expected above 0, got {max_radiance}")
-    if largest not in SIZES:
-        raise ValueError(f"largest: expected one of {', '.join(map(str, SIZES))}, got {largest}")
+    return Clusters(group[head], representative, order, distance, excluded)
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
@@ -209,21 +141,9 @@ def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
-def _groups(
-    graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
-) -> tuple[list[tuple[int, np.ndarray]], Stats]:
-    """Forms groups.
-
-    Args:
-        graph: The graph, of M nodes.
-        number: int [M], the triangle of each node, which breaks ties.
-        progress: As for `cluster`.
-
-    Returns:
-        The representative node and the nodes of each group with several nodes, in the order in which the groups were
-        formed; and figures of the graph.
-    """
-    count, compared, edges = len(number), 0, 0
+def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
+    """Forms groups of several nodes, each with its representative; the nodes' triangles [M] break ties."""
+    count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
     groups: list[tuple[int, np.ndarray]] = []
@@ -231,13 +151,12 @@ def _groups(
     while True:
         sample = left if len(left) <= SAMPLE else np.sort(left[np.argsort(drawn[left])[:SAMPLE]])
         part = graph if len(sample) == count else graphs.part(graph, sample)
-        edge, stats = _edges(part, comparing, count - len(left))
-        compared, edges = compared + stats.compared, edges + stats.edges
+        edge = _edges(part, comparing, count - len(left))
         formed = [(int(sample[node]), sample[members]) for node, members in _greedy(edge, number[sample])]
         if len(sample) == len(left):
             groups += formed
             clustering.report(count)
-            return groups, Stats(compared, edges)
+            return groups
         # Nodes that are like no other in the sample may be like one outside it.
         alone = np.setdiff1d(sample, np.concatenate([np.empty(0, np.int64), *(members for _, members in formed)]))
         heads = np.concatenate([np.array([node for node, _ in formed], np.int64), alone])
@@ -272,32 +191,22 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
     return joined.numpy()
 
 
-def _edges(graph: graphs.Graph, meter: Meter, done: int) -> tuple[np.ndarray, Stats]:
+def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
     """Computes the edges, uint8 [M, M]; `done` triangles are already grouped."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
-    compared = wp.zeros(count, dtype=wp.int64, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
     for begin in range(0, count, piece):
         end = min(begin + piece, count)
-        graphs.find_edges(graph, begin, end, edge, compared)
+        graphs.find_edges(graph, begin, end, edge)
         wp.synchronize_device(device)
         if meter.due(done + end):
             meter.report(done + end)
-    edges = edge.numpy()
-    return edges, Stats(int(compared.numpy().sum()), int(np.count_nonzero(edges)) // 2)
+    return edge.numpy()
 
 
 def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Forms groups and removes them from the graph (section 3.2.2).
-
-    Args:
-        edge: uint8 [M, M], 1 where two nodes are alike.
-        number: int [M], the triangle of each node, which breaks ties.
-
-    Yields:
-        The node that represents a group, and the nodes of the group; groups of one are left out.
-    """
+    """Forms groups of several nodes, each with its representative, and removes them from the graph (section 3.2.2)."""
     degree = edge.sum(1, dtype=np.int64)
     remains = np.ones(len(number), bool)
     # Among equals the lowest number comes first.

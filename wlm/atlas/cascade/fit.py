@@ -15,27 +15,24 @@ T_p starts as the regenerated lightmap downscaled by epsilon_p, T_c as the coord
 The paper leaves some points open. Here the loss is a sum and not a mean, which changes Adam's steps by its epsilon
 alone; radiance, and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned
 more coarsely than a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range
-of its 16 bits, where F is the identity. The paper's rates are constant; `Profile.final_rate` lets rates decay, so that
-less noise of the last steps is stored, and start higher: 5e-3 and 1e-3 decaying to a hundredth are 0.6 to 1.3 dB better
-than the best constant rates, with 300 steps as with 2,000.
+of its 16 bits, where F is the identity. `Profile.final_rate` lets rates, which are constant in the paper, decay.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import warp as wp
 
 from wlm import interop
-from wlm.atlas.cascade.cluster import Clusters, Stats, cluster
+from wlm.atlas.cascade.cluster import Clusters, cluster
 from wlm.atlas.cascade.pack import pack, regenerate
 from wlm.atlas.colour import quantise
-from wlm.atlas.corners import snapped
 from wlm.atlas.data import LightmappedScene, Sheet
-from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace
+from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
@@ -57,28 +54,16 @@ _PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show
 
 @dataclass(frozen=True, eq=False)
 class Textures:
-    """A cascade before it is stored.
-
-    Attributes:
-        colour: float32 [Hp, Wp, 3], T_p, linear radiance.
-        lut: float32 [Hc, Wc, 2], T_c, x and y over the size of T_p; [0, 0, 2]: none.
-    """
+    """A cascade before it is stored: T_p, float32 [Hp, Wp, 3], linear radiance; T_c, float32 [Hc, Wc, 2], x and y over
+    the size of T_p, [0, 0, 2] for none."""
 
     colour: np.ndarray
     lut: np.ndarray
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2).
-
-    Args:
-        sheet: The triangles and their lightmap.
-        profile: `threshold`, `colour_threshold` and `max_radiance`.
-        stages: Reports and times the stage.
-
-    Returns:
-        The groups; None if the threshold is 0, where no triangle shares texels.
-    """
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0, where no triangle
+    shares texels."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -101,8 +86,7 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
             progress=stages.progress,
         )
         if stages.checkpoint is not None:
-            parts = {field.name: getattr(clusters, field.name) for field in fields(Clusters)}
-            stages.checkpoint.add_finished(0, parts | {"stats": np.array(astuple(clusters.stats))})
+            stages.checkpoint.add_finished(0, vars(clusters))
         return clusters
 
 
@@ -115,14 +99,12 @@ def fit_cascade(
     *,
     repack: bool = True,
 ) -> AtlasModel:
-    """Compresses a lightmap whose triangles are grouped.
+    """Compresses a lightmap whose triangles are grouped; None: no triangle shares.
 
     Args:
         scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles; None: no triangle shares.
-        profile: The settings.
-        seed: Seed of the cameras or points.
-        stages: Reports and times the stages.
+        clusters: The groups of its triangles.
+        profile, seed, stages: As for `wlm.atlas.fit.compress`.
         repack: Whether charts are packed anew (section 3.3.1). Else the mesh keeps its UVs, the cascade begins as the
             lightmap itself, and neither `clusters` nor the profile's `scale` counts (section 4.5.2).
 
@@ -172,15 +154,11 @@ def fit_cascade(
 
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
-    """Makes the textures that tuning starts from (section 3.3.3).
+    """Makes the textures that tuning starts from (section 3.3.3): T_p, each texel the mean of those that it covers, and
+    T_c.
 
-    Args:
-        lightmap: float32 [H_r, W_r, 3], the regenerated lightmap.
-        mask: bool [H_r, W_r], its texels that are used; the others are filled from them.
-        profile: `colour_scale` and `lut_scale`; a side is rounded, to at least one texel.
-
-    Returns:
-        T_p, each texel the mean of those it covers, and T_c; no T_c if `lut_scale` is 0.
+    The regenerated lightmap is float32 [H_r, W_r, 3], its used texels are bool [H_r, W_r]; the others are filled from
+    them.
     """
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
@@ -203,20 +181,8 @@ def tune(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
-    """Tunes a cascade so that the mesh looks as with its lightmap.
-
-    Args:
-        sheet: The triangles and their lightmap.
-        uv: float32 [F, 3, 2], the corners' UVs under which the cascade is read.
-        textures: Initial values.
-        profile: `space`, `steps`, `colour_rate`, `lut_rate`, `final_rate`, `resolution` and `gradient`.
-        seed: Seed of the cameras or points.
-        device: "cpu" or "cuda:N".
-        progress: Called about twice a second with the steps done.
-        checkpoint: Keeps the state of the steps, as batch 1.
-
-    Returns:
-        The tuned cascade.
+    """Tunes a cascade, read under the corners' UVs, float32 [F, 3, 2], so that the mesh looks as with its lightmap. The
+    checkpoint keeps the state of the steps as batch 1.
 
     Raises:
         WlmError: No such device, or the fit diverged.
@@ -259,13 +225,12 @@ def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
         "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
         "distance": Part(np.float64, (count,), least=0.0),
         "excluded": Part(np.bool_, (count,)),
-        "stats": Part(np.int64, (2,), least=0),
     }
     if (kept := checkpoint.finished(0, table)) is None:
         return None
     if kept["group"].max() >= len(kept["representative"]):
         raise WlmError(f"{checkpoint.path}: finished batch 0: part group: expected one of the representatives' groups")
-    return Clusters(**{**kept, "stats": Stats(*map(int, kept["stats"]))})
+    return Clusters(**kept)
 
 
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:

@@ -9,17 +9,8 @@ The paper leaves two points open. Here charts have two texels between them (one 
 one never reads another's texel, and a triangle that is too thin for the packer gets a separate place, half a texel
 high. The atlas is as large as its charts need, W_r x H_r of eq. 9, be that less or more than epsilon W x epsilon H.
 
-The stated behaviours:
-
-================================================  ===============================================================
-input                                             behaviour
-================================================  ===============================================================
-a triangle that isn't `active`                  no texels; it reads one point of a neighbour, else (0, 0)
-a triangle smaller than a texel                   keeps its size, in the texels that it touches
-triangles that fold over each other in a chart    separate charts
-three and more triangles at one edge              separate charts; grouped first if they are alike
-an atlas of over 16,384 texels along a side       error
-================================================  ===============================================================
+A triangle that isn't `active` takes no texels: it reads one point of a neighbour, else (0, 0). Triangles that fold over
+each other in a chart, or of which three and more share an edge, are in separate charts.
 """
 
 import math
@@ -70,15 +61,8 @@ class Packed:
 
 
 def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
-    """Gives the mesh new UVs in which the triangles of a group share texels.
-
-    Args:
-        sheet: The triangles.
-        clusters: Their groups; None: no triangle shares.
-        scale: epsilon, texels of the atlas per texel of the lightmap, along a side.
-
-    Returns:
-        The new UVs.
+    """Gives the mesh new UVs in which the triangles of a group share texels; `scale` is epsilon, texels of the atlas
+    per texel of the lightmap along a side.
 
     Raises:
         WlmError: `uvunwrap` isn't installed or fails, or the atlas gets too large.
@@ -129,13 +113,7 @@ def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.nd
     Inside a triangle that is the place with the same barycentrics, the paper's three steps. Since a chart moved
     rigidly, one affine map gives it for all its triangles, and beyond its border, where the lightmap's gaps are filled.
 
-    Args:
-        sheet: The triangles and their lightmap.
-        packed: Their new UVs.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts.
+    Returns float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts.
     """
     height, width = packed.height, packed.width
     heads = np.flatnonzero(packed.source == np.arange(len(packed.source)))
@@ -158,17 +136,9 @@ def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.nd
 def _pack_charts(
     name: str, old: np.ndarray, numbers: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Packs the charts.
-
-    Args:
-        name: The mesh's name, for messages.
-        old: float64 [N, 3, 2], corners in texels of the lightmap.
-        numbers: int [N, 3], the corners' numbers, equal where corners coincide.
-        scale: As for `pack`.
-
-    Returns:
-        int [N], the chart of each triangle; complex [C] twice, its motion, as `_motions`; float64 [2], W_r and H_r.
-    """
+    """Packs the charts of corners [N, 3, 2] in texels of the lightmap, whose numbers [N, 3] are equal where corners
+    coincide. Returns the chart of each triangle, int [N]; its motion, complex [C] twice, as `_motions`; and W_r and
+    H_r."""
     label = charts(numbers)
     # Triangles are made counter-clockwise, since the packer would mirror clockwise ones.
     winding = np.where((_signed_area(old) < 0)[:, None], [0, 2, 1], [0, 1, 2])
@@ -194,9 +164,8 @@ def _uvunwrap(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Calls the packer, which leaves out triangles that are too thin for it.
 
-    Returns:
-        float64 [N, 3, 2], new corners in texels; int [N], the chart, also of a triangle that the packer left out of
-        one, -1 where there is none; bool [N], whether it has new corners; float64 [2], W_r and H_r.
+    Returns new corners in texels, float64 [N, 3, 2]; the chart, int [N], -1 where there is none; whether the triangle
+    has new corners, bool [N]; and W_r and H_r.
     """
     uvunwrap = need("uvunwrap", "atlas")
     if not len(points):
@@ -236,14 +205,11 @@ def _uvunwrap(
 def _chart_meshes(
     points: np.ndarray, numbers: np.ndarray, label: np.ndarray
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-    """Makes each chart a flat mesh with its lower corner at the origin.
+    """Makes each chart a flat mesh with its lower corner at the origin: places float32 [v, 3], triangles uint32 [f, 3]
+    and the same places as UVs; also returns the triangles [N] in the order of the meshes.
 
     In one mesh charts that meet at a point would be joined, and the thinnest triangle that the packer takes and the
     resolution of float32 depend on a mesh's extent.
-
-    Returns:
-        The triangles [N] in the order of the meshes, and for each chart: float32 [v, 3], places; uint32 [f, 3];
-        float32 [v, 2], the same places as UVs.
     """
     charts = np.arange(int(label.max()) + 2)
     low = np.full((len(charts) - 1, 2), np.inf)
@@ -312,8 +278,8 @@ def _thickened(points: np.ndarray, height: float) -> np.ndarray:
 def _dilated(corner: np.ndarray) -> np.ndarray:
     """Computes outlines of triangles [N, 3, 2], each dilated by one texel along both axes: [N, 7, 2].
 
-    A bilinear read at a point uses the texels whose centres are less than one texel away along both axes, so these
-    are the centres within the Minkowski sum of the triangle and a square. Its edges are those of both, by direction.
+    A bilinear read uses the texels whose centres are less than one texel away along both axes. These are in the
+    Minkowski sum of the triangle and a square, whose edges are those of both, by direction.
     """
     flip = _signed_area(corner) < 0
     ring = np.where(flip[:, None, None], corner[:, ::-1], corner)

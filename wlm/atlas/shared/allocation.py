@@ -52,12 +52,8 @@ class Allocated:
 
 
 def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocated:
-    """Allocates components and sizes to the tiles of all sheets, and places them.
-
-    Args:
-        tried: The tiles with each number of components.
-        bits: Bits of all tiles and factors.
-        profile: `budget`, for messages.
+    """Allocates components and sizes to the tiles of all sheets, and places them. `bits` are those of all tiles and
+    factors.
 
     Raises:
         WlmError: The budget is less than the smallest tiles take, or all pages together are too small.
@@ -119,18 +115,7 @@ def _worth(
     error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
 ) -> np.ndarray:
     """Removes mixtures, the least useful first, until each saves more error than its factors' bits would elsewhere.
-
-    Args:
-        error: float64 [choices, T].
-        cost: [choices], bits.
-        of: int [choices], the number of each choice's `Candidate`.
-        number: int [candidates, T], the tiles' mixtures.
-        factors: [candidates], number of factors of one mixture.
-        bits: Bits of all tiles and factors.
-
-    Returns:
-        `error`, with a value above all others where a tile's mixture is left out.
-    """
+    Returns `error`, with a value above all others where a tile's mixture is left out."""
     tiles = np.arange(error.shape[1])
     ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in _two(error, cost, bits)]
     gain = (ends[1][0] - ends[0][0]) / max(ends[0][1] - ends[1][1], 1.0)  # error that one bit saves
@@ -159,13 +144,8 @@ def _two(error: np.ndarray, cost: np.ndarray, bits: float) -> list[np.ndarray]:
 
 
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Packs rectangles on the smallest number of pages, which all have one size.
-
-    Args:
-        size: int [T, 2], texels along x and y of each.
-
-    Returns:
-        First texels, int64 [T, 2]; pages, int64 [T]; rows and columns of a page.
+    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages, which all have one size.
+    Returns first texels, int64 [T, 2]; pages, int64 [T]; rows and columns of a page.
 
     Raises:
         WlmError: All pages together are too small.

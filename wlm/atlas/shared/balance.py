@@ -29,11 +29,8 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class ViewShares:
-    """The tiles that views show.
-
-    Attributes:
-        share: float64 [V, T], the fraction of each view's pixels that shows each tile; 0 for tiles of smaller levels.
-        lost: float64 [V], the error of each view that the current tile weights assume.
+    """The tiles that views show: `share`, float64 [V, T], the fraction of each view's pixels that shows each tile, 0
+    for tiles of smaller levels; and `lost`, float64 [V], the error of each view that the current tile weights assume.
     """
 
     share: csr_array
@@ -59,13 +56,8 @@ def tile_shares(
     seed: int,
     device: str,
 ) -> ViewShares:
-    """Renders the views of `scene_weights` again and counts the pixels of each tile.
-
-    Args:
-        scene, varies, profile, seed, device: As for `scene_weights`.
-        tiles: The scene's tiles.
-        grids: Rows and columns of tiles of each sheet.
-    """
+    """Renders the views of `scene_weights` again and counts the pixels of each tile. `grids` are the rows and columns
+    of tiles of each sheet."""
     first = np.cumsum([0, *(rows * columns for rows, columns in grids)])
     row = np.full(first[-1], -1)
     of = np.flatnonzero(tiles.plane < len(scene.sheets))
@@ -98,14 +90,8 @@ def tile_shares(
 
 
 def balance(tried: list[Candidate], weight: np.ndarray, shown: ViewShares, bits: float) -> np.ndarray:
-    """Computes factors on the tiles' weights, float64 [T]; the sum of all weights is unchanged.
-
-    Args:
-        tried: The tiles with each number of components.
-        weight: float64 [T], the weights of the tiles in `tried`.
-        shown: `tile_shares`.
-        bits: Bits of all tiles.
-    """
+    """Computes factors on the tiles' weights, float64 [T]; the sum of all weights [T] is unchanged. `bits` are those of
+    all tiles."""
     error, cost, tiles = np.concatenate([each.error for each in tried]), costs(tried), np.arange(len(weight))
     visible = np.asarray(shown.share.sum(0)).ravel() > 0
     if not visible.any():

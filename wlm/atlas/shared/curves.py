@@ -17,14 +17,9 @@ import torch
 from wlm.atlas.colour import stored
 from wlm.atlas.model import (
     BLOCK_SIDE,
-    BLOCKS,
     COLOUR_BITS,
     FACTOR_BITS,
-    FIRST_BLOCK_CODE,
     MOST_COARSE,
-    SIDE_BITS,
-    TEXELS,
-    Profile,
     extent,
 )
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
@@ -43,7 +38,6 @@ _FACTOR_SHARE = 0.15  # largest fraction of the budget for the factors of all ca
 # Tiles from which mixtures are found, limit on the size of their moments, and texels per tile for the bounds.
 _SAMPLES, _MOMENTS, _SAMPLE_TEXELS = 8192, 1 << 24, 16
 _PAYS = 0.99  # more components must reduce the error below this fraction, or no more are tried
-_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16)
 _ROUGH, _MEDIUM = 3, 10  # rounds of conjugate gradients for a curve, and for one of blocks
 _AT_ONCE = 1024  # tiles
 
@@ -84,13 +78,7 @@ class SceneTiles:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A size and a number of components that a tile may have.
-
-    Attributes:
-        size: Size of the components that aren't coarse.
-        count: Number of components.
-        coarse: Number of coarse components, the last ones, which have one block each.
-    """
+    """A size and a number of components that a tile may have; the last `coarse` components have one block each."""
 
     size: Size
     count: int
@@ -112,8 +100,7 @@ class Candidate:
     """The errors of all tiles with one number of components.
 
     Attributes:
-        mixtures: The mixtures.
-        number: int [T], the mixture of each tile.
+        mixtures, number: The mixtures, and that of each tile, int [T].
         choices: The sizes of the components.
         error: float64 [choices, T], mean over the states.
         left: An estimate of the whole error if tiles may have up to this number of components.
@@ -131,16 +118,6 @@ class Candidate:
         return self.mixtures.factor.shape[2]
 
 
-def sizes_of(profile: Profile) -> list[Size]:
-    """Lists the sizes of a component."""
-    mixed = profile.colour == "mixed"
-    most = profile.tile + 1
-    sides = [side for side in _SIDES if side <= (min(most, FIRST_BLOCK_CODE) if mixed else most)]
-    whole = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE) if mixed else ()
-    sizes = [Size(nx, ny, TEXELS) for ny in sides for nx in sides]
-    return sizes + [Size(nx, ny, BLOCKS, True) for ny in whole for nx in whole]
-
-
 def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
     """Lists the choices for a number of components: all of one size, or of blocks with the last ones coarse."""
     few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
@@ -156,13 +133,8 @@ def candidates(
 ) -> list[Candidate]:
     """Computes the error of every tile with one component, two and so on, up to the number that pays.
 
-    Args:
-        tiles: T of them.
-        sizes: The sizes of a component.
-        bits: Bits of all tiles and factors.
-        seed: Seed of the samples and mixtures.
-        stages: Reports progress; its checkpoint keeps each number of components as one finished batch.
-        batch: Number of the first of these batches.
+    The checkpoint of `stages` keeps each number of components as one finished batch, from number `batch` on; `bits` are
+    those of all tiles and factors.
     """
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(states, _RANKS[-1])

@@ -22,7 +22,6 @@ from wlm.atlas.model import (
     TEXELS,
     AtlasModel,
     Profile,
-    SheetPlace,
     coarse_place,
     extent,
     pack_tiles,
@@ -43,15 +42,8 @@ _BRIGHT = 1024.0  # a component's largest texel after scaling: RGB9E5 has as man
 def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
     """Compresses all lightmaps of a scene into one lookup texture and one or two colour textures.
 
-    Args:
-        scene: The scene.
-        profile: `budget`, `colour`, `tile`, `views` and `mips`.
-        seed: Seed of the random views and mixtures.
-        stages: Reports and times the stages.
-
-    Returns:
-        The model; its report has the numbers of tiles, samples and components of each sheet, and the error for each
-        number of components that was tried.
+    The model's report has the numbers of tiles, samples and components of each sheet, and the error for each number of
+    components that was tried.
 
     Raises:
         WlmError: The budget is less than the smallest model takes.
@@ -69,10 +61,7 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
     with stages("solve"):
         textures, scale = _textures(tiles, tried, given)
     lut = np.ascontiguousarray(_lookup(tiles, layout, given)[..., : kept.numbers])
-    rows = [
-        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *grid, plane.smaller)
-        for plane, row, column, grid in zip(planes, layout.row, layout.column, layout.grid, strict=True)
-    ]
+    rows = layout.places
     sheets = len(scene.sheets)
     counts, samples, many = (
         np.bincount(tiles.plane % stride, each, stride)[:sheets]
@@ -117,12 +106,8 @@ def _of_texels(weight: np.ndarray) -> np.ndarray:
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Solves for the samples of all components and composes the colour textures.
-
-    Returns:
-        `texels` and, if there is a second texture, `blocks` and `block_texels` of the model; and the factor by which
-        each component was multiplied, float64 [C, 3].
-    """
+    """Solves for the samples of all components and composes the colour textures. Returns arrays of the model by name,
+    and the factor by which each component was multiplied, float64 [C, 3]."""
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)
@@ -163,9 +148,9 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
 
 def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
     """Composes T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
-    columns = np.array([each[1] for each in layout.grid])[tiles.plane]
-    row = tiles.index // columns + np.array(layout.row)[tiles.plane]
-    column = tiles.index % columns + np.array(layout.column)[tiles.plane]
+    places = np.array([(each.row, each.column, each.columns) for each in layout.places])
+    first, left, columns = places[tiles.plane].T
+    row, column = first + tiles.index // columns, left + tiles.index % columns
     table = np.zeros((*layout.shape, 4), np.uint16)
     table[row, column] = pack_tiles(
         given.first, given.size, given.component, given.count, given.page, given.second, given.coarse

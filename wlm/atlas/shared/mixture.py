@@ -31,11 +31,10 @@ class Mixtures:
     """All mixtures with the same number of components.
 
     Attributes:
-        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, not
-            below 0.
+        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, at least 0.
         offset: float32 [G, K, 3]: the states are `factor` times the components less this.
         kept: float32 [G, 3 M M], flattened projections onto the subspaces: their product with a tile's moments is the
-            energy that they keep; only the first components count where `find_mixtures` has `like`.
+            energy that they keep.
     """
 
     factor: torch.Tensor
@@ -59,12 +58,8 @@ class Mixtures:
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Sums the products of the states' light over the points of each tile, float32 [T, 3, M, M].
-
-    Args:
-        light: float32 [T, M, 3, P].
-        weight: float32 [T, P].
-    """
+    """Sums the products of the states' light [T, M, 3, P], weighted [T, P], over the points of each tile, float32 [T,
+    3, M, M]."""
     part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
     return part @ part.transpose(2, 3)
 
@@ -72,13 +67,13 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 def find_mixtures(
     moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
 ) -> Mixtures:
-    """Finds the mixtures of some tiles.
+    """Finds the mixtures of some tiles, at most `count`; fewer where some would have no tile.
 
     Args:
         moment: float [T, 3, M, M], `moments`.
         texels: float [T, N, M, 3], texels of the same tiles, not negative.
         rank: K, 1 to M.
-        count: Number of mixtures, at least 1; fewer where some would have no tile.
+        count: Largest number of mixtures, at least 1.
         seed: Seed of the tiles from which they start.
         like: Number of components by which tiles are assigned to mixtures; None: K.
     """
@@ -111,13 +106,10 @@ def find_mixtures(
 
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
-    """Finds the first mixture that keeps about the most energy, int64 [T].
+    """Finds the first mixture that keeps about the most energy, int64 [T], of kept energies [T, G] and tiles' energies
+    [T].
 
     Rounding must not assign a tile to a mixture whose offsets were not computed for it.
-
-    Args:
-        kept: [T, G], the energy that each mixture keeps.
-        energy: [T], the energy of each tile.
     """
     return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 

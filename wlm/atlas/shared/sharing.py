@@ -21,21 +21,22 @@ from wlm.atlas.model import (
     ENTRY,
     FACTOR_BITS,
     LUT_BITS,
+    MIP_OCTAVES,
     SHEET_BITS,
     SHORT_ENTRY,
     SOURCE_BITS,
-    TAIL_OCTAVES,
     TEXELS,
     Profile,
+    SheetPlace,
     tile_counts,
 )
 from wlm.atlas.resize import box
 from wlm.atlas.shared.allocation import NO_ROOM, WIDTHS, Allocated, allocated
 from wlm.atlas.shared.balance import ViewShares, balance, tile_shares
-from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs, sizes_of
+from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import patches, weighted
-from wlm.atlas.tiles.layout import allocate, place
+from wlm.atlas.tiles.layout import allocate, place, sizes_of
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
@@ -46,14 +47,9 @@ _HOPELESS = 1.25  # ratio of sampled separate to shared error above which the re
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A sheet or a mip level of a sheet, to be cut into tiles.
-
-    Attributes:
-        name: The sheet's name.
-        frames: float32 [M, H, W, 3], without gaps.
-        weight: float64 [2 H, 2 W], the weight of each quarter of a texel.
-        smaller: The number of the next smaller level; 0: there is none.
-    """
+    """A sheet or a mip level of a sheet, to be cut into tiles. `frames` are float32 [M, H, W, 3] without gaps, `weight`
+    float64 [2 H, 2 W] has the weights of quarters of texels, and `smaller` is the number of the next smaller level; 0:
+    there is none."""
 
     name: str
     frames: np.ndarray
@@ -64,13 +60,8 @@ class Plane:
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
     """Lists the sheets and then, with mips, their levels: a quarter of a sheet's sides, rounded up, and halves of that.
 
-    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them.
-
-    Args:
-        scene: The scene.
-        weights: `scene_weights`.
-        mips: Whether there are levels.
-        device: "cpu" or "cuda:N".
+    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them, from
+    `scene_weights`.
     """
     pairs = zip(scene.sheets, weights, strict=True)
     planes = [Plane(sheet.name, sheet.lightmaps, weight) for sheet, weight in pairs]
@@ -91,7 +82,7 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
     light = torch.from_numpy(plane.frames).permute(1, 2, 0, 3).flatten(2).double()
     sums = torch.cat([light * share, share], 2).to(device)
     weight = torch.from_numpy(plane.weight).double()[..., None].to(device)
-    levels, side = [], (-(-height >> TAIL_OCTAVES), -(-width >> TAIL_OCTAVES))
+    levels, side = [], (-(-height >> MIP_OCTAVES), -(-width >> MIP_OCTAVES))
     while True:
         sums, weight = box(sums, *side), box(weight, *(2 * each for each in side))
         values = sums.cpu().numpy()
@@ -106,18 +97,15 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The places of sheets and levels in T_c.
+    """The places of sheets and levels in T_c, and its rows and columns."""
 
-    Attributes:
-        grid: Rows and columns of tiles of each.
-        row, column: The first entry of each in T_c.
-        shape: Rows and columns of T_c.
-    """
-
-    grid: list[tuple[int, int]]
-    row: list[int]
-    column: list[int]
+    places: list[SheetPlace]
     shape: tuple[int, int]
+
+    @property
+    def grids(self) -> list[tuple[int, int]]:
+        """Rows and columns of tiles of each."""
+        return [(place.rows, place.columns) for place in self.places]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +113,7 @@ class Fitted:
     """The allocation of all tiles.
 
     Attributes:
-        planes: Sheets and levels; with separate tiles, of one state after the other.
-        layout: Their places in T_c.
-        tiles: Their tiles.
+        planes, layout, tiles: Sheets and levels, their places and tiles; separate tiles are listed state by state.
         tried: The tiles with each number of components, weighted by `balance`.
         given: Components, sizes and places of the tiles.
         numbers: Number of integers per entry of T_c.
@@ -181,7 +167,7 @@ def fitted(
     with stages("curves"):
         tried = candidates(tiles, sizes_of(profile), room, seed, stages, 0)
     with stages("balance"):
-        shown = tile_shares(scene, varies, tiles, layout.grid[:sheets], profile, seed, device)
+        shown = tile_shares(scene, varies, tiles, layout.grids[:sheets], profile, seed, device)
         weight = tiles.weight.double().sum(1).cpu().numpy()
         factor = balance(tried, weight, shown, room)
     with stages("allocate"):
@@ -302,7 +288,11 @@ def _laid_out(planes: list[Plane], tile: int) -> Layout:
         width = int((first[:, 0] + across[:, 0]).max())
         if best is None or width * height < best[0]:
             best = width * height, first, (height, width)
-    return Layout(grid, best[1][:, 1].tolist(), best[1][:, 0].tolist(), best[2])
+    places = [
+        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *counts, plane.smaller)
+        for plane, (column, row), counts in zip(planes, best[1].tolist(), grid, strict=True)
+    ]
+    return Layout(places, best[2])
 
 
 def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str) -> SceneTiles:

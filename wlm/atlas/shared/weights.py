@@ -36,16 +36,8 @@ def peaks_of(scene: LightmappedScene) -> np.ndarray:
 
 
 def variation(scene: LightmappedScene, peak: np.ndarray, device: str) -> list[np.ndarray]:
-    """Computes squared second differences of light, along both axes and within charts, mean of the channels.
-
-    Args:
-        scene: The scene.
-        peak: float64 [M], `peaks_of`, by which light is divided.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        For each sheet float32 [M, H, W].
-    """
+    """Computes squared second differences of light, along both axes and within charts, mean of the channels: for each
+    sheet float32 [M, H, W]. Light is divided by the peaks, float64 [M]."""
     result = []
     for sheet in scene.sheets:
         mask = torch.from_numpy(sheet.mask).to(device)
@@ -63,15 +55,8 @@ def _variation(light: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 
 def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
-    """Computes the divisor of each state's normalised light that makes all states vary equally.
-
-    Args:
-        varies: `variation`.
-        weights: For each sheet [H, W], the weights of its texels.
-
-    Returns:
-        float64 [M], of geometric mean 1.
-    """
+    """Computes the divisor of each state's normalised light that makes all states vary equally, float64 [M], of
+    geometric mean 1, from `variation` and the weights [H, W] of each sheet's texels."""
     sums = sum((each * weight).sum((1, 2), dtype=np.float64) for each, weight in zip(varies, weights, strict=True))
     total = sum(float(weight.sum()) for weight in weights)
     root = np.sqrt(sums / max(total, 1e-30) + FLOOR)
@@ -81,23 +66,11 @@ def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.nd
 def scene_weights(
     scene: LightmappedScene, varies: Sequence[np.ndarray], profile: Profile, seed: int, device: str
 ) -> list[np.ndarray]:
-    """Counts for each quarter of a texel the pixels of random views of the scene that show it.
+    """Counts for each quarter of a texel the pixels of random views of the scene that show it: for each sheet float64
+    [2 H, 2 W], 0 where there is no triangle.
 
     An object that is large in the views thus gets more weight than one that is small, far away or hidden. The weight of
     a view is the inverse of the variation of the light that it shows; it does not grow with its number of pixels.
-
-    Args:
-        scene: The scene.
-        varies: `variation`.
-        profile: `views`.
-        seed: Seed of the views.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        For each sheet float64 [2 H, 2 W], 0 where there is no triangle.
-
-    Raises:
-        WlmError: There is no such device.
     """
     grids = [FineGrid(sheet, device) for sheet in scene.sheets]
     visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
@@ -116,7 +89,7 @@ def _counts(
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
-    """Fractions of views that show each cell of each sheet, over how much light varies in the view."""
+    """Sums the fractions of views that show each cell of each sheet, divided by how much light varies in the view."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
@@ -134,13 +107,7 @@ def _counts(
 
 
 class Detail:
-    """The variation of a scene's light, on a device.
-
-    Args:
-        scene: The scene.
-        varies: `variation`.
-        device: "cpu" or "cuda:N".
-    """
+    """The variation of a scene's light, on a device."""
 
     def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
         masks = [sheet.mask for sheet in scene.sheets]

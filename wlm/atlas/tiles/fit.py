@@ -27,7 +27,6 @@ from wlm.atlas.model import (
     AtlasModel,
     Profile,
     SheetPlace,
-    tail_bits,
     tile_counts,
 )
 from wlm.atlas.stages import Stages
@@ -72,17 +71,8 @@ class Tiles:
 def fit_tiles(
     scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
 ) -> AtlasModel | None:
-    """Compresses a lightmap to tiles.
-
-    Args:
-        scene: A scene of one sheet and one state.
-        grid: The fine grid of its sheet.
-        profile: `budget`, `colour`, `tile`, `mips` and the settings of `weights`.
-        seed: Seed of the random views.
-        stages: Reports and times the stages.
-
-    Returns:
-        The model; None where not even the smallest tiles and their table fit the budget.
+    """Compresses a scene of one sheet and one state to tiles; None where not even the smallest tiles and their table
+    fit the budget.
 
     Raises:
         WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
@@ -93,8 +83,6 @@ def fit_tiles(
     height, width = sheet.mask.shape
     rows, columns = tile_counts(height, width, profile.tile)
     bits = profile.budget * height * width * SOURCE_BITS
-    if profile.mips:
-        bits -= tail_bits(height, width)
     room = bits - rows * columns * LUT_BITS
     sizes = sizes_of(profile)
     if room < len(tiles.index) * min(size.bits for size in sizes):
@@ -120,17 +108,8 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model from the solved samples of its tiles.
-
-    Args:
-        scene: The scene whose lightmap was cut.
-        profile: `colour` and `tile`.
-        samples: `solved`.
-        sizes: The sizes that a tile may have.
-        packed: The tiles' sizes and places.
-        index: int64 [T], `Tiles.index`.
-        device: "cpu" or "cuda:N", where blocks are encoded.
-    """
+    """Makes the model from the solved samples of its tiles, their sizes and places, and the tiles' numbers in the grid,
+    int64 [T]."""
     size = scene.sheets[0].mask.shape
     counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
@@ -160,17 +139,8 @@ def least_gain(sheet: Sheet) -> float:
 
 
 def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
-    """Cuts a lightmap into tiles.
-
-    Args:
-        image: float [H, W, 3], without gaps.
-        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
-        size: B, texels along a tile.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        The tiles in which some weight is above 0.
-    """
+    """Cuts a lightmap, float [H, W, 3] without gaps, into the tiles in which some weight, float64 [2 H, 2 W] of each
+    quarter of a texel, is above 0; at least one is."""
     index, share = weighted(torch.as_tensor(weight, device=device), size)
     columns = tile_counts(*image.shape[:2], size)[1]
     light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
@@ -179,15 +149,8 @@ def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device:
 
 
 def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Selects the tiles that have a weight.
-
-    Args:
-        weight: float64 [2 H, 2 W], of each quarter of a texel; at least one is above 0.
-        size: B, texels along a tile.
-
-    Returns:
-        `index` and `weight` of `Tiles`.
-    """
+    """Selects the tiles that have a weight, and returns `index` and `weight` of `Tiles`. The weights of quarters of
+    texels are float64 [2 H, 2 W], at least one above 0."""
     rows, columns = tile_counts(*(side // 2 for side in weight.shape), size)
     m = SUPERSAMPLING * size
     folded = _folded(_folded(weight, rows * m).T, columns * m).T
@@ -237,17 +200,10 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 
 
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
-    """Solves for the samples of least weighted squared error, at one size for all tiles.
+    """Solves for the samples of least weighted squared error, float [T, ny, nx, 3], at one size for all tiles, in at
+    most `rounds` rounds.
 
     Conjugate gradients solve the normal equations of each channel of a tile from the solution with equal weights.
-
-    Args:
-        tiles: T of them.
-        nx, ny: Samples along x and y.
-        rounds: Rounds of conjugate gradients, at most.
-
-    Returns:
-        float [T, ny, nx, 3].
     """
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
@@ -311,12 +267,8 @@ def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.T
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
-    """Computes the weighted squared error of each tile, averaged over the channels, float64 [T]; the sum is the MSE.
-
-    Args:
-        tiles: T of them.
-        samples: float [T, ny, nx, 3].
-    """
+    """Computes the weighted squared error of samples [T, ny, nx, 3], averaged over the channels, float64 [T]; the sum
+    is the MSE."""
     result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
     flat = samples.permute(0, 3, 1, 2).flatten(2)
     with on_stream(samples.device):
@@ -339,14 +291,8 @@ def curves(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
-    """Computes the error of every tile at every size, float64 [sizes, T].
-
-    Args:
-        tiles: T of them.
-        sizes: The sizes; errors are measured after the samples are stored in the size's format.
-        progress: Called with the sizes done.
-        checkpoint: Keeps the errors of the sizes done, as batch 0.
-    """
+    """Computes the error of every tile at every size, float64 [sizes, T], after the samples are stored in the size's
+    format. The checkpoint keeps the errors of the sizes done as batch 0."""
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
 
@@ -378,16 +324,10 @@ def curves(
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:
-    """Solves for the samples of every tile at its own size.
+    """Solves for the samples of every tile at its own size, int [T].
 
-    Args:
-        tiles: T of them.
-        sizes: The sizes.
-        chosen: int [T], the number of each tile's size.
-
-    Returns:
-        All tiles, in groups of one size: their numbers, int [n], and on the tiles' device samples, float32 [n, ny, nx,
-        3], not negative, and the weights of the samples' squared errors [n, ny, nx].
+    Returns all tiles in groups of one size: their numbers, int [n], and on the tiles' device samples, float32 [n, ny,
+    nx, 3], not negative, and the weights of the samples' squared errors [n, ny, nx].
     """
     result = []
     for number in np.unique(chosen).tolist():

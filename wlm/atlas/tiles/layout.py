@@ -15,8 +15,8 @@ from wlm.atlas.model import (
     BLOCK_SIDE,
     BLOCKS,
     COLOUR_BITS,
-    FIRST_BLOCK_CODE,
     MOST_SIZE,
+    NO_BLOCKS,
     SIDE_BITS,
     TEXELS,
     Profile,
@@ -29,19 +29,13 @@ from wlm.formats.exr import HALF_MAX
 _BISECTIONS, _CLOSE = 60, 1e-6
 _TILES_AT_ONCE = 1 << 16
 _WIDTHS = np.linspace(0.7, 1.5, 17)  # candidate widths of T_p over the square root of its number of samples
-# Sides in texels for "mixed": above 6 every second one is enough.
-_MIXED_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+_SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14)  # texels, beside the largest side: above 6 every second one is enough
 
 
 @dataclass(frozen=True)
 class Size:
-    """A size that a tile may have.
-
-    Attributes:
-        nx, ny: Samples along x and y.
-        format: Their format, a key of `COLOUR_BITS`.
-        second: Whether they are in the second texture of "mixed".
-    """
+    """A size that a tile may have: samples along x and y, their format, a key of `COLOUR_BITS`, and whether they are in
+    the second texture of "mixed"."""
 
     nx: int
     ny: int
@@ -61,13 +55,8 @@ class Size:
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of all tiles and their places.
-
-    Attributes:
-        chosen: int [T], numbers of sizes.
-        first: int64 [T, 2], x and y of each tile's first texel.
-        shapes: Rows and columns of T_p, and of the second texture of "mixed".
-    """
+    """The sizes of all tiles, int [T]; x and y of each tile's first texel, int64 [T, 2]; and rows and columns of T_p,
+    and of the second texture of "mixed"."""
 
     chosen: np.ndarray
     first: np.ndarray
@@ -76,32 +65,19 @@ class Layout:
 
 def sizes_of(profile: Profile) -> list[Size]:
     """Lists the sizes that a tile may have; tiles consist of whole blocks, so that no block is shared."""
-    most = profile.tile + 1
-
-    def of_blocks(format: str, second: bool) -> list[Size]:
-        sides = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE)
-        return [Size(nx, ny, format, second) for ny in sides for nx in sides]
-
-    if profile.colour in ("bc6h", "astc"):
-        return of_blocks(profile.colour, False)
-    if profile.colour != "mixed":
-        sides = range(1, most + 1)
-        return [Size(nx, ny, profile.colour) for ny in sides for nx in sides]
-    sides = [side for side in _MIXED_SIDES if side <= min(most, FIRST_BLOCK_CODE)]
-    return [Size(nx, ny, TEXELS) for ny in sides for nx in sides] + of_blocks(BLOCKS, True)
+    most, colour = profile.tile + 1, profile.colour
+    code = first_block_code(colour)
+    most_texels = min(most, code)
+    format, blocks = (TEXELS, BLOCKS) if colour == "mixed" else (colour, colour)
+    sides = sorted({*(side for side in _SIDES if side < most_texels), most_texels}) if code else []
+    whole = range(BLOCK_SIDE, min(most + BLOCK_SIDE - 1, 1 << SIDE_BITS) + 1, BLOCK_SIDE) if code < NO_BLOCKS else []
+    sizes = [Size(nx, ny, format) for ny in sides for nx in sides]
+    return sizes + [Size(nx, ny, blocks, bool(code)) for ny in whole for nx in whole]
 
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
-    """Allocates sizes whose rectangles fit in textures of a given number of bits, and places them.
-
-    Args:
-        error: float64 [sizes, T], `curves`, on any device.
-        sizes: The sizes.
-        room: Most bits of T_p.
-        least: Error that a bit must save to be allocated.
-
-    Returns:
-        The layout; None where not even the smallest sizes fit.
+    """Allocates sizes whose rectangles fit in textures of `room` bits, and places them; None where not even the
+    smallest sizes fit. `error` is float64 [sizes, T], on any device; `least` is the error that a bit must save.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -163,16 +139,15 @@ def composed(
     """Composes T_p and T_c.
 
     Args:
-        samples: Groups of tiles of one size: their rows in `layout`, int [n], and on the device float32 [n, ny, nx, 3]
-            and the weights of their squared errors [n, ny, nx].
+        samples: Groups of tiles of one size, `solved`.
         sizes: The sizes.
         layout: Sizes and places of the tiles.
-        index: int64 [T], the tiles' numbers in the grid.
-        counts: Rows and columns of the grid. Tiles that aren't in `index` show the first texel.
+        index: int64 [T], the tiles' numbers in the grid; other tiles show the first texel.
+        counts: Rows and columns of the grid.
         device: "cpu" or "cuda:N": copying a large texture through the host takes seconds.
 
     Returns:
-        For each texture, on the device, the texels, float32 [H, W, 3], and their weights [H, W]; and T_c.
+        For each texture the texels, float32 [H, W, 3], and their weights [H, W], on the device; and T_c.
     """
     textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
     for members, values, weight in samples:
@@ -182,7 +157,7 @@ def composed(
         texels[at], weights[at] = values, weight
     total = counts[0] * counts[1]
     mixed = any(size.second for size in sizes)
-    code = first_block_code("mixed" if mixed else sizes[0].format, layout.shapes[0])
+    code = first_block_code("mixed" if mixed else sizes[0].format)
     first, side, blocks = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
     if not code:
         side[:], blocks[:] = BLOCK_SIDE, True
@@ -201,17 +176,8 @@ def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarr
 
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
-    """Chooses the size of each tile for the least total error within a budget.
-
-    Args:
-        error: float64 [sizes, T].
-        cost: [sizes], bits of each size.
-        budget: Bits of all tiles.
-        least: Error that a bit must save to be allocated.
-
-    Returns:
-        int [T], numbers of sizes. All tiles have the cheapest size where even that is over the budget.
-    """
+    """Chooses the size of each tile, int [T], for the least total error, float64 [sizes, T], within a budget of bits;
+    each bit must save at least `least`. All tiles have the cheapest size where even that is over the budget."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
@@ -236,14 +202,8 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 
 @dataclass(frozen=True)
 class _Run:
-    """The places of the rectangles of one size: some share a shelf with another size, the rest have separate shelves.
-
-    Attributes:
-        beside: Number of rectangles beside others, from (x, y) on.
-        x, y: Place of the first of these.
-        each: Number of rectangles on each of the further shelves.
-        below: y of the first of those shelves.
-        widest: Right end of the rightmost rectangle.
+    """The places of the rectangles of one size: the first `beside`, from (x, y) on, share a shelf with another size;
+    the rest have separate shelves of `each` rectangles from y = `below` on. `widest` is the right end of all of them.
     """
 
     beside: int
@@ -285,15 +245,8 @@ class _Kinds:
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles on shelves of one width, the highest first; each shelf is as high as its first rectangle.
-
-    Args:
-        sizes: int [R, 2], width and height of each.
-        width: Width of the shelves, at least that of the widest rectangle.
-
-    Returns:
-        int64 [R, 2], x and y of each; and the height of all shelves.
-    """
+    """Packs rectangles, int [R, 2] widths and heights, on shelves of one width, the highest first; each shelf is as
+    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the height of all shelves."""
     first = np.zeros((len(sizes), 2), np.int64)
     if not len(sizes):
         return first, 0

@@ -4,7 +4,6 @@ Materials read the lightmaps at their own resolution: a kit has no mips. A kit o
 and one of shared tiles has `scene.*` with a component that sets the objects' rectangles and states.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
     entries = _write_pictures(bundle, folder, engine) if pictures else _write_textures(bundle, folder, engine)
     for name, content in bundle.files.items():
         (folder / name).write_bytes(content)
-    texts = (_SCENE if bundle.document["method"] == "shared" else _ONE)[engine](bundle, entries)
+    texts = _texts(bundle, engine, entries)
     write_texts(folder, texts)
     return {"shader": next(iter(texts)), "textures": entries}
 
@@ -61,7 +60,9 @@ def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]
     ending, entries = ".bytes" if engine == "unity" else None, {}
     for name, texture in bundle.textures.items():
         if texture.fmt not in DXGI_FORMATS:
-            raise WlmError(f"{bundle.name}: cannot export for {engine}: there is no DDS of ASTC; compress with bc6h")
+            raise WlmError(
+                f"{bundle.name}: cannot export for {engine}: there is no DDS of ASTC; compress with --colour bc6h"
+            )
         if texture.image is not None and (texture.width % BLOCK_SIDE or texture.height % BLOCK_SIDE):
             # Direct3D and browsers refuse blocks that don't fill their texture.
             whole = np.concatenate([texture.image, np.ones((*texture.image.shape[:2], 1), np.float32)], 2)
@@ -85,90 +86,36 @@ def _write_pictures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]
     return entries
 
 
-def _three(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    return {
-        "atlas.glsl": bundle.shader,
-        "atlas.js": filled("three_atlas.js", DDS=filled("three_dds.js")),
-        README_FILE: filled("three_atlas.md", NAME=bundle.name),
-    }
-
-
-def _godot(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    return {
-        "atlas.gdshader": filled("godot_atlas.gdshader", SHADER=godot_uniforms(bundle.shader)),
-        README_FILE: filled("godot_atlas.md", NAME=bundle.name),
-    }
-
-
-def _unity(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    return {
-        "WlmAtlas.hlsl": translate(bundle.shader, "hlsl"),
-        "WlmAtlas.shader": filled("unity_atlas.shader"),
-        "WlmAtlas.cs": filled("unity_atlas.cs", DDS=filled("unity_dds.cs")),
-        README_FILE: filled("unity_atlas.md", NAME=bundle.name),
-    }
-
-
-def _unreal(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    code, _ = custom_node(bundle.shader, "wlm_atlas", "UV")
-    place = asset_name(bundle.name)
-    return {
-        "wlm_atlas.py": filled("unreal_atlas.py.in", NAME=place, CODE=code, KIT=filled("unreal_kit.py.in")),
-        README_FILE: filled("unreal_atlas.md", NAME=bundle.name, PLACE=place),
-    }
-
-
-def _scene_three(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    return {
-        "scene.glsl": bundle.shader,
-        "scene.js": filled("three_scene.js", DDS=filled("three_dds.js")),
-        README_FILE: filled("three_scene.md", NAME=bundle.name),
-    }
-
-
-def _scene_godot(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    uv_set = bundle.document["uv_set"]
-    if uv_set > 1:
-        raise WlmError(
-            f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the light is at {uv_set}"
-        )
-    shader = godot_uniforms(bundle.shader)
-    return {
-        "scene.gdshader": filled("godot_scene.gdshader", SHADER=shader, UV=("UV", "UV2")[uv_set]),
-        "wlm_scene.gd": filled("godot_scene.gd"),
-        README_FILE: filled("godot_scene.md", NAME=bundle.name),
-    }
-
-
-def _scene_unity(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    return {
-        "WlmScene.hlsl": translate(bundle.shader, "hlsl"),
-        "WlmScene.shader": filled("unity_scene.shader", SET=str(bundle.document["uv_set"])),
-        "WlmScene.cs": filled("unity_scene.cs", DDS=filled("unity_dds.cs")),
-        README_FILE: filled("unity_scene.md", NAME=bundle.name),
-    }
-
-
-def _scene_unreal(bundle: Bundle, entries: dict[str, Any]) -> dict[str, str]:
-    arrays = {f"wlm_scene_{name}": (each.height, each.layers) for name, each in bundle.textures.items() if each.layers}
-    code, _ = custom_node(bundle.shader, "wlm_object", "UV, Place, int(Sheet + 0.5), State", arrays)
-    rows = [
-        f'    "wlm_scene_{name}": {{"file": "{entry["file"]}", "form": "{_form(name)}", '
-        f'"size": [{entry["width"]}, {entry["height"]}]}},\n'
-        for name, entry in entries.items()
-    ]
-    place = asset_name(bundle.name)
-    parts = {"CODE": code, "TEXTURES": "{\n" + "".join(rows) + "}", "KIT": filled("unreal_kit.py.in")}
-    return {
-        "wlm_scene.py": filled("unreal_scene.py.in", NAME=place, **parts),
-        README_FILE: filled("unreal_scene.md", NAME=bundle.name, PLACE=place),
-    }
-
-
-def _form(name: str) -> str:
-    return "halves" if name in ("colour", "blocks") else "floats"
-
-
-_Texts = dict[str, Callable[[Bundle, dict[str, Any]], dict[str, str]]]
-_ONE: _Texts = {"three": _three, "godot": _godot, "unity": _unity, "unreal": _unreal}
-_SCENE: _Texts = {"three": _scene_three, "godot": _scene_godot, "unity": _scene_unity, "unreal": _scene_unreal}
+def _texts(bundle: Bundle, engine: str, entries: dict[str, Any]) -> dict[str, str]:
+    """Makes the text files of a kit, the shader first."""
+    shared, uv_set, place = bundle.document["method"] == "shared", bundle.document["uv_set"], asset_name(bundle.name)
+    kind, title = ("scene", "WlmScene") if shared else ("atlas", "WlmAtlas")
+    if engine == "three":
+        texts = {f"{kind}.glsl": bundle.shader, f"{kind}.js": filled(f"three_{kind}.js", DDS=filled("three_dds.js"))}
+    elif engine == "unity":
+        texts = {
+            f"{title}.hlsl": translate(bundle.shader, "hlsl"),
+            f"{title}.shader": filled(f"unity_{kind}.shader", SET=str(uv_set)),
+            f"{title}.cs": filled(f"unity_{kind}.cs", DDS=filled("unity_dds.cs")),
+        }
+    elif engine == "godot":
+        if shared and uv_set > 1:
+            raise WlmError(
+                f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the light is at {uv_set}"
+            )
+        marks = {"SHADER": godot_uniforms(bundle.shader), "UV": "UV2" if uv_set else "UV"}
+        texts = {f"{kind}.gdshader": filled(f"godot_{kind}.gdshader", **marks)}
+        texts |= {"wlm_scene.gd": filled("godot_scene.gd")} if shared else {}
+    else:
+        arrays = {f"wlm_scene_{name}": (t.height, t.layers) for name, t in bundle.textures.items() if t.layers}
+        call = ("wlm_object", "UV, Place, int(Sheet + 0.5), State") if shared else ("wlm_atlas", "UV")
+        marks = {"CODE": custom_node(bundle.shader, *call, arrays)[0], "KIT": filled("unreal_kit.py.in")}
+        rows = [
+            f'    "wlm_scene_{name}": {{"file": "{entry["file"]}", '
+            f'"form": "{"halves" if name in ("colour", "blocks") else "floats"}", '
+            f'"size": [{entry["width"]}, {entry["height"]}]}},\n'
+            for name, entry in entries.items()
+        ]
+        marks["TEXTURES"] = "{\n" + "".join(rows) + "}"
+        texts = {f"wlm_{kind}.py": filled(f"unreal_{kind}.py.in", NAME=place, **marks)}
+    return texts | {README_FILE: filled(f"{engine}_{kind}.md", NAME=bundle.name, PLACE=place)}
