@@ -20,10 +20,6 @@ SMALL = Profile(name="small", method="gaussians", ratio=0.1, latent=3, hidden=16
 RANDOM = np.random.default_rng(7)
 
 
-def arrays(model):
-    return [getattr(model.content, key) for key in ("code", "bounds", "net")]
-
-
 def test_it_learns_and_says_how_well():
     probes = synthetic(300)
     reports = []
