@@ -1,4 +1,4 @@
-"""A whole simulation: smoke in moving air, obstacles, checkpoints, and the hard cases."""
+"""A whole simulation: smoke in moving air, obstacles, checkpoints, hard cases, and the documented examples."""
 
 import re
 from pathlib import Path
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from wlm import fluid
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES, axis_ends
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
@@ -363,3 +364,16 @@ def test_steps_can_be_captured(device: str):
         eager.step(12)
         np.testing.assert_array_equal(_numbers(eager), _numbers(graphed))
         assert graphed.steps == eager.steps == 12
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "fluid.md"
+
+
+@pytest.mark.parametrize("text", [fluid.__doc__, PAGE.read_text(encoding="utf-8").split("\n## ")[0]])
+def test_the_example_runs(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """In fewer steps."""
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
+    assert "smoke.step(100)" in code
+    exec(code.replace("smoke.step(100)", "smoke.step(2)"), {})
+    assert float(fluid.load_volume("smoke.npz").density.sum()) > 0.0

@@ -1,16 +1,34 @@
-"""The float64 path against the decoder and by hand."""
+"""The float64 path and tiles of frames, against the decoders and by hand."""
 
+import dataclasses
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from builders.synthetic import random_sheet
+from builders.checks import error_of
+from builders.small_sets import moving_light, static_light, tiny_profile
+from builders.synthetic import any_blocks, random_model, random_sheet
 
+import wlm
+from benchmarks.rivals.lightmap import encode_set
 from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.bc7 import pack_mode6
+from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.encodings.frames import choose_frames, needed_blocks, round_half
+from wlm.lightmap.encodings.maps import tile_bytes
+from wlm.lightmap.evaluation import count_kinds
 from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
+from wlm.lightmap.fit import compress, open_checkpoint
+from wlm.lightmap.profile import Profile
+from wlm.lightmap.runtime import FrameDecoder
+from wlm.lightmap.sheet import LIGHT
+from wlm.lightmap.tiles import TileKind, classify, split
+from wlm.metrics import evaluate_frame, summarise
 
 TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
 
@@ -77,3 +95,166 @@ def test_what_is_not_there():
     with pytest.raises(WlmError, match="finite"):
         colour_tile64(model, 0, math.nan)
     assert not decode_tile64(model, 3, 1.0).any() and bound64(model, 3, 1.0) == 0.0
+
+
+DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
+KINDS = (4, 3, 1, 4)
+FRAME_TIMES = (7.5, 10.0, 23.0)
+
+
+@pytest.mark.parametrize("interpolation", ["radiance", "network"])
+def test_decoders_agree_with_the_float64_path(interpolation, device):
+    """The blocks are of all modes."""
+    model = random_sheet(KINDS, interpolation=interpolation)
+    decoder, runtime = SheetDecoder(model, device), FrameDecoder(model, device)
+    assert runtime.numbers.tolist() == [0, 3]
+    for time in FRAME_TIMES:
+        light, (codes, bounds) = decoder.tiles([0, 1, 3], time), decoder.tiles_8bit([0, 1, 3], time)
+        for place, number in ((0, 0), (2, 3)):
+            expected = decode_tile64(model, number, time)
+            np.testing.assert_allclose(light[place], expected, rtol=0, atol=1e-5 * expected.max())
+            assert abs(bounds[place] - bound64(model, number, time)) < 1e-6
+            share = np.minimum(colour_tile64(model, number, time) / bounds[place], 1.0)
+            assert np.abs(codes[place, ..., :3] / 255.0 - share).max() < 0.502 / 255.0
+            assert (codes[place, ..., 3] == 255).all()
+        runtime.set_time(time)
+        runtime.decode()
+        assert np.abs(runtime.numpy().astype(int) - codes[[0, 2]]).max() <= (time != 7.5)
+        np.testing.assert_array_equal(runtime.bounds, bounds[[0, 2]])
+    with pytest.raises(WlmError, match="finite"):
+        runtime.set_time(float("nan"))
+    with pytest.raises(WlmError, match="expected at least one tile of frames, found none"):
+        FrameDecoder(random_sheet((3, 0)), device)
+
+
+def test_the_blocks_that_a_read_reaches():
+    mask = np.zeros((250, 260), bool)
+    mask[125, 130] = mask[249, 0] = True
+    # Rows and columns 123 to 127 and 128 to 132: both sides of the border.
+    assert np.argwhere(needed_blocks(mask, 1)).tolist() == [[30, 0], [30, 1], [31, 0], [31, 1]]
+    assert np.argwhere(needed_blocks(mask, 4)).tolist() == []
+    mask[126, 129] = True
+    assert np.argwhere(needed_blocks(mask, 0)).tolist() == [[31, 31]]
+    assert np.argwhere(needed_blocks(mask, 4)).tolist() == [[0, 0]]
+    # What is past the map's end is never read.
+    assert np.argwhere(needed_blocks(mask, 3)).tolist() == [[0, 31], [29, 0], [30, 0]]
+
+
+def test_half_floats_are_rounded_outwards():
+    values = np.random.default_rng(0).lognormal(0.0, 2.0, 1000).astype(np.float32)
+    low, high = round_half(values, -np.inf), round_half(values, np.inf)
+    assert (low <= values).all() and (high >= values).all() and (np.nextafter(low, high) == high).mean() > 0.99
+
+
+def _changed(tmp_path, **tensors) -> str:
+    random_model((4, 4), times=(0.0, 7.5)).save(tmp_path / "a.wlm")
+    artifact = read_artifact(tmp_path / "a.wlm")
+    parts = artifact.tensors | {
+        f"0.{name}": value(artifact.tensors[f"0.{name}"].copy()) for name, value in tensors.items()
+    }
+    write_artifact(tmp_path / "b.wlm", "lightmap", artifact.settings, parts, artifact.source)
+    return error_of(wlm.load, tmp_path / "b.wlm")
+
+
+def test_damage_is_one_line(tmp_path):
+    assert "part ranges: expected no least above its greatest" in _changed(tmp_path, ranges=lambda v: v[:, :, ::-1])
+    assert "part ranges: expected numbers of at least 0" in _changed(tmp_path, ranges=lambda v: v - np.float16(2.0))
+
+
+def test_what_a_file_must_not_contain(tmp_path):
+    model = random_model((4, 0))
+    sheet = model.sheets[LIGHT]
+    frames = sheet.frames.copy()
+    frames[0, 2, 3, 4, 0] = 0
+    sheet.frames = frames
+    assert "tile 0: expected BC7 blocks of modes 0 to 7, found a reserved mode" in error_of(model.save, tmp_path / "a")
+    model = random_model((4, 0))
+    sheet = model.sheets[LIGHT]
+    sheet.mask = np.zeros_like(sheet.mask)
+    sheet.mask[0, 0] = True
+    assert "expected black blocks where no read reaches" in error_of(model.save, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.fixture(scope="module")
+def two_hours():
+    """Baked light: noon and evening of the demo's city."""
+    day = wlm.lightmap.load(DEMO)
+    light = day.light
+    return from_arrays(light.frames[[12, 20]], light.times[[12, 20]], light.mask, 24.0, name="two")
+
+
+def test_two_states_are_as_good_as_bc7_in_fewer_bytes(two_hours, tmp_path):
+    model, light = compress(two_hours, "M"), two_hours.light
+    kinds = count_kinds(model.sheets[LIGHT])
+    assert sum(kinds.values()) == kinds["frames"] == 2
+    assert model.warnings == () and model.memory_bytes == 2 * 2 * (16384 + 12) + 2
+    model.save(tmp_path / "a.wlm")
+    found = wlm.lightmap.evaluate(wlm.load(tmp_path / "a.wlm"), two_hours, metrics=("psnr",))
+    rival, frames = encode_set(
+        "bc7",
+        light,
+        lambda i, decoded: evaluate_frame(light.frames[i], decoded, light.mask, 128, ("psnr",)),
+    )
+    assert found.psnr > summarise(frames).psnr and found.bytes < rival.disk_bytes
+
+
+@pytest.mark.parametrize(
+    ("lightmaps", "settings", "kind"),
+    [
+        (moving_light(hours=(6.0, 12.0)), {}, "frames"),
+        (moving_light(hours=(6.0, 12.0, 18.0)), {}, "dynamic"),
+        (moving_light(hours=(6.0, 12.0, 18.0)), {"uvt_resolution": 64}, "frames"),
+        (moving_light(hours=(6.0,)), {}, "frames"),
+        (static_light(hours=(6.0, 12.0)), {}, "static"),
+        (moving_light(hours=(6.0,)), {"frames": "never"}, "static"),
+        (static_light(hours=(6.0, 12.0)), {"frames": "always"}, "frames"),
+    ],
+    ids=["two", "three", "large maps", "one", "static", "never", "always"],
+)
+def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
+    profile, count = Profile.load("M").override(settings), len(lightmaps.times)
+    kinds = classify(split(lightmaps.light, profile.gamma), profile.gamma)
+    chosen = choose_frames(kinds, [0], lightmaps.light.mask, count, profile)
+    assert ("frames" if chosen[0] else TileKind(kinds[0]).name.lower()) == kind
+    assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile, kinds[0] == TileKind.DYNAMIC))
+
+
+def test_blocks_that_nothing_needs_count_for_neither():
+    profile, count = Profile.load("M"), 12
+    for width, chosen in ((6, True), (12, False)):
+        mask = np.zeros((128, 128), bool)
+        mask[:, :width] = True
+        needed = -(-(width + 2) // 4) / 32
+        assert (count * (needed * 16384 + 12) < tile_bytes(profile, True) - (1 - needed) * 16384) == chosen
+        assert choose_frames(np.array([TileKind.DYNAMIC]), [0], mask, count, profile)[0] == chosen
+        assert not choose_frames(np.array([TileKind.CONSTANT]), [0], mask, count, profile)[0]
+
+
+def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+    lightmaps = moving_light(hours=(6.0,))
+    model = compress(lightmaps, tiny_profile(frames="auto"))
+    assert count_kinds(model.sheets[LIGHT])["static"] == 1
+    assert len(model.warnings) == 1 and "1 tile would be" in model.warnings[0]
+    assert "pip install 'wlm[frames]'" in model.warnings[0] and "\n" not in model.warnings[0]
+    with pytest.raises(WlmError, match=r"^frames: ispc_texcomp is missing; needs the extra"):
+        compress(lightmaps, "frames")
+    # A fit goes on as it began.
+    checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, tiny_profile(frames="auto"), every=0.0)
+    compress(lightmaps, tiny_profile(frames="auto"), checkpoint=checkpoint)
+    monkeypatch.undo()
+    line = error_of(open_checkpoint, tmp_path / "a.wlm", lightmaps, tiny_profile(frames="auto"), resume=True)
+    assert "profile" in line
+    random_model((4, 0)).decoder().frame(3.0)  # reading needs no encoder
+
+
+def test_any_block_may_lie_beside_any(device):
+    """Texels of a map of blocks whose neighbours are of other modes are where they belong."""
+    model = random_sheet((4,), columns=1, times=(0.0,), period=None)
+    frames = any_blocks(1, 1, 32, 32, seed=9)
+    light = SheetDecoder(dataclasses.replace(model, frames=frames), device).tiles([0], 0.0)[0]
+    for y, x in ((0, 0), (3, 77), (101, 126)):
+        one = np.broadcast_to(frames[:, :, y // 4, x // 4][:, :, None, None], frames.shape)
+        alone = SheetDecoder(dataclasses.replace(model, frames=np.ascontiguousarray(one)), device).tiles([0], 0.0)[0]
+        assert np.array_equal(alone[y % 4, x % 4], light[y, x])
