@@ -4,6 +4,7 @@ import sys
 from unittest.mock import MagicMock
 
 import numpy as np
+import pytest
 from builders.shader_runs import run_hlsl
 from PIL import Image
 
@@ -118,3 +119,19 @@ def node_gives(code, inputs, size, place, bound, folder, numbers=None, channels=
     called = f"wlm_custom({place}, pixel)"
     whole = called if channels == 4 else f"float4({called}, 1.0)"
     return run_hlsl(text, whole, size, bound, folder)[..., :channels]
+
+
+def assert_csharp_parses(path) -> None:
+    """Checks the syntax of a C# file; skips where the parser is not installed."""
+    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
+    from tree_sitter import Language, Parser
+
+    assert not Parser(Language(sharp.language())).parse(path.read_bytes()).root_node.has_error, path
+
+
+def assert_gdscript_parses(path) -> None:
+    """Checks the syntax of a script of Godot; skips where the parser is not installed."""
+    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
+    from gdtoolkit.parser import parser
+
+    parser.parse(path.read_text())

@@ -153,11 +153,6 @@ def test_constant_is_one_half_float_step_and_no_more(value):
     assert _kind(linear) is not TileKind.CONSTANT
 
 
-def test_constant_may_change_over_time_and_differ_between_channels():
-    linear = np.array([[0.0, 1.0, 7.0], [3.0, 0.1, 0.0], [60_000.0, 0.0, 1e-5]])[:, None, None]
-    assert _kind(_half(linear)) is TileKind.CONSTANT
-
-
 def test_only_valid_texels_count():
     linear = np.full((2, TILE, TILE, 3), 0.5, np.float32)
     mask = np.ones((TILE, TILE), bool)
@@ -171,13 +166,27 @@ def _pattern() -> np.ndarray:
     return np.random.default_rng(4).uniform(0.25, 1.0, (1, TILE, TILE, 3))
 
 
-def test_product_of_a_colour_a_time_and_a_pattern_is_static():
-    strength = np.array([[1.0, 0.5, 0.25], [0.02, 8.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])[:, None, None]
-    assert _kind(_pattern() * strength) is TileKind.STATIC
+PATTERN = _pattern()
+CHANNELS = np.array([[0.0, 1.0, 7.0], [3.0, 0.1, 0.0], [60_000.0, 0.0, 1e-5]])[:, None, None]
+PRODUCT = PATTERN * np.array([[1.0, 0.5, 0.25], [0.02, 8.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])[:, None, None]
+LAMP = PATTERN + 0.5 * (np.indices((TILE, TILE)).max(0) < 20)[..., None]
 
 
-def test_one_time_needs_no_more_than_static():
-    assert _kind(np.random.default_rng(5).random((1, TILE, TILE, 3)), budget=np.inf) is TileKind.STATIC
+@pytest.mark.parametrize(
+    ("linear", "budget", "kind"),
+    [
+        (_half(CHANNELS), 60.0, TileKind.CONSTANT),
+        (PRODUCT, 60.0, TileKind.STATIC),
+        (np.random.default_rng(5).random((1, TILE, TILE, 3)), np.inf, TileKind.STATIC),
+        # Three or four steps of half floats, whose PSNR measures the rounding.
+        (np.concatenate([PATTERN, _half(PATTERN * 2e-7)]), 60.0, TileKind.STATIC),
+        (np.concatenate([PATTERN, LAMP, PATTERN]), 60.0, TileKind.DYNAMIC),
+        (np.concatenate([PATTERN, np.full((1, TILE, TILE, 3), 0.5)]), 1.0, TileKind.DYNAMIC),
+    ],
+    ids=["channels", "product", "one time", "dark time", "lamp", "grey time"],
+)
+def test_kinds_of_tiles(linear, budget, kind):
+    assert _kind(linear, budget=budget) is kind
 
 
 def test_budget_is_the_psnr_at_the_worst_time():
@@ -189,23 +198,6 @@ def test_budget_is_the_psnr_at_the_worst_time():
     linear[7] += noise
     assert _kind(linear, budget=59.0) is TileKind.STATIC
     assert _kind(linear, budget=61.0) is TileKind.DYNAMIC
-
-
-def test_lamp_that_lights_one_corner_is_dynamic():
-    linear = np.repeat(_pattern(), 3, axis=0)
-    linear[1, :20, :20] += 0.5
-    assert _kind(linear) is TileKind.DYNAMIC
-
-
-def test_dark_time_within_a_half_float_step_does_not_make_a_tile_dynamic():
-    dim = _half(_pattern() * 2e-7)  # three or four steps of half float: its PSNR measures the rounding
-    linear = np.concatenate([_pattern(), dim])
-    assert _kind(linear) is TileKind.STATIC
-
-
-def test_grey_time_of_no_range_but_another_light_is_dynamic():
-    linear = np.concatenate([_pattern(), np.full((1, TILE, TILE, 3), 0.5)])
-    assert _kind(linear, budget=1.0) is TileKind.DYNAMIC
 
 
 def _mask(seed: int = 0, shape: tuple[int, int] = (40, 50), share: float = 0.05) -> np.ndarray:

@@ -13,7 +13,7 @@ from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, MIXED, random_model
 from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
-from builders.engine_scripts import Script, node_gives, pixels_of
+from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.layered_sets import random_layers
 from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
@@ -187,10 +187,7 @@ def test_godots_passes_compile(kinds, tmp_path):
     names = json.loads(re.search(r"NAMES: Array\[String\] = (.*)", script)[1])
     bound = re.findall(r"^#define WLM_LIGHTMAP_(\w+)_BINDING (\d+)$", text, re.MULTILINE)
     assert [name.lower() for name, _ in bound] == names and [int(i) for _, i in bound] == list(range(len(names)))
-    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
-    from gdtoolkit.parser import parser
-
-    parser.parse(script)
+    assert_gdscript_parses(tmp_path / "out" / "wlm_lightmap.gd")
 
 
 def as_glsl(text):
@@ -311,14 +308,11 @@ def test_unitys_surface_compiles(kind, tmp_path):
 
 
 def test_unitys_components_parse(tmp_path):
-    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
-    from tree_sitter import Language, Parser
 
     export(random_lightmap(), tmp_path / "lightmap", "unity")
     export(atlas_model("tiles"), tmp_path / "atlas", "unity")
-    for path in (tmp_path / "lightmap" / "WlmLightmap.cs", tmp_path / "atlas" / "WlmAtlas.cs"):
-        tree = Parser(Language(sharp.language())).parse(path.read_bytes())
-        assert not tree.root_node.has_error, path
+    assert_csharp_parses(tmp_path / "lightmap" / "WlmLightmap.cs")
+    assert_csharp_parses(tmp_path / "atlas" / "WlmAtlas.cs")
 
 
 _SCRIPT = """

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from builders.checks import error_of
-from builders.engine_scripts import Script, node_gives, pixels_of
+from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
 from test_folders import TEXTS, UNITY, as_glsl, compiled
@@ -163,10 +163,7 @@ def test_godots_shader_reads_each_objects_part(each_form, tmp_path):
         own = {"wlm_place": tuple(place), "wlm_sheet": sheet, "wlm_state": 0.5, "colour": (1.0, 1.0, 1.0, 1.0)}
         picture[y : y + height, x : x + width] = run_glsl(text, main, (height, width), bound, uniforms=own)[..., :3]
     check(picture, model, 0.5)
-    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
-    from gdtoolkit.parser import parser
-
-    parser.parse((tmp_path / "wlm_scene.gd").read_text())
+    assert_gdscript_parses(tmp_path / "wlm_scene.gd")
 
 
 def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
@@ -179,8 +176,4 @@ def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
     for stage in ("frag", "vert"):
         own = UNITY + text.replace('#include "UnityCG.cginc"', "")
         compiled(own, tmp_path, "-D", "-S", stage, "-e", stage, "--auto-map-bindings")
-    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
-    from tree_sitter import Language, Parser
-
-    tree = Parser(Language(sharp.language())).parse((tmp_path / "WlmScene.cs").read_bytes())
-    assert not tree.root_node.has_error
+    assert_csharp_parses(tmp_path / "WlmScene.cs")

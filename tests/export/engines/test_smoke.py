@@ -10,7 +10,7 @@ import subprocess
 import numpy as np
 import pytest
 from builders.checks import error_of
-from builders.engine_scripts import Script, node_gives, pixels_of
+from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.shader_runs import run_glsl, run_hlsl
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
 from PIL import Image
@@ -155,10 +155,7 @@ def test_godots_script_and_imports_parse(frames, tmp_path):
         assert f"mipmaps/generate={mips}\n" in settings and "process/fix_alpha_border=false" in settings
         shader = (tmp_path / "smoke.gdshader").read_text()
         assert ("filter_linear_mipmap" in shader) == (padding == 2)
-    pytest.importorskip("gdtoolkit", reason="gdtoolkit is not installed (pip, extra test)")
-    from gdtoolkit.parser import parser
-
-    parser.parse((tmp_path / "wlm_smoke.gd").read_text())
+    assert_gdscript_parses(tmp_path / "wlm_smoke.gd")
 
 
 UNITY = """
@@ -219,12 +216,8 @@ def test_unitys_stages_compile(frames, tmp_path):
 
 
 def test_unitys_component_parses(frames, tmp_path):
-    sharp = pytest.importorskip("tree_sitter_c_sharp", reason="tree-sitter-c-sharp is not installed (pip, extra test)")
-    from tree_sitter import Language, Parser
-
     export_smoke(random_book(frames), tmp_path, "unity")
-    tree = Parser(Language(sharp.language())).parse((tmp_path / "WlmSmoke.cs").read_bytes())
-    assert not tree.root_node.has_error
+    assert_csharp_parses(tmp_path / "WlmSmoke.cs")
 
 
 @pytest.mark.parametrize("moving", [False, True])
