@@ -238,10 +238,8 @@ def test_wrong_files(tmp_path: Path):
         ({"extinction": 0.0}, "extinction: expected a number above 0"),
         ({"emission": -1.0}, "emission: expected"),
         ({"device": "cuda:99"}, "cuda:99"),
-        ({"voxel": -1.0}, "voxel: expected a length above 0"),
         ({"voxel": 1e-60}, "voxel: expected a length above 0 that float32 holds"),
         ({"extinction": 1e308}, "extinction: expected a number above 0 that float32 holds"),
-        ({"extinction": float("nan")}, "extinction: expected"),
         ({"emission": 1e39}, "emission: expected a number of at least 0 that float32 holds"),
         ({"origin": (0.0, 0.0, 1e39)}, "origin: expected three numbers that float32 holds"),
     ):

@@ -227,7 +227,6 @@ def test_the_shader_compiles(settings, exact, tmp_path):
     model = random_sheet(**settings)
     names = [f"#define WLM_LIGHTMAP_{name.upper()}_BINDING {i}\n" for i, name in enumerate(texture_names(model))]
     for version, options, layout in (
-        ("330\n", [], ""),
         ("300 es\n" + "".join(HEADS["glsl-es"].splitlines(True)[1:]), [], ""),
         ("450\n" + "".join(names), ["-V", "-o", "shader.spv"], "layout(location = 0) "),
     ):

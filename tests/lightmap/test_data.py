@@ -302,16 +302,12 @@ def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
     [
         ({"width": None}, "width is missing"),
         ({"height": "5"}, 'height: expected a whole number of texels above 0, got "5"'),
-        ({"height": 5.0}, "height: expected a whole number"),
-        ({"width": True}, "width: expected a whole number"),
         ({"width": 0}, "width: expected a whole number"),
         ({"name": 3}, "name: expected a name, got 3"),
         ({"period_hours": "day"}, 'period_hours: expected a number above 0, got "day"'),
         ({"period_hours": 0}, "period_hours: expected a number above 0, got 0"),
-        ({"period_hours": True}, "period_hours: expected a number above 0, got true"),
         ({"mask": 1}, "mask: expected the name of a PNG"),
         ({"lightmaps": None}, "lightmaps is missing"),
-        ({"lightmaps": []}, "lightmaps: expected a list of lightmaps, got an empty list"),
         ({"lightmaps": {}}, "lightmaps: expected a list of lightmaps, got an object"),
         ({"lightmaps": ["a.exr"]}, 'lightmaps[0]: expected an object (time_hours, file), got "a.exr"'),
         ({"lightmaps": [{"time_hours": 0}]}, "lightmaps[0].file is missing"),
@@ -319,7 +315,6 @@ def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
         ({"lightmaps": [{"file": "a.exr"}]}, "lightmaps[0].time_hours is missing"),
         ({"lightmaps": [{"time_hours": "6", "file": "a.exr"}]}, "lightmaps[0].time_hours: expected a finite"),
         ({"lightmaps": [{"time_hours": float("nan"), "file": "a.exr"}]}, "lightmaps[0].time_hours: expected"),
-        ({"lightmaps": [{"time_hours": 10**400, "file": "a.exr"}]}, "lightmaps[0].time_hours: expected"),
     ],
 )
 def test_malformed_set_names_the_field(tmp_path, changes, expected):

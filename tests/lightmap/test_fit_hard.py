@@ -176,25 +176,13 @@ def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
     assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
 
 
-def test_light_up_to_60000(tmp_path):
-    lightmaps = moving_light(gain=60_000 / 1.2)
-    assert lightmaps.light.frames.max() > 50_000
-    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=60))
-    out = decoded(decoder)
-    assert out.max() > 10_000
-    np.testing.assert_allclose(out.mean((1, 2)), lightmaps.light.frames.mean((1, 2)), rtol=0.3)
-    # The scale is the same path for any brightness: the fit is as good as that of the dim set.
-    dim = evaluate(compress(moving_light(), tiny_profile(steps=60)), moving_light(), metrics=("psnr",))
-    bright = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps, metrics=("psnr",))
-    assert bright.psnr == pytest.approx(dim.psnr, abs=2.0)
-
-
 def test_dark_and_bright_tiles_side_by_side(tmp_path):
     frames = moving_light(128, 256).light.frames.copy()
     frames[:, :, :128] *= 1e-4
-    frames[:, :, 128:] *= 2e4
+    frames[:, :, 128:] *= 5e4
     lightmaps = from_arrays(frames, HOURS, period=24.0)
     out = decoded(through_file(tmp_path, lightmaps, tiny_profile(steps=60)))
+    assert frames.max() > 50_000 and out.max() > 10_000
     for half in (slice(0, 128), slice(128, 256)):
         np.testing.assert_allclose(out[:, :, half].mean((1, 2)), frames[:, :, half].mean((1, 2)), rtol=0.3)
 

@@ -189,12 +189,6 @@ class Files:
         (w1, b1), (w2, b2), (w3, b3) = self.layers
         return self.info["gain"] * (sigmoid(sigmoid(h @ w1 + b1) @ w2 + b2) @ w3 + b3)
 
-    def reach(self):
-        """[K, 3], half the box round what a Gaussian reaches."""
-        if self.info["support"] == "sphere":
-            return np.repeat(self.info["cut"] * self.scale.max(1, keepdims=True), 3, 1)
-        return self.info["cut"] * np.sqrt(((self.rotation * self.scale[:, None]) ** 2).sum(2))
-
 
 def places(count=200, seed=1):
     """Positions in the box and a little beyond."""
@@ -216,20 +210,6 @@ def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
     assert values.shape == (min(model.content.count, 64) + 1, model.outputs)
     assert (position[-1] > ORIGIN + EXTENT * SIZE).all()
     np.testing.assert_allclose(files.values(position), values, rtol=0, atol=2e-5 * np.abs(values).max())
-
-
-def test_the_lists_leave_nothing_out(tmp_path):
-    for settings in ({}, {"support": "sphere"}):
-        export(random_model(count=60, **settings), tmp_path)
-        files = Files(tmp_path)
-        x = files.place(places(400))
-        side = max(files.info["size"]) / 8
-        reach, listed = files.reach(), np.zeros((len(x), 60), bool)
-        for i, cell in enumerate(np.floor(x / side)):
-            low, high = cell * side - 1e-6, (cell + 1) * side + 1e-6
-            listed[i] = ((files.centre + reach >= low) & (files.centre - reach <= high)).all(1)
-        assert not files.weights(x)[~listed].any()
-        assert listed.mean() < 0.9
 
 
 def test_what_is_written(tmp_path):

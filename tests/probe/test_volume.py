@@ -340,7 +340,6 @@ def test_a_wrong_viewpoint_changes_nothing(viewpoint: object):
     ("settings", "word"),
     [
         ({"block": 0.0}, "block"),
-        ({"block": np.nan}, "block"),
         ({"ratios": ()}, "ratios"),
         ({"ratios": (1, 3)}, "ratios"),
         ({"ratios": (1, 2, 2)}, "ratios"),

@@ -84,7 +84,7 @@ def test_inspect_names_a_scenes_files(made, tmp_path):
 
 
 def test_scenes_that_cannot_be_exported(made, tmp_path):
-    assert "engine: expected one of three" in error_of(export, made, tmp_path / "a", "cry")
+
     other = scene_folder(tmp_path / "other", 2)
     line = error_of(export, other, tmp_path / "deep" / "a", "godot")
     assert line.startswith(f"{other.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1")
