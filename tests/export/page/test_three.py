@@ -1,4 +1,4 @@
-"""The grid for three.js, loaded and drawn by three.js itself: its KTX2 loader, its shader's spherical harmonics.
+"""Kits for three.js, loaded and drawn by three.js itself: probe grids, lightmaps, atlases, scenes and smoke.
 
 three.js is no part of this package: WLM_THREE names the folder of an unpacked `three` from npm, 0.187 or later.
 """
@@ -7,10 +7,18 @@ import json
 
 import numpy as np
 import pytest
+from builders.atlas_meshes import charts
+from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import random_model as random_atlas
 from builders.probe_models import whole_model as random_model
+from builders.scene_folders import expected_picture, scene_folder
+from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
+from builders.synthetic import random_model as random_lightmap
 
+from wlm.atlas.exact import decode64
 from wlm.export import export
 from wlm.probe.sphere import irradiance
+from wlm.smoke.bundle import bundle
 
 _SIZE = 64
 _PAGE = """<!doctype html>
@@ -96,3 +104,262 @@ def test_three_shows_what_decode_gives(site, browser):
             assert want.min() > 0.0 and np.ptp(want) > 0.01 * want.max()
             np.testing.assert_allclose(pixels[..., :3], want, atol=2e-3 * want.max())
     page.close()
+
+
+_KIT_SIZE = 96
+_KIT_PAGE = """<!doctype html>
+<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
+<script type="module">
+import * as THREE from 'three';
+const renderer = new THREE.WebGLRenderer(), size = SIZE;
+const floats = (target) => {
+  const pixels = new Float32Array(4 * target.width * target.height);
+  renderer.readRenderTargetPixels(target, 0, 0, target.width, target.height, pixels);
+  return Array.from(pixels);
+};
+// A white plane whose second UVs fill the picture, v down, under the light alone.
+window.plane = (apply, name) => {
+  const geometry = new THREE.PlaneGeometry(2, 2), uv = geometry.attributes.uv.clone();
+  for (let i = 0; i < uv.count; ++i) uv.setY(i, 1 - uv.getY(i));
+  geometry.setAttribute('uv1', uv);
+  const material = new THREE[`Mesh${name}Material`]({color: 0xffffff});
+  apply(material, 1);
+  const mesh = new THREE.Mesh(geometry, material);
+  const target = new THREE.WebGLRenderTarget(size, size, {type: THREE.FloatType});
+  const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, -1, 1), scene = new THREE.Scene();
+  scene.add(mesh);
+  renderer.setRenderTarget(target);
+  renderer.render(scene, camera);
+  const error = renderer.getContext().getError();
+  renderer.setRenderTarget(null);
+  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
+  return floats(target);
+};
+const {load} = await import('./load.js');
+window.light = await load(renderer, THREE);
+window.ready = true;
+</script>
+"""
+_LIGHTMAP = """import { loadLightmap } from './lightmap.js';
+export const load = (renderer, THREE) => loadLightmap(new URL('bundle.json', import.meta.url), renderer, THREE);
+"""
+_ATLAS = """import { loadAtlas } from './atlas.js';
+export const load = (renderer, THREE) => loadAtlas(new URL('bundle.json', import.meta.url), THREE);
+"""
+
+
+def opened(browser, folder, serve, load):
+    (folder / "load.js").write_text(load)
+    (folder / "index.html").write_text(_KIT_PAGE.replace("SIZE", str(_KIT_SIZE)))
+    page, errors = browser.new_page(), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(f"{serve(folder)}/index.html")
+    page.wait_for_function("window.ready", timeout=20000) if not errors else None
+    assert not errors
+    return page, errors
+
+
+def drawn(page, name):
+    """The plane, row 0 at v = 0."""
+    values = page.evaluate(f"plane(light.apply, '{name}')")
+    return np.array(values).reshape(_KIT_SIZE, _KIT_SIZE, 4)[::-1, :, :3]
+
+
+def filtered(frame):
+    """A frame at the picture's pixels, as a linear filter reads it."""
+    height, width = frame.shape[:2]
+    out = frame.astype(np.float64)
+    for axis, size in ((0, height), (1, width)):
+        at = np.clip((np.arange(_KIT_SIZE) + 0.5) / _KIT_SIZE * size - 0.5, 0, size - 1)
+        low = np.floor(at).astype(int)
+        share = (at - low).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+        out = (1 - share) * out.take(low, axis) + share * out.take(np.minimum(low + 1, size - 1), axis)
+    return out
+
+
+@pytest.mark.parametrize(("kinds", "interpolation"), [((4, 3, 2, 1), "radiance"), ((4, 3, 2, 1), "network")])
+def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, browser, serve):
+    model = random_lightmap(kinds, interpolation=interpolation)
+    export(model, tmp_path, "three")
+    page, errors = opened(browser, tmp_path, serve, _LIGHTMAP)
+    decoder = model.decoder()
+    for time, name in ((0.0, "Basic"), (7.5, "Lambert"), (9.1, "Phong"), (21.7, "Basic")):
+        page.evaluate(f"light.setTime({time})")
+        expected = filtered(decoder.frame(time))
+        # Maps of half floats, between which SwiftShader's filter mixes in floats.
+        np.testing.assert_allclose(drawn(page, name), expected, rtol=0, atol=expected.max() / 255)
+    assert not errors
+    page.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "colour"), [*((kind, "rgb9e5") for kind in KINDS), ("plain", "bc6h"), (MIXED, "mixed")]
+)
+def test_three_shows_an_atlas(kind, colour, tmp_path, browser, serve):
+    model = random_atlas(charts(), kind, colour)
+    export(model, tmp_path / "three_js", "three")
+    page, errors = opened(browser, tmp_path / "three_js", serve, _ATLAS)
+    v, u = np.mgrid[:_KIT_SIZE, :_KIT_SIZE] / _KIT_SIZE + 0.5 / _KIT_SIZE
+    uv = np.stack([u, v], -1).reshape(-1, 2).astype(np.float32)
+    expected = decode64(model, uv).reshape(_KIT_SIZE, _KIT_SIZE, 3)
+    inside = np.ones((_KIT_SIZE, _KIT_SIZE), bool)
+    if model.method == "tiles":
+        # A point on a border of tiles may be read from either.
+        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
+        inside = (np.abs(place - np.rint(place)).min(1) > 1e-3).reshape(_KIT_SIZE, _KIT_SIZE)
+    # As of the shader alone: a filter's place between two texels has 8 bits, in a table too.
+    allowed = 3.0 / 512 * 2 * (1 + 22 * (model.method == "cascade"))
+    for name in ("Basic", "Lambert", "Phong"):
+        np.testing.assert_allclose(drawn(page, name)[inside], expected[inside], rtol=0, atol=allowed)
+    assert not errors
+    page.close()
+
+
+_SCENE_PAGE = """<!doctype html>
+<script type="importmap">{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
+</script>
+<script type="module">
+import * as THREE from 'three';
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { loadScene } from './scene.js';
+const renderer = new THREE.WebGLRenderer(), size = SIZE;
+const light = await loadScene(new URL('bundle.json', import.meta.url), THREE);
+window.draw = async (name, state) => {
+  const { scene } = await new GLTFLoader().loadAsync('mesh.glb');
+  const shared = new THREE[`Mesh${name}Material`]({color: 0xffffff});
+  scene.traverse((each) => { if (each.isMesh) each.material = shared; });
+  // A node below one that has light, and its own has none.
+  const below = new THREE.Mesh(new THREE.BufferGeometry(), shared);
+  below.userData.name = 'below';
+  scene.getObjectByName('left').add(below);
+  light.apply(scene);
+  if (below.material !== shared) throw new Error('light of another node');
+  light.setState(state);
+  const target = new THREE.WebGLRenderTarget(size, size, {type: THREE.FloatType});
+  const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, -1, 1), root = new THREE.Scene();
+  root.add(scene);
+  renderer.setRenderTarget(target);
+  renderer.render(root, camera);
+  const pixels = new Float32Array(4 * size * size);
+  renderer.readRenderTargetPixels(target, 0, 0, size, size, pixels);
+  const error = renderer.getContext().getError();
+  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
+  return Array.from(pixels);
+};
+window.ready = true;
+</script>
+"""
+
+
+@pytest.mark.parametrize(("uv_set", "colour"), [(0, "mixed"), (1, "rgb9e5")])
+def test_three_shows_each_object_its_part(uv_set, colour, tmp_path, browser, serve):
+    model = scene_folder(tmp_path / "scene", uv_set, colour=colour)
+    assert model.colour == colour
+    export(model, tmp_path / "out", "three")
+    (tmp_path / "out" / "index.html").write_text(_SCENE_PAGE.replace("SIZE", str(_KIT_SIZE)))
+    page, errors = browser.new_page(), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(f"{serve(tmp_path / 'out')}/index.html")
+    page.wait_for_function("window.ready", timeout=20000)
+    for name, state in (("Basic", 0.0), ("Lambert", 1.0), ("Phong", 1.5), ("Basic", 2.0)):
+        found = np.array(page.evaluate(f"draw('{name}', {state})")).reshape(_KIT_SIZE, _KIT_SIZE, 4)[::-1, :, :3]
+        expected, inside = expected_picture(model, _KIT_SIZE, state)
+        assert inside.mean() > 0.9
+        np.testing.assert_allclose(found[inside], expected[inside], rtol=0, atol=expected.max() / 255)
+    assert not errors
+    page.close()
+
+
+_SMOKE_PAGE = """<!doctype html>
+<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
+<script type="module">
+import * as THREE from 'three';
+import { loadSmoke } from './smoke.js';
+const renderer = new THREE.WebGLRenderer();
+const smoke = await loadSmoke(new URL('bundle.json', import.meta.url), THREE);
+const scene = new THREE.Scene(), sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
+scene.add(smoke.mesh, sun, sun.target, sky);
+smoke.mesh.position.set(3, 2, 1);
+smoke.mesh.rotation.set(0.3, 0.2, 0.1);
+smoke.mesh.scale.setScalar(2);
+// From behind and above, so that the mesh has to turn; light as floats, before a background.
+window.draw = ({time, loop, width, height, toward, irradiance, sky: [r, g, b], behind}) => {
+  const [wide, high] = smoke.info.extent;
+  const camera = new THREE.OrthographicCamera(-wide, wide, high, -high, 0.1, 100);
+  camera.position.set(-4, 9, -8);
+  camera.lookAt(smoke.mesh.position);
+  camera.updateMatrixWorld();
+  sun.target.position.set(0, 0, 0);
+  sun.position.set(...toward).transformDirection(camera.matrixWorld);
+  sun.color.setRGB(...irradiance, THREE.LinearSRGBColorSpace);
+  sky.color.setRGB(r * Math.PI, g * Math.PI, b * Math.PI, THREE.LinearSRGBColorSpace);
+  smoke.setTime(time, loop);
+  const target = new THREE.WebGLRenderTarget(width, height, {type: THREE.FloatType});
+  renderer.setRenderTarget(target);
+  renderer.setClearColor(new THREE.Color().setRGB(behind, behind, behind, THREE.LinearSRGBColorSpace), 1);
+  renderer.render(scene, camera);
+  const pixels = new Float32Array(4 * width * height);
+  renderer.readRenderTargetPixels(target, 0, 0, width, height, pixels);
+  const error = renderer.getContext().getError();
+  renderer.setRenderTarget(null);
+  if (error || parseInt(THREE.REVISION) < 187) throw new Error(`GL ${error}, revision ${THREE.REVISION}`);
+  return Array.from(pixels);
+};
+window.ready = true;
+</script>
+"""
+
+
+@pytest.fixture
+def opened_book(tmp_path, browser, serve):
+    """Opens a flip book; at the end nothing has gone wrong in its page."""
+    pages, errors = [], []
+
+    def open_book(book):
+        export(bundle(book), tmp_path, "three")
+        (tmp_path / "index.html").write_text(_SMOKE_PAGE)
+        page = browser.new_page()
+        pages.append(page)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(f"{serve(tmp_path)}/index.html")
+        page.wait_for_function("window.ready", timeout=20000)
+
+        def drawn(time, width=16, height=12, *, loop=True, behind=0.0):
+            given = {"time": time, "width": width, "height": height, "loop": loop, "behind": behind}
+            given |= {"toward": TOWARD, "irradiance": IRRADIANCE, "sky": SKY}
+            return np.array(page.evaluate("draw", given)).reshape(height, width, 4)[::-1, :, :3]
+
+        return drawn
+
+    yield open_book
+    for page in pages:
+        page.close()
+    assert not errors
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_three_shows_what_shade_gives(moving, opened_book):
+    """At frames, between them and, where it doesn't begin again, after the last; over black and over light."""
+    frames = random_frames()
+    book = random_book(frames, moving=moving)
+    drawn = opened_book(book)
+    for seconds, loop in ((0.0, True), (0.15, True), (0.825, True), (0.4, False), (0.9, False)):
+        frame = seconds * book.rate
+        frame = frame % 5 if loop else min(frame, 4.0)
+        want = shown(frames, book, frame)
+        for behind in (0.0, 0.75):
+            expected = want[..., :3] + behind * (1.0 - want[..., 3:])
+            np.testing.assert_allclose(drawn(seconds, loop=loop, behind=behind), expected, atol=1.6 / 255)
+
+
+def test_smaller_pictures_read_mips(opened_book):
+    """A pixel as large as four is their mean, where the padding allows the mip, and else one place between them."""
+    frames = random_frames(seed=1)
+    found = opened_book(random_book(frames, ramp=None))(0.0, 8, 6)
+    want = shown(frames, random_book(frames, ramp=None), 0.0)[..., :3]
+    fours = want.reshape(6, 2, 8, 2, 3).mean((1, 3))
+    # Mips are rounded to 8 bits once more.
+    np.testing.assert_allclose(found, fours, atol=2.4 / 255)
