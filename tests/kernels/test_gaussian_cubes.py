@@ -124,19 +124,6 @@ def test_no_list_lacks_a_gaussian_that_reaches(device: str, anisotropy: float, o
             np.testing.assert_array_equal(f.numpy(), want.numpy())
 
 
-def test_cube_of_points(device: str):
-    """The cube of a point, the nearest one outside of the grid, and some cube for a NaN."""
-    cubes = probe_cubes.build(_shapes(_gaussians(3, 2.0), device), LOW, HIGH, 0.3)
-    random = np.random.default_rng(2)
-    x = np.concatenate([random.random((200, 3)) * 4 - 2, [LOW, HIGH, [np.inf, -np.inf, 1e30], [np.nan] * 3]])
-    x = x.astype(np.float32)
-    out = wp.zeros(len(x), dtype=int, device=device)
-    wp.launch(_cube_of, len(x), inputs=[cubes, array(x, wp.vec3, device)], outputs=[out], device=device)
-    place = np.clip(np.floor((x[:-1] - np.float32(LOW)) / np.float32(0.3)), 0, np.array([3, 2, 2])).astype(int)
-    np.testing.assert_array_equal(out.numpy()[:-1], np.ravel_multi_index(tuple(place.T), (4, 3, 3)))
-    assert 0 <= out.numpy()[-1] < 36
-
-
 def test_hard_gaussians(device: str):
     """Collapsed: one cube. As large as all: every cube. Far off: the cubes at the border that face it. Not a number:
     every cube, for no test can say."""
@@ -171,23 +158,6 @@ def test_flat_boxes(device: str):
             counts = [*cubes.counts]
             assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
             assert _table(cubes, 40).any(0).all()
-
-
-def test_chosen_size(device: str):
-    """A quarter of the median reach, or coarser by powers of two where that makes too much."""
-    rows = _gaussians(100, 1.0, longest=0.1)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    assert cubes.size == pytest.approx(0.25 * CUT * 0.1)
-    rows[:, 3:6] = np.log(1e-3)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    most = 4096 + 8 * 100
-    assert most / 8 < np.prod([*cubes.counts]) <= most
-    doubled = np.log2(cubes.size / (0.25 * CUT * 1e-3))
-    assert doubled == pytest.approx(round(doubled), abs=1e-3)
-    # A few small ones don't make the lists of many large ones long.
-    rows[:45, 3:6] = np.log(0.5)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    assert len(cubes.item) <= 4096 + 256 * 100
 
 
 def test_everything_is_one_list(device: str):

@@ -184,14 +184,7 @@ def evaluate_frame(
 
 
 def summarise(frames: Sequence[FrameMetrics]) -> Summary:
-    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
-
-    Args:
-        frames: One `FrameMetrics` per lightmap, all with the same grid of tiles and the same metrics, in order of
-            time.
-
-    Returns:
-        Means, means by tile and by time, the worst tile, and the number of excluded tiles by reason.
+    """Averages the scores of a scene's lightmaps, in order of time, over all tiles and lightmaps.
 
     Raises:
         WlmError: No frames, or frames of different grids or metrics.
