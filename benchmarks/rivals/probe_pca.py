@@ -149,7 +149,7 @@ def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components:
 
 
 def encode(values: np.ndarray, partition: Partition, components: int, bits: int | None) -> bytes:
-    """Fits and packs.
+    """Fits the subspaces of all parts and packs them.
 
     Args:
         values: float64 [N, D].
@@ -175,7 +175,7 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Reads what `encode` wrote.
+    """Decodes the result of `encode`.
 
     Args:
         payload: The layout of this module.

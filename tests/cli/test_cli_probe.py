@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 from builders.probe_sets import synthetic
-from builders.running import call, fails
+from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
 from wlm.probe import data, evaluate, save_probes
@@ -187,19 +187,24 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        (["compress", "absent.npz", "-o", "{tmp}/a.wlm"], "absent.npz: no such file or folder"),
+        (["compress", "{set}", "-o", "{set}"], "ends in .wlm"),
+        (["compress", "{set}"], "--output"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "0"], "--ratio: expected"),
-        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--latent", "0"], "--latent: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--key", "noon"], "expected values named noon"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--convention", "quake"], "convention"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--device", "cuda:9"], "device 'cuda:9'"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz"], "stores no positions"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{bad}"], "position[0]: expected finite"),
         (["decode", "{fit}", "-o", "{tmp}/f.exr", "--positions", "{set}"], "ends in .npz or .json"),
-        (
-            ["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "absent.npz"],
-            "absent.npz: cannot read the arrays: No such file",
-        ),
-        (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{fit}"], "not valid JSON"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{set}", "--convention", "quake"], "convention"),
+        (["decode", "{set}", "-o", "{tmp}/f.npz"], "expected an artifact"),
+        (["evaluate", "{fit}", "absent.npz"], "absent.npz: cannot read the arrays: No such file"),
+        (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
+        (["info", "{tmp}"], "expected a file, found a folder"),
         (["probe", "volume", "{fit}", "-o", "{tmp}/out"], "stores no positions"),
         (["probe", "volume", "{fit}", "{other}", "-o", "{tmp}/out"], "expected the 160 probes of"),
         (["probe", "volume", "{fit}", "{set}", "-o", "{tmp}/out", "--block", "-1"], "volume block"),
@@ -218,28 +223,45 @@ def test_bad_input_is_one_line_and_exit_code_2(words, says, room, fitted, tmp_pa
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 
 
+def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(room, profile, tmp_path, monkeypatch):
+    check_a_stop_is_resumed(monkeypatch, tmp_path, ["compress", room, "--profile", profile])
+
+
 def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path):
-    text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", "1,2.5,-3")
+    text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", 1, 2.5, -3)
     files = list((tmp_path / "out").iterdir())
     assert len(files) == 8 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
     document = json.loads((tmp_path / "out" / "bundle.json").read_text())
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
     call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
     assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
-    assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
+    assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")
 
 
-def test_exports_for_engines_and_in_languages(fitted, tmp_path):
-    out = ["export", fitted, "-o", tmp_path / "out"]
-    assert "probe.wgsl" in call(*out, "--shader", "wgsl")
-    assert "wlm_probe_sh(" in (tmp_path / "out" / "probe.wgsl").read_text()
-    for engine, name in (("three", "grid.json"), ("unreal", "light.json")):
-        call(*out, "--engine", engine, "--cells", 5)
-        assert max(json.loads((tmp_path / "out" / name).read_text())["resolution"]) == 5
+def test_shaders_in_other_languages(fitted, tmp_path):
+    for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
+        assert name in call("export", fitted, "-o", tmp_path / "out", "--shader", language)
+        assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
     words = ["export", fitted, "-o", tmp_path / "no", "--engine"]
-    assert "cells" in fails(*words, "unity", "--cells", 4)
     assert "--shader: has no meaning" in fails(*words, "three", "--shader", "hlsl")
     assert "'--engine': 'any' is not one of 'three'" in fails(*words, "any")
+
+
+@pytest.mark.parametrize(("engine", "index", "file"), [("three", "grid", "grid.ktx2"), ("unreal", "light", "sh5.dds")])
+def test_lattices_of_engines(engine, index, file, fitted, tmp_path):
+    text = call("export", fitted, "--engine", engine, "-o", tmp_path / "out", "--cells", 5)
+    assert max(json.loads((tmp_path / "out" / f"{index}.json").read_text())["resolution"]) == 5 and file in text
+    assert "cells" in fails("export", fitted, "--engine", "unity", "-o", tmp_path / "no", "--cells", 4)
+
+
+def test_a_volume_takes_the_normals_of_probes(carrying, room, tmp_path):
+    arrays = dict(np.load(room))
+    np.savez(tmp_path / "room.npz", normal=np.tile([0.0, 1.0, 0.0], (len(arrays["position"]), 1)), **arrays)
+    pools = []
+    for name, probes in (("plain", room), ("known", tmp_path / "room.npz")):
+        call("probe", "volume", carrying, probes, "-o", tmp_path / name)
+        pools.append((tmp_path / name / "pool.bin").read_bytes())
+    assert len(pools[0]) == len(pools[1]) and pools[0] != pools[1]
 
 
 def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):

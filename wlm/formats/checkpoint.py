@@ -34,11 +34,7 @@ class Pace:
     """Schedules saves: at a fixed interval, or less often where saving would take over a twentieth of the time."""
 
     def __init__(self, every: float) -> None:
-        """Starts the clock.
-
-        Args:
-            every: Seconds from one save to the next; 0: save whenever asked.
-        """
+        """Starts the clock; `every` is the number of seconds between two saves, 0 to save at each request."""
         self._every = self._wait = every
         self._last = time.monotonic()
         self._took = 0.0

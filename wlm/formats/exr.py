@@ -69,12 +69,10 @@ def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], name
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
-    """Writes RGB or RGBA pixels as an EXR file of scan lines with lossless ZIP compression, atomically.
+    """Writes linear pixels [H, W, 3 or 4] as an EXR file of scan lines with lossless ZIP compression, atomically.
 
-    Args:
-        path: The file to write; its folder must exist.
-        pixels: Linear values, [H, W, 3 or 4], neither side empty.
-        half: Whether to round to half floats. Values beyond their range, infinity included, become +-65504; NaN stays.
+    With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
+    stays.
 
     Raises:
         ValueError: The shape is not that of a picture.

@@ -114,16 +114,13 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
-    """Returns the codec of a setting; equal settings share one codec.
+    """Returns the codec of a setting, one for equal settings.
 
     Args:
         block: One of `ASTC_BLOCKS`.
         quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
-        extra: Name of the optional extra for the error message.
+        extra: Name of the optional extra for the error message that the package is missing.
         ldr: Whether to use the LDR profile, for values in [0, 1]; else HDR.
-
-    Raises:
-        WlmError: The package is missing.
     """
     return _astc(need("astc_encoder", extra), block, float(quality), ldr)
 

@@ -39,9 +39,6 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
 
     The lock is on a file beside the output, which is removed at the end. Locks may be nested within one process.
 
-    Args:
-        output: A file or a folder; it need not exist.
-
     Raises:
         WlmError: Another process holds the lock.
     """

@@ -375,13 +375,7 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """The pictures of a layer of an atlas.
-
-    Attributes:
-        frames: Levels of each of its sheets, float32 [T, H, W, 3], in the order of the times.
-        alpha: bool [T, H, W], true where a texel has an alpha above 0; None if the mask is not taken from it.
-        warnings: Lines about alphas.
-    """
+    """The pictures of a layer of an atlas."""
 
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None
@@ -500,16 +494,7 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """The states of a set, in the order given, and the words that messages need.
-
-    Attributes:
-        labels: Names of the states.
-        times: float64 [T], checked.
-        period: Length of the day, or None.
-        where: The set, for messages.
-        mask_from: The origin of the mask, for messages.
-        warn_order: Whether times that are out of order deserve a warning.
-    """
+    """The states of a set, in the order given, and the words that messages need."""
 
     labels: Sequence[str]
     times: np.ndarray

@@ -48,14 +48,7 @@ class Batch:
 
 @dataclass(eq=False)
 class _Running:
-    """A batch that a worker is fitting.
-
-    Attributes:
-        batch: The batch.
-        step: Steps done; None until the worker has begun.
-        deaths: Workers that it has lost since its state was last saved.
-        saving: Whether its state is requested before it goes on.
-    """
+    """A batch that a worker is fitting."""
 
     batch: Batch
     step: int | None = None

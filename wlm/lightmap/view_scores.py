@@ -387,12 +387,7 @@ class Tally:
 
 
 class _Texels:
-    """Some texels of a map, and sums over those of each tile.
-
-    Attributes:
-        at: Their rows and columns, int [K] each.
-        count: int [rows, columns] of the grid, number in each tile.
-    """
+    """Some texels of a map, and sums over those of each tile."""
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)
