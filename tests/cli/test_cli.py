@@ -63,7 +63,7 @@ def test_the_version_is_quick_to_tell():
 
 
 def test_help_lists_the_commands():
-    verbs = "compress evaluate decode export info compare inspect view web doctor probe smoke bake"
+    verbs = "compress evaluate decode export info inspect view web doctor probe smoke bake"
     assert set(verbs.split()) <= set(call().split())
     for group, commands in {"probe": "volume", "smoke": "simulate bake shade flipbook train export-onnx"}.items():
         assert set(commands.split()) <= set(call(group, "--help").split())
