@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,14 +97,11 @@ def run(
     *,
     quick: bool,
     device: str,
-    meshes_path: str | os.PathLike[str] | None = None,
-    mesh_path: str | os.PathLike[str] | None = None,
-    lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
-    mask_path: str | os.PathLike[str] | None = None,
     profiles: Sequence[str] | None = None,
     rivals: bool = True,
     rivals_at: str | os.PathLike[str] | None = None,
     progress: Note | None = None,
+    **paths: Any,
 ) -> list[Row]:
     """Measures the atlas system.
 
@@ -111,11 +109,11 @@ def run(
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's fit is not finished, so its error is large.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        meshes_path, mesh_path, lightmap_paths, mask_path: As for `read_lightmaps`.
         profiles: Profiles; none: `PROFILES`.
         rivals: Whether to measure block codecs, which take minutes on the CPU. Downsampling is always measured.
         rivals_at: Measure only the rivals, on the CPU, at the bits of our tiles in this result file.
         progress: Called with a line before each part of the work.
+        paths: The arguments of `read_lightmaps`.
 
     Returns:
         The rows, lightmap by lightmap in the order of the module's list, and their means.
@@ -126,7 +124,7 @@ def run(
     """
     device = interop.check_device(device)
     loaded = [Profile.load(name) for name in profiles or PROFILES]
-    lightmaps = read_lightmaps(meshes_path, mesh_path, lightmap_paths or (), mask_path)
+    lightmaps = read_lightmaps(**paths)
     if rivals_at is not None:
         others = {"--quick": quick, "--profile": profiles, "--no-rivals": not rivals, "--device": device != "cpu"}
         expect_alone("--rivals-at", others)
@@ -148,7 +146,7 @@ def run(
 def read_lightmaps(
     meshes_path: str | os.PathLike[str] | None = None,
     mesh_path: str | os.PathLike[str] | None = None,
-    lightmap_paths: Sequence[str | os.PathLike[str]] = (),
+    lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
     mask_path: str | os.PathLike[str] | None = None,
 ) -> list[Lightmap]:
     """Reads the lightmaps of a run.

@@ -15,9 +15,9 @@ Triangles are grouped once a lightmap, which takes no part in the times. Seams a
 row's own UVs. Bits are as everywhere those of a GPU, 64 a texel of half floats, where the paper has 48.
 """
 
-import os
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from benchmarks.atlas import (
     QUICK_RESOLUTION,
@@ -68,13 +68,10 @@ def run(
     only: Sequence[str] | None = None,
     quick: bool,
     device: str,
-    meshes_path: str | os.PathLike[str] | None = None,
-    mesh_path: str | os.PathLike[str] | None = None,
-    lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
-    mask_path: str | os.PathLike[str] | None = None,
     steps: int | None = None,
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
+    **paths: Any,
 ) -> list[Row]:
     """Fits the variants of a profile to each lightmap and compares them.
 
@@ -83,10 +80,10 @@ def run(
         only: Names of rows; none: all.
         quick: Short fits in small views, which show on a CPU that everything works: the fits are not finished.
         device: "cpu" or "cuda:0".
-        meshes_path, mesh_path, lightmap_paths, mask_path: As for `benchmarks.atlas.read_lightmaps`.
         steps: Steps of each fit; None: the profile's.
         progress: Called with a line before each part of the work.
         done: Called after each lightmap with all rows so far.
+        paths: The arguments of `benchmarks.atlas.read_lightmaps`.
 
     Returns:
         The rows, lightmap by lightmap, and where there are several their means.
@@ -98,7 +95,7 @@ def run(
     if steps is not None:
         settings = settings.override({"steps": steps})
     choose(settings, only or ())  # a misspelt name fails before the meshes are read
-    lightmaps = read_lightmaps(meshes_path, mesh_path, lightmap_paths or (), mask_path)
+    lightmaps = read_lightmaps(**paths)
     views, resolution = (QUICK_VIEWS, QUICK_RESOLUTION) if quick else (VIEWS, RESOLUTION)
     options = {"device": device, "progress": progress, "done": done}
     return run_rows(lightmaps, settings, only or (), views=views, resolution=resolution, **options)

@@ -23,7 +23,7 @@ graphs, so that gaps between launches do not count.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -90,53 +90,40 @@ _FEW_PATHS = 4
 
 @dataclass(frozen=True)
 class Sizes:
-    """Grids, steps and repeats."""
+    """Grids, steps and repeats. The defaults are the grids of the paper, for a GPU."""
 
-    lattice: int  # cells along an edge of the large lattice
-    small: int  # cells along an edge of the small lattice
-    chunk: int  # steps of a lattice that are timed as one
-    compared: tuple[int, ...]  # steps after which velocities of 16 and 32 bits are compared
-    drift: int  # steps after which the drift of the mass is measured
-    fills: tuple[float, ...]  # shares of the domain in which there is smoke
-    coarse: int  # cells of velocity along an edge, each four voxels of smoke along its edge
-    cloud: int  # voxels along an edge of the cloud
-    resolution: int  # pixels along an edge of its image
-    exact: float  # step in voxels of the march that guiding maps are compared with
-    guide_shared: tuple[float, ...]  # steps of guiding maps whose pixels share marches to the lights
-    guide_alone: tuple[float, ...]  # steps of guiding maps with marches for each pixel
-    six: tuple[float, ...]  # steps of the six-way march; the shortest is last
-    plume: int  # pixels along an edge of the image of the plume
-    scale: float  # factor on the number of cells of the scene
-    frames: int  # frames of the scene before the timed frame
-    warmup: int  # calls before the first that is timed
-    repeats: int  # samples of a time
-    few: int  # samples of a time that is long
-    every: bool  # include slow-to-compile cases of minor interest
+    lattice: int = 256  # cells along an edge of the large lattice
+    small: int = 100  # cells along an edge of the small lattice
+    chunk: int = 48  # steps of a lattice that are timed as one
+    compared: tuple[int, ...] = (500, 1000)  # steps after which velocities of 16 and 32 bits are compared
+    drift: int = 5000  # steps after which the drift of the mass is measured
+    fills: tuple[float, ...] = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the domain that contain smoke
+    coarse: int = 100  # cells of velocity along an edge, each four voxels of smoke along its edge
+    cloud: int = 400  # voxels along an edge of the cloud
+    resolution: int = 512  # pixels along an edge of its image
+    exact: float = 0.5  # step in voxels of the march that guiding maps are compared with
+    guide_shared: tuple[float, ...] = (2, 3, 5, 10, 15, 20)  # steps of guiding maps whose pixels share marches
+    guide_alone: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20)  # steps of guiding maps with marches for each pixel
+    six: tuple[float, ...] = (
+        20.0,
+        15.0,
+        10.0,
+        7.0,
+        5.0,
+        3.0,
+        2.0,
+        1.0,
+        0.5,
+        0.25,
+    )  # steps of the six-way march
+    plume: int = 64  # pixels along an edge of the image of the plume
+    scale: float = 1.0  # factor on the number of cells of the scene
+    frames: int = 40  # frames of the scene before the timed frame
+    warmup: int = 3  # calls before the first that is timed
+    repeats: int = 12  # samples of a time
+    few: int = 3  # samples of a time that is long
+    every: bool = True  # include slow-to-compile cases of minor interest
 
-
-FULL = Sizes(
-    lattice=256,
-    small=100,
-    chunk=48,
-    compared=(500, 1000),
-    drift=5000,
-    fills=(0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0),
-    coarse=100,
-    cloud=400,
-    resolution=512,
-    exact=0.5,
-    guide_shared=(2, 3, 5, 10, 15, 20),
-    guide_alone=(1, 2, 3, 5, 10, 15, 20),
-    six=(20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 2.0, 1.0, 0.5, 0.25),
-    plume=64,
-    scale=1.0,
-    frames=40,
-    warmup=3,
-    repeats=12,
-    few=3,
-    every=True,
-)
-"""The paper's grids: for a GPU."""
 
 QUICK = Sizes(
     lattice=48,
@@ -148,8 +135,6 @@ QUICK = Sizes(
     coarse=12,
     cloud=48,
     resolution=48,
-    exact=0.5,
-    guide_shared=(2, 3, 5, 10, 15, 20),
     guide_alone=(2, 5, 10, 20),
     six=(1.0, 0.5, 0.25),
     plume=24,
@@ -160,7 +145,7 @@ QUICK = Sizes(
     few=1,
     every=False,
 )
-"""For a CPU."""
+"""Sizes for a CPU."""
 
 
 class SmokeBench(Bench):
@@ -482,7 +467,7 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
     return ((1.5 * noise[0, 0] + 0.9 - radius).clamp(0.0, 1.0) * (y.abs() < 0.95)).contiguous()
 
 
-def guide_rows(bench: SmokeBench) -> list[Row]:
+def guide_rows(bench: SmokeBench) -> Iterator[Row]:
     """Measures guiding maps by their step, with shared or separate marches to the lights, against a fine march."""
     bench.note("guide")
     sizes = bench.sizes
@@ -502,7 +487,6 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
     # Python takes longer to launch it than it takes itself: in a frame that is one graph, this is its time.
     cuda = bench.device != "cpu"
     replays = bench.time({key: bench.replay(call) for key, call in short.items()}) if cuda else {}
-    rows = []
     for key, volume in cases.items():
         way, step, storage = key
         shared = way == "shared"
@@ -510,7 +494,7 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
         still = guide(volume, camera, March(float(step), jitter=0.0), shared=shared)
         option = f"h {step:g}" + (", each pixel alone" if way == "alone" else "")
         option += ", float16" if storage == "float16" else ""
-        row = bench.row(
+        yield bench.row(
             "guide",
             option,
             scene=_CLOUD,
@@ -524,11 +508,9 @@ def guide_rows(bench: SmokeBench) -> list[Row]:
             voxels=sizes.cloud,
             pixels=sizes.resolution,
         )
-        rows.append(row)
-    return rows
 
 
-def six_rows(bench: SmokeBench) -> list[Row]:
+def six_rows(bench: SmokeBench) -> Iterator[Row]:
     """Measures the fine march of six-way lightmaps by its step, with its own estimate of its error."""
     bench.note("six ways")
     sizes = bench.sizes
@@ -538,11 +520,10 @@ def six_rows(bench: SmokeBench) -> list[Row]:
     calls = {name: partial(bake, volume, camera, step=step, estimate=False) for name, (volume, step) in cases.items()}
     times = bench.time(calls, few=True)
     finest = bake(volumes["float32"], camera, step=sizes.six[-1], estimate=False).lightmaps
-    rows = []
     for name, (volume, step) in cases.items():
         six = bake(volume, camera, step=step)
         is_finest = step == sizes.six[-1]
-        row = bench.row(
+        yield bench.row(
             "six ways",
             name,
             "the finest" if is_finest else "",
@@ -554,11 +535,9 @@ def six_rows(bench: SmokeBench) -> list[Row]:
             voxels=sizes.cloud,
             pixels=sizes.resolution,
         )
-        rows.append(row)
-    return rows
 
 
-def weight_rows(bench: SmokeBench) -> list[Row]:
+def weight_rows(bench: SmokeBench) -> Iterator[Row]:
     """Measures the rules that weight six lightmaps against a march to each of some oblique lights, on a plume."""
     bench.note("weights")
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
@@ -569,12 +548,11 @@ def weight_rows(bench: SmokeBench) -> list[Row]:
     lights = [tuple(map(float, toward)) for toward in _directions(_LIGHTS)]
     march = March(_WEIGHT_STEP, jitter=0.0)
     exact = list(light_smoke(volume, camera, [Light(toward) for toward in lights], march).planes)
-    rows = []
     for rule in RULES:
         weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
         pairs = list(zip(weighted, exact, strict=True))
         bias = [float(w.double().mean() / e.double().mean()) - 1.0 for w, e in pairs]
-        row = bench.row(
+        yield bench.row(
             "weights",
             rule,
             scene="plume",
@@ -586,8 +564,6 @@ def weight_rows(bench: SmokeBench) -> list[Row]:
             max_error=max(float((w - e).abs().max()) for w, e in pairs),
             lights=_LIGHTS,
         )
-        rows.append(row)
-    return rows
 
 
 def frame_rows(bench: SmokeBench) -> list[Row]:
@@ -730,7 +706,7 @@ def _psnr(coarse: Guide, fine: Guide) -> float:
 
 
 # The lattice comes first: it measures the copy that others are compared with.
-_PARTS: tuple[Callable[[SmokeBench], list[Row]], ...] = (
+_PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
     lattice_rows,
     storage_rows,
     advection_rows,
@@ -742,26 +718,23 @@ _PARTS: tuple[Callable[[SmokeBench], list[Row]], ...] = (
 )
 
 
-def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
+def run(*, quick: bool = False, device: str, sizes: Sizes | None = None, progress: Note | None = None) -> list[Row]:
     """Measures the smoke system.
 
     Args:
-        quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU with 40 GB: hours on a CPU.
+        quick: Whether to take `QUICK`, for a minute on a CPU, in place of the grids of the paper, which need a GPU
+            with 40 GB.
         device: "cpu" or "cuda:0".
+        sizes: Other grids.
         progress: Called with a line before each part of the work.
 
     Returns:
         The rows, method by method.
 
     Raises:
-        WlmError: The device isn't there, or hasn't the memory.
+        WlmError: The device does not exist, or has too little memory.
     """
-    return run_rows(QUICK if quick else FULL, device=device, progress=progress)
-
-
-def run_rows(sizes: Sizes, *, device: str, progress: Note | None = None) -> list[Row]:
-    """Measures it on grids of the given sizes; the rest as for `run`."""
-    bench = SmokeBench(device, sizes, progress)
+    bench = SmokeBench(device, sizes or (QUICK if quick else Sizes()), progress)
     return [row for part in _PARTS for row in part(bench)]
 
 

@@ -108,47 +108,36 @@ class GridSizes:
 
 @dataclass(frozen=True)
 class OrdersSizes:
-    """Smoke, pictures and samples.
+    """Smoke, pictures and samples. The defaults are for a GPU.
 
     Attributes:
-        plumes: How many.
-        cells: Voxels along a plume's edge as it is drawn; None: 40 to 64.
-        voxels: That it is resampled to; None: it stays.
+        plumes: Number of plumes.
+        cells: Voxels along the edge of a plume as it is drawn; None: 40 to 64.
+        voxels: Voxels along the edge to which a plume is resampled; None: it is not resampled.
         pixels: H and W.
-        samples: Paths a pixel of a reference.
-        scale, frames: Of the scene `jet-sphere`: cells as a multiple of its own, and frames before the first seen.
-        sides: From which it is seen.
+        samples: Paths for each pixel of a reference.
+        scale: Cells of the scene `jet-sphere`, as a multiple of its own.
+        frames: Frames of the scene before the first that is scored.
+        sides: Number of cameras that see the scene.
         repeats: Samples of a time.
         single: Sizes of `grid_rows`.
         other: Arguments of `other_rows`, by name.
     """
 
-    plumes: int
-    cells: int | None
-    voxels: int | None
-    pixels: int
-    samples: int
-    scale: float
-    frames: int
-    sides: int
-    repeats: int
-    single: GridSizes
+    plumes: int = 12
+    cells: int | None = 128
+    voxels: int | None = 400
+    pixels: int = 512
+    samples: int = 3072
+    scale: float = 1.0
+    frames: int = 60
+    sides: int = 4
+    repeats: int = 10
+    single: GridSizes = GridSizes(
+        (32, 64, 128, 256, 400, 512), extinctions=(2.5, 8.0, 25.0, 80.0), pixels=192, samples=512
+    )
     other: Mapping[str, int] = field(default_factory=dict)
 
-
-FULL = OrdersSizes(
-    plumes=12,
-    cells=128,
-    voxels=400,
-    pixels=512,
-    samples=3072,
-    scale=1.0,
-    frames=60,
-    sides=4,
-    repeats=10,
-    single=GridSizes((32, 64, 128, 256, 400, 512), extinctions=(2.5, 8.0, 25.0, 80.0), pixels=192, samples=512),
-)
-"""For a GPU."""
 
 QUICK = OrdersSizes(
     plumes=4,
@@ -162,7 +151,7 @@ QUICK = OrdersSizes(
     repeats=2,
     single=GridSizes((32, 64, 128), extinctions=(8.0, 25.0), pixels=24, samples=256),
 )
-"""For a CPU."""
+"""Sizes for a CPU."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,25 +173,16 @@ class Shot:
     motion: torch.Tensor | None = None
 
 
-def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
+def run(
+    *, quick: bool = False, device: str, sizes: OrdersSizes | None = None, progress: Note | None = None
+) -> list[Row]:
     """Measures light of all orders.
 
     Args:
-        quick: Small pictures and few, for a minute or two on a CPU. Otherwise 400^3 voxels at 512^2, for a GPU.
-        device: "cpu" or "cuda:0".
-        progress: Called with a line before each part of the work.
-
-    Returns:
-        The rows, scene by scene.
-
-    Raises:
-        WlmError: The device isn't there, or hasn't the memory.
+        quick: Whether to take `QUICK`, for a minute or two on a CPU, in place of 400^3 voxels at 512^2, for a GPU.
+        device, sizes, progress, returns: As for `benchmarks.smoke.run`; the rows are in the order of the scenes.
     """
-    return run_rows(QUICK if quick else FULL, device=device, progress=progress)
-
-
-def run_rows(sizes: OrdersSizes, *, device: str, progress: Note | None = None) -> list[Row]:
-    """Measures it at the given sizes; the rest as for `run`."""
+    sizes = sizes or (QUICK if quick else OrdersSizes())
     bench = Bench("smoke", device, progress, clock="time_ms", repeats=sizes.repeats, few=2)
     if not has_denoiser():
         bench.note(f"{_DENOISED}: left out, pyoidn isn't installed: wlm[bake]")

@@ -48,7 +48,7 @@ from wlm_kernels.smoke.settings import March
 HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
 STEP = 0.5  # voxels, of the fine march
-RESOLUTION, FRAMES = 128, 6
+RESOLUTION, FRAMES = 96, 4
 RATES = {"jet-sphere": 1.5, "jet-moving": 1.5, "explosion": 6.0}  # frames a second
 TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its lights turn the other way
 

@@ -1,6 +1,7 @@
 """Checks that every import points to a lower layer and that modules form no import cycle."""
 
 import ast
+import functools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -28,6 +29,7 @@ def package_of(module: str) -> str:
     return root if root != "wlm" else ".".join(module.split(".")[:2])
 
 
+@functools.cache
 def imports() -> dict[str, set[str]]:
     """Returns the project modules that each module imports anywhere, including in functions and for type checking."""
     files = [path for folder in ("wlm", "wlm_kernels", "benchmarks") for path in (ROOT / folder).rglob("*.py")]

@@ -14,15 +14,8 @@ from typing import Any
 def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Makes the `__getattr__` and `__dir__` of a package.
 
-    A public name must not be the name of a submodule, because importing the submodule would replace it.
-
-    Args:
-        package: The package's `__name__`.
-        places: For each public name the module that defines it under the same name; for a subpackage its own full
-            name.
-
-    Returns:
-        `__getattr__` and `__dir__`.
+    `places` names for each public name the module that defines it, or for a subpackage its own full name. A public name
+    must not be the name of a submodule, because importing the submodule would replace it.
     """
 
     def get(name: str) -> Any:

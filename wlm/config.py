@@ -25,14 +25,7 @@ _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
-    """Reads a YAML file into a settings model. Unknown keys are errors, whatever the model's own configuration says.
-
-    Args:
-        cls: The pydantic model; every key of the file must be one of its fields.
-        path: The YAML file, one mapping.
-
-    Returns:
-        The checked settings.
+    """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`.
 
     Raises:
         WlmError: One line with the file, the field, what was expected and what was found.
@@ -74,14 +67,7 @@ def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Sett
 
 
 def profile_path(system: str, name: str) -> Path:
-    """Finds the file of a profile, `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
-
-    Args:
-        system: First part of the file name, the attribute `FILES` of the settings.
-        name: Name of the profile, `M` for example.
-
-    Returns:
-        The path of the YAML file.
+    """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
 
     Raises:
         WlmError: There is no such profile; the line lists the known ones.

@@ -30,10 +30,7 @@ def available_devices() -> list[str]:
 
 
 def check_device(name: str) -> str:
-    """Checks that a device exists. It never falls back to another one.
-
-    Args:
-        name: "cpu", "cuda" (the first GPU) or "cuda:N".
+    """Checks that the device "cpu", "cuda" (the first GPU) or "cuda:N" exists, without falling back to another one.
 
     Returns:
         The name that both Warp and torch accept: "cpu" or "cuda:N".
@@ -97,17 +94,11 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
 
 @contextmanager
 def stream(device: str) -> Iterator[torch.cuda.Stream | None]:
-    """Runs torch and Warp on one CUDA stream inside the block; on the CPU it does nothing.
+    """Runs torch and Warp on one CUDA stream inside the block, and yields the torch stream; does nothing on the CPU.
 
-    The stream isn't the default stream, which CUDA can't capture in a graph, and it is the same one at every use.
-    It waits for the work that both libraries queued before the block, and work that they queue after the block
-    waits for it.
-
-    Args:
-        device: A result of `check_device`.
-
-    Yields:
-        The torch stream, or None on the CPU.
+    The stream isn't the default stream, which CUDA can't capture in a graph, and it is the same one at every use. It
+    waits for the work that both libraries queued before the block, and work that they queue after the block waits for
+    it.
     """
     if device == "cpu":
         yield None
@@ -214,10 +205,7 @@ class StepGraph:
 
 @cache
 def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
-    """Creates the single side stream of a device, as a torch and as a Warp object.
-
-    All uses share it, because torch's allocator keeps a pool of memory for every stream.
-    """
+    """Creates the single side stream of a device: torch's allocator keeps a pool of memory for every stream."""
     # Warp looks up a stream's device in a table created at initialisation, and this may be the first Warp call.
     wp.init()
     side = torch.cuda.Stream(device)

@@ -67,11 +67,8 @@ class Settings(BaseModel):
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
-        """Loads a profile.
-
-        Args:
-            profile: A name (`configs/FILES-NAME.yaml`), the path of a YAML file, or settings, which are returned as
-                they are.
+        """Loads a profile by its name (`configs/FILES-NAME.yaml`) or the path of a YAML file; settings are returned as
+        they are.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.
@@ -82,11 +79,9 @@ class Settings(BaseModel):
         return load_settings(cls, path if path.endswith((".yaml", ".yml")) else profile_path(cls.FILES, path))
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Replaces some settings.
+        """Returns the settings with new values by name; None leaves a setting as it is.
 
-        Args:
-            values: New values by name; None leaves a setting as it is.
-            prefix: Text before the setting's name in an error; `"--"` writes the name as an option.
+        `prefix` is the text before the setting's name in an error; `"--"` writes the name as an option.
 
         Raises:
             WlmError: Unknown or out of range.
@@ -131,12 +126,8 @@ class Meter:
     """
 
     def __init__(self, progress: OnProgress | None, stage: str, total: int, every: float = _REPORT_EVERY) -> None:
-        """Starts the clock.
-
-        Args:
-            progress: The callback, or None for no reports.
-            stage, total: Values of the attributes of `Progress`.
-            every: Seconds between two reports.
+        """Starts the clock; `every` is the number of seconds between two reports, and without a callback there are
+        none.
         """
         self._progress, self._stage, self._total, self._every = progress, stage, total, every
         self._start = self._last = time.perf_counter()
@@ -229,14 +220,7 @@ class Model:
         return sum(memoryview(part).nbytes for part in encode_artifact(self.SYSTEM, *self._encoded()))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
-        """Loads the model onto a device.
-
-        Args:
-            device: "cpu", "cuda" or "cuda:N".
-            options: Further options of the system's `Decoder`.
-
-        Returns:
-            The system's `Decoder`.
+        """Loads the model onto a device and returns the system's `Decoder`, which takes the options.
 
         Raises:
             WlmError: No such device.
@@ -245,11 +229,10 @@ class Model:
         return getattr(_module(self.SYSTEM, module), name)(self, device, **options)
 
     def bundle(self, device: str = "cpu", **options: Any) -> "Bundle":
-        """Converts the model to textures, buffers and shader source for a GPU.
+        """Converts the model to textures, buffers and shader source for a GPU; the device computes the reference
+        values.
 
-        Args:
-            device: Device that computes the reference values.
-            options: Further options of the system's `bundle`.
+        `options` are those of the system's `bundle`.
 
         Raises:
             WlmError: No such device.
@@ -262,14 +245,7 @@ class Model:
 
 
 def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
-    """Reads a file that a model of any system was saved to.
-
-    Args:
-        path: The file.
-        system: Name of the system that must have written it; None for any.
-
-    Returns:
-        The system's model.
+    """Reads the model of any system from a file; with `system`, only of that system.
 
     Raises:
         WlmError: One line: the file is no model, is cut short or damaged, is of another system or version, or has

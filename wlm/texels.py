@@ -102,13 +102,10 @@ def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the texels within `REACH` of a valid one, and the nearest valid one of each.
+    """Finds the texels within `REACH` of a valid one, and the nearest valid one of each, for a mask bool [H, W].
 
     Among equally near texels it is the first in reading order, so that every decoder (host, shader, web page) uses the
     same one.
-
-    Args:
-        mask: bool [H, W], true where a texel is valid.
 
     Returns:
         Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.

@@ -17,26 +17,21 @@ from wlm.formats.hdr_blocks import need
 from wlm.texels import fill_smoothly
 from wlm.workers import cores
 
-BITS = 10
-"""Bits of a sample."""
-
-WHITE = (1 << BITS) - 1
-"""Level of the greatest colour."""
-
+BITS = 10  # bits of a sample
+WHITE = (1 << BITS) - 1  # level of the greatest colour
 _MIDDLE = 1 << BITS - 1  # stands for a difference of 0
-_SPEED = 3  # 0 (slowest) to 10
+_SPEED = 3  # speed of libaom, 0 (slowest, best) to 10
 _IDENTITY = 0  # matrix coefficients, ITU-T H.273: green, blue and red are Y, U and V
 _FROM_PLANES, _TO_PLANES = [2, 0, 1], [1, 2, 0]
 
 
-def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80, speed: int = _SPEED) -> Rival:
+def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80) -> Rival:
     """Encodes all lightmaps of a set as one AV1 sequence.
 
     Args:
         frames: [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
         quality: 0 to 100.
-        speed: Speed of libaom, 0 (slowest, best) to 10.
 
     Returns:
         The rival; `decoded` is float32 [T, H, W, 3].
@@ -46,29 +41,24 @@ def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80, speed: i
     """
     if not 0 <= quality <= 100:
         raise WlmError(f"av1: expected a quality from 0 to 100, got {quality}")
-    if not 0 <= speed <= 10:
-        raise WlmError(f"av1: expected a speed from 0 to 10, got {speed}")
     # Each texel that must be right costs bits here: a ring of one is enough for a bilinear read.
     codes, seen = to_codes(prepare(frames, mask)), seen_texels(mask, ring=1)
     tiles = TileRanges.over_times(codes, seen, by_channel=False)  # grey stays grey
     levels = fill_smoothly(tiles.levels(codes), seen)
-
-    def encode() -> bytes:
-        return encode_levels(levels, quality, speed)
 
     def decode(stream: bytes) -> np.ndarray:
         return tiles.radiance(decode_levels(stream, levels.shape) / np.float32(WHITE))
 
     return measure(
         f"av1-{quality}",
-        encode,
+        lambda: encode_levels(levels, quality),
         decode,
         bytes=lambda data: _stream_bytes(data) + len(tiles.tobytes()),
         disk_bytes=lambda data: _stream_bytes(data) + disk_size(tiles.tobytes()),
     )
 
 
-def encode_levels(levels: np.ndarray, quality: int, speed: int) -> bytes:
+def encode_levels(levels: np.ndarray, quality: int) -> bytes:
     """Encodes levels, float32 [T, H, W, 3] in [0, 1], as one AVIF sequence.
 
     The stream is the same on any machine with the same version of the encoder.
@@ -86,7 +76,7 @@ def encode_levels(levels: np.ndarray, quality: int, speed: int) -> bytes:
     return need("imagecodecs", EXTRA).avif_encode(
         rgb if len(rgb) > 1 else rgb[0],  # one frame is a still picture
         level=quality,
-        speed=speed,
+        speed=_SPEED,
         bitspersample=BITS,
         pixelformat="yuv444",
         matrix=_IDENTITY,

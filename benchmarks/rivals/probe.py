@@ -97,7 +97,7 @@ def moving_basis(
     )
 
 
-def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None = None) -> Rival:
+def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
     """Packs SH like the bricks of Unreal's volumetric lightmap, without sky occlusion: 28 bytes per probe at L2.
 
     The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
@@ -108,14 +108,14 @@ def unreal_packing(position: np.ndarray, values: np.ndarray, bands: int | None =
 
     Args:
         position: Only their number counts.
-        values: D = 3, 12 or 27 (else a `WlmError`): SH coefficients from L00, for each its red, green and blue.
-        bands: 1 to 3, SH bands that are kept, 4, 13 or 28 bytes a probe; the rest decode to zero. None for all.
+        values: SH coefficients from L00, each red, green and blue: 3, 12 or 27 numbers take 4, 13 or 28 bytes. Any
+            other count raises a `WlmError`.
     """
     position, values = _checked(position, values)
-    most = _unreal_bands(values.shape[1])
-    bands = most if bands is None else bands
-    _in_range("bands", bands, 1, most)
     width = values.shape[1]
+    bands = {3: 1, 12: 2, 27: 3}.get(width)
+    if bands is None:
+        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (L0, L1 or L2 in RGB), got {width}")
     return measure(
         "unreal",
         lambda: pack_unreal(values, bands),
@@ -158,7 +158,6 @@ def at_bytes(
         position, values: See the module.
         budget_bytes: The largest size.
         bits: Bits of a weight to try; `(None,)` keeps to half floats as gaussian-probe-compression's table has them.
-            The engine's packing has none to choose.
 
     Returns:
         The best result; its times are those of its settings alone, without the search.
@@ -253,19 +252,11 @@ def _moving_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequ
     return min((first, longer), key=lambda rival: _error(values, rival))
 
 
-def _unreal_at(position: np.ndarray, values: np.ndarray, budget: int, bits: Sequence[int | None]) -> Rival | None:
-    for bands in range(_unreal_bands(values.shape[1]), 0, -1):
-        if len(values) * (4 + 3 * (bands**2 - 1)) <= budget:
-            return unreal_packing(position, values, bands)
-    return None
-
-
 RIVALS: dict[str, Callable[[np.ndarray, np.ndarray, int, Sequence[int | None]], Rival | None]] = {
     "global_pca": functools.partial(_pca_at, probe_pca.WHOLE, global_pca),
     "clustered_pca": functools.partial(_pca_at, probe_pca.PLACE, clustered_pca),
     "clustered_pca_signal": functools.partial(_pca_at, probe_pca.SIGNAL, functools.partial(clustered_pca, signal=True)),
     "moving_basis": _moving_at,
-    "unreal": _unreal_at,
 }
 """Rivals by name: functions of positions, values, bytes and the bits to try that return the best `Rival`."""
 
@@ -293,13 +284,6 @@ def _error(values: np.ndarray, rival: Rival) -> float:
 
 def _weights(bits: int | None) -> str:
     return "half floats" if bits is None else f"{bits} bits"
-
-
-def _unreal_bands(width: int) -> int:
-    bands = {3: 1, 12: 2, 27: 3}.get(width)
-    if bands is None:
-        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (L0, L1 or L2 in RGB), got {width}")
-    return bands
 
 
 def _checked(

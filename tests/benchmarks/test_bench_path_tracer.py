@@ -11,7 +11,6 @@ import benchmarks.smoke_network as bench_module
 from benchmarks import path_tracer
 from benchmarks.path_tracer import choose_variant
 from benchmarks.runner import Bench
-from wlm.errors import WlmError
 
 
 @pytest.mark.parametrize(
@@ -25,12 +24,6 @@ def test_the_variant_is_the_fastest_that_works(monkeypatch, backends, llvm, vari
     monkeypatch.setitem(sys.modules, "drjit", module)
     monkeypatch.setattr(path_tracer, "has_tracer", lambda: True)
     assert choose_variant() == variant
-
-
-def test_without_mitsuba(monkeypatch):
-    monkeypatch.setattr(path_tracer, "has_tracer", lambda: False)
-    with pytest.raises(WlmError, match=r"mitsuba: install wlm\[bake\]"):
-        choose_variant()
 
 
 @pytest.mark.parametrize("denoiser", [True, False])

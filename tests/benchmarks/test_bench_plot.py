@@ -64,14 +64,6 @@ def test_both_panels_name_every_row(tmp_path, as_text):
     assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
 
 
-def test_one_panel_and_a_line_of_panels_a_scene(tmp_path, as_text):
-    path = tmp_path / "p.svg"
-    plot(ROWS + [replace(row, scene="livingroom") for row in ROWS], path, x="bpp")
-    texts = svg_texts(path)
-    assert texts.count("size (bpp)") == 2 and "decode time (ms)" not in texts
-    assert texts.count("city") == texts.count("livingroom") == 1
-
-
 def test_rows_without_a_value_are_left_out_of_that_panel(tmp_path, as_text):
     path = tmp_path / "p.svg"
     other = Row("lightmap", "night", "ours", "M", {"decode_ms": 1.0, "psnr": 30.0})

@@ -206,16 +206,6 @@ def test_a_path_tracer_finds_the_same_light():
     assert float(np.square(denoise(few) - exact).mean()) < 0.3 * rough
 
 
-def test_rows_of_a_path_tracer():
-    pytest.importorskip("mitsuba")
-    traced = by_option(bench.traced_rows(NetworkBench("cpu", TINY, [])), "path tracing")
-    plain = traced["1 sample"]
-    assert 5.0 < plain["psnr"] < 30.0 and plain["time_ms"] > 0.0
-    if path_tracer.has_denoiser():
-        cleaned = traced["1 sample, denoised"]
-        assert cleaned["psnr"] > plain["psnr"] + 3.0 and cleaned["time_ms"] > plain["time_ms"]
-
-
 def _plume():
     volume = make_plume(24, hot=False, extinction=14.0)
     return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))

@@ -13,11 +13,9 @@ from builders.smoke_plumes import facing, plume
 import benchmarks.rivals.smoke_orders as rivals
 import benchmarks.smoke_orders as bench
 from benchmarks import read_json, tables, write_json
-from benchmarks.path_tracer import denoised_picture
 from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves, three_octaves
 from benchmarks.runner import Bench
-from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, grid_rows, run_rows
-from wlm.errors import WlmError
+from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, grid_rows, run
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
 from wlm.smoke.transport.learning import psnr
@@ -46,7 +44,7 @@ def rows():
         # Of fifteen octaves a few: each is a march.
         for module in (bench, rivals):
             patch.setattr(module, "FITTED", FITTED[::4])
-        return run_rows(TINY, device="cpu")
+        return run(device="cpu", sizes=TINY)
 
 
 def test_every_row_has_its_figures(rows):
@@ -115,27 +113,10 @@ def test_flicker_is_what_the_smokes_motion_leaves():
     assert set(bench._flicker(shots, [light, 1.5 * light], still, opacity)) == {"flicker"}
 
 
-def test_plumes_of_finer_voxels_are_the_same_smoke():
-    """What a GPU's rows are of: resampled, as opaque as before from the same side."""
-    plain, fine = (bench._plume(replace(TINY, cells=20, voxels=voxels), 3, "cpu") for voxels in (None, 50))
-    assert fine.volume.shape == (50, 50, 50) and fine.camera == plain.camera
-    assert [light.irradiance for light in fine.lights] == [light.irradiance for light in plain.lights]
-    assert fine.volume.size == pytest.approx(plain.volume.size)
-    clear = [light_smoke(shot.volume, shot.camera, ()).transparency for shot in (plain, fine)]
-    assert clear[0].min() < 0.8 and torch.allclose(*clear, atol=0.05)
-    assert sum(np.sum(light.irradiance) for light in fine.lights) == pytest.approx(12 * np.pi)
-
-
 def test_rows_make_a_file_and_a_table(rows, tmp_path):
     write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
     assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT)
     assert "| learned mix |" in tables(rows)
-
-
-def test_what_is_refused(monkeypatch):
-    monkeypatch.setattr("benchmarks.path_tracer.has_denoiser", lambda: False)
-    with pytest.raises(WlmError, match=r"needs pyoidn: install wlm\[bake\]"):
-        denoised_picture(torch.zeros(4, 4, 3))
 
 
 def test_rivals_are_nearer_than_single_scattering(device: str):

@@ -184,23 +184,14 @@ def test_export_lists_what_it_wrote(fitted, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
-    odd = tmp_path / "[red]a[b].wlm"
-    odd.write_bytes(fitted.read_bytes())
-    assert "[red]a[b].wlm" in call("info", odd).splitlines()[0]
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         (["compress", "absent.npz", "-o", "{tmp}/a.wlm"], "absent.npz: no such file or folder"),
-        (["compress", "{set}", "-o", "{tmp}/absent/a.wlm"], "does not exist"),
         (["compress", "{set}", "-o", "{set}"], "ends in .wlm"),
         (["compress", "{set}"], "--output"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "9"], "--steps: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "0"], "--ratio: expected"),
-        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "nan"], "--ratio: expected"),
-        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--latent", "0"], "--latent: expected"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--key", "noon"], "expected values named noon"),
@@ -209,14 +200,8 @@ def test_names_that_look_like_markup_are_shown_as_they_are(fitted, tmp_path):
         (["decode", "{fit}", "-o", "{tmp}/f.npz"], "stores no positions"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{bad}"], "position[0]: expected finite"),
         (["decode", "{fit}", "-o", "{tmp}/f.exr", "--positions", "{set}"], "ends in .npz or .json"),
-        (
-            ["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "absent.npz"],
-            "absent.npz: cannot read the arrays: No such file",
-        ),
-        (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{fit}"], "not valid JSON"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz", "--positions", "{set}", "--convention", "quake"], "convention"),
         (["decode", "{set}", "-o", "{tmp}/f.npz"], "expected an artifact"),
-        (["decode", "absent.wlm", "-o", "{tmp}/f.npz"], "absent.wlm"),
         (["evaluate", "{fit}", "absent.npz"], "absent.npz: cannot read the arrays: No such file"),
         (["evaluate", "{fit}", "{set}", "--json", "{tmp}"], "ends in .json"),
         (["info", "{tmp}"], "expected a file, found a folder"),
@@ -242,29 +227,15 @@ def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(room, profile, tmp_path,
     check_a_stop_is_resumed(monkeypatch, tmp_path, ["compress", room, "--profile", profile])
 
 
-def test_an_unknown_exception_is_a_bug_and_shows(room, profile, monkeypatch, tmp_path):
-    def broken(path, **options):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(wlm.probe, "load", broken)
-    with pytest.raises(ZeroDivisionError):
-        call("compress", room, "-o", tmp_path / "a.wlm", "--profile", profile)
-
-
 def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path):
-    text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", "1,2.5,-3")
+    text = call("probe", "volume", fitted, room, "-o", tmp_path / "out", "--at", 1, 2.5, -3)
     files = list((tmp_path / "out").iterdir())
     assert len(files) == 8 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
     document = json.loads((tmp_path / "out" / "bundle.json").read_text())
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
     call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
     assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
-    assert "--at: expected three numbers" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", "1,2")
-
-
-def test_grid_for_three(fitted, tmp_path):
-    text = call("export", fitted, "--engine", "three", "-o", tmp_path / "out", "--cells", 5)
-    assert max(json.loads((tmp_path / "out" / "grid.json").read_text())["resolution"]) == 5 and "grid.ktx2" in text
+    assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")
 
 
 def test_shaders_in_other_languages(fitted, tmp_path):
@@ -276,11 +247,11 @@ def test_shaders_in_other_languages(fitted, tmp_path):
     assert "'--engine': 'any' is not one of 'three'" in fails(*words, "any")
 
 
-def test_textures_for_unreal(fitted, tmp_path):
-    text = call("export", fitted, "--engine", "unreal", "-o", tmp_path / "out", "--cells", 4)
-    assert max(json.loads((tmp_path / "out" / "light.json").read_text())["resolution"]) == 4 and "WlmProbes.usf" in text
-    message = fails("export", fitted, "--engine", "unity", "-o", tmp_path / "no", "--cells", 4)
-    assert "cells" in message
+@pytest.mark.parametrize(("engine", "index", "file"), [("three", "grid", "grid.ktx2"), ("unreal", "light", "sh5.dds")])
+def test_lattices_of_engines(engine, index, file, fitted, tmp_path):
+    text = call("export", fitted, "--engine", engine, "-o", tmp_path / "out", "--cells", 5)
+    assert max(json.loads((tmp_path / "out" / f"{index}.json").read_text())["resolution"]) == 5 and file in text
+    assert "cells" in fails("export", fitted, "--engine", "unity", "-o", tmp_path / "no", "--cells", 4)
 
 
 def test_a_volume_takes_the_normals_of_probes(carrying, room, tmp_path):

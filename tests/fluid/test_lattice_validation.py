@@ -38,6 +38,7 @@ def _cavity_error(reynolds: int, cells: int, steps: int, device: str, **settings
     return float(np.sqrt(np.mean((profile - GHIA[reynolds]) ** 2)))
 
 
+@pytest.mark.slow
 def test_cavity_at_100(device: str):
     """0.0030 when it no longer changes."""
     assert _cavity_error(100, 64, 8000, device) <= 0.006
@@ -84,7 +85,13 @@ def _vortex_ratio(cells: int, device: str, **settings) -> float:
 
 @pytest.mark.parametrize(
     ("lattice", "operator"),
-    [("D2Q9", "bgk"), ("D2Q9", "regularised"), ("D3Q19", "regularised"), ("D3Q19", "bgk"), ("D3Q27", "regularised")],
+    [
+        ("D2Q9", "bgk"),
+        ("D3Q19", "regularised"),
+        pytest.param("D2Q9", "regularised", marks=pytest.mark.slow),
+        pytest.param("D3Q19", "bgk", marks=pytest.mark.slow),
+        pytest.param("D3Q27", "regularised", marks=pytest.mark.slow),
+    ],
 )
 def test_vortices_decay(lattice: str, operator: str, device: str):
     """Within 1% of the decay at the viscosity that was set."""
@@ -117,7 +124,14 @@ def _channel_error(cells: int, device: str, operator: str, lattice: str) -> floa
     return float(np.sqrt(np.mean((profile - 4 * y * (1 - y)) ** 2)))
 
 
-@pytest.mark.parametrize(("lattice", "operator"), [("D2Q9", "bgk"), ("D3Q19", "regularised"), ("D3Q27", "regularised")])
+@pytest.mark.parametrize(
+    ("lattice", "operator"),
+    [
+        ("D2Q9", "bgk"),
+        pytest.param("D3Q19", "regularised", marks=pytest.mark.slow),
+        pytest.param("D3Q27", "regularised", marks=pytest.mark.slow),
+    ],
+)
 def test_channel_is_of_second_order(lattice: str, operator: str, device: str):
     """Poiseuille between half-way walls, driven by a force."""
     errors = [_channel_error(cells, device, operator, lattice) for cells in (4, 8, 16)]
@@ -242,6 +256,7 @@ def _hold_jet(box: Lattice, steps: int, drift: float) -> None:
     assert u[-4:, :, :, 0].sum() / 4 == pytest.approx(inflow, rel=0.1)
 
 
+@pytest.mark.slow
 def test_jet_is_stable(device: str):
     """With the default operator: the mass drifts by rounding, and there is no flutter of period 2."""
     _hold_jet(_jet((24, 12, 12), device), 5000, 1e-6)

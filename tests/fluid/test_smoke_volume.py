@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.volume import from_array, from_grid, load_volume, save_volume
+from wlm.fluid.volume import from_array, load_volume, save_volume
 from wlm.inspection import inspect
 
 _GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
@@ -137,17 +137,6 @@ def test_smoke_that_may_lie_on_its_side(tmp_path: Path):
     assert " --volume up=z -o" in finding.command and len(finding.problems) == 1
     _nvdb(path, np.ones((8, 24, 8), np.float32))
     assert not load_volume(path).warnings and "--volume" not in inspect(path)[0].command
-
-
-def test_grid_on_its_device(device: str):
-    """A `wp.Volume` becomes dense where it lies."""
-    density = np.random.default_rng(2).uniform(0.1, 1, (8, 8, 8)).astype(np.float32)
-    grid = wp.Volume.load_from_numpy(density, min_world=(0.0, 0.0, 0.0), voxel_size=2.0, device=device)
-    volume = from_grid(grid, grid, extinction=3.0)
-    np.testing.assert_array_equal(volume.density.cpu(), density)
-    np.testing.assert_array_equal(volume.temperature.cpu(), density)
-    assert volume.origin == (-1.0, -1.0, -1.0) and volume.voxel == 2.0 and volume.extinction == 3.0
-    assert str(volume.device) == device
 
 
 def test_nvdb_of_two_grids(tmp_path: Path):

@@ -87,26 +87,6 @@ def test_gradients_against_finite_differences(device: str):
         close(np.array((ends[1] - ends[0]) / (2 * size)), np.array((grad.astype(np.float64) * way).sum()), 1e-3)
 
 
-def test_the_identity_reads_the_texture(device: str):
-    """T_c with the coordinates of its texels' centres changes nothing, from its first centre to its last."""
-    random = np.random.default_rng(2)
-    colour = random.uniform(size=(5, 6, 3)).astype(np.float32)
-    v, u = np.meshgrid((np.arange(8) + 0.5) / 8, (np.arange(9) + 0.5) / 9, indexing="ij")
-    lut = np.stack([u, v], -1).astype(np.float32)
-    uv = random.uniform(1 / 16, 15 / 16, (200, 2)).astype(np.float32)
-    close(Reading(colour, lut, uv, device).forward(), Reading(colour, None, uv, device).forward(), 1e-5)
-
-
-def test_the_wave_acts_on_what_was_read(device: str):
-    """Between texels at 0.8 and 1.6 lies 1.2, which F takes to 0.8; F of the texels first would give 0.6."""
-    colour = np.zeros((1, 10, 3), np.float32)
-    colour[0, :, 0] = (np.arange(10) + 0.5) / 10
-    lut = np.zeros((1, 2, 2), np.float32)
-    lut[0, :, 0] = 0.8, 1.6
-    uv = np.array([[0.5, 0.5]], np.float32)
-    assert Reading(colour, lut, uv, device).forward()[0, 0] == pytest.approx(0.8, abs=1e-6)
-
-
 def test_nothing_to_read(device: str):
     """Points that are NaN read NaN and give nothing; so does T_c where it is NaN; no point is no work."""
     colour, lut, _, _ = _case((4, 4), (3, 3), 0.0)

@@ -74,32 +74,24 @@ def _distances(rows: np.ndarray, cubes: Cubes, support: str) -> np.ndarray:
     return np.array(nearest).reshape(len(low), len(rows)) / CUT
 
 
-@pytest.mark.parametrize("support", ["ellipsoid", "sphere"])
-def test_lists_hold_what_meets_the_cube(device: str, support: str):
-    """The lists agree with float64, for ellipsoids with a solver of bounded least squares."""
-    rows = _gaussians(30, 20.0)
+@pytest.mark.parametrize(
+    ("anisotropy", "longest", "support"),
+    [(20.0, 0.2, "ellipsoid"), (20.0, 0.2, "sphere"), (1.0, 0.1, "ellipsoid"), (300.0, 0.4, "ellipsoid")]
+    + [(30000.0, 0.4, "ellipsoid")],
+)
+def test_lists_hold_the_gaussians_that_meet_the_cube(device: str, anisotropy: float, longest: float, support: str):
+    """The lists agree with float64, for ellipsoids with a solver of bounded least squares; sheets are among them."""
+    rows = _gaussians(24, anisotropy, longest)
+    rows[::2, 4] = rows[::2, 3]
     cubes = probe_cubes.build(_shapes(rows, device, support), LOW, HIGH, 0.3)
     assert [*cubes.counts] == [4, 3, 3]
     far = _distances(rows, cubes, support)
     listed = _table(cubes, len(rows))
     assert listed[far <= 1.0].all()
-    assert not listed[far > 1.0 + LOOSE].any()
-    assert 0.02 < listed.mean() < 0.98
-
-
-@pytest.mark.parametrize(("anisotropy", "longest"), [(1.0, 0.1), (300.0, 0.4), (30000.0, 0.4)])
-def test_exact_lists_of_needles_and_sheets(device: str, anisotropy: float, longest: float):
-    """The nearest point of a cube, where the ellipsoid's axes differ by more than float32 can tell."""
-    rows = _gaussians(16, anisotropy, longest)
-    rows[::2, 4] = rows[::2, 3]
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH, 0.25)
-    far = _distances(rows, cubes, "ellipsoid")
-    listed = _table(cubes, len(rows))
-    assert listed[far <= 1.0].all()
     # A cube is a little larger than it should be; to a sheet of 1e-5 that is far.
     slack = LOOSE + 4e-6 / (CUT * np.exp(rows[:, 3:6].min(1)))
     assert not listed[far > 1.0 + slack].any()
-    assert 0.02 < listed.mean() < 0.9
+    assert 0.02 < listed.mean() < 0.98
 
 
 def _reached(row: np.ndarray, random: np.random.Generator, count: int = 60) -> np.ndarray:
@@ -130,19 +122,6 @@ def test_no_list_lacks_a_gaussian_that_reaches(device: str, anisotropy: float, o
             f = wp.zeros_like(want)
             gaussian_sum.sum(used, shapes, probe_cubes.build(shapes, low, high, size), x, f, CUT)
             np.testing.assert_array_equal(f.numpy(), want.numpy())
-
-
-def test_cube_of_points(device: str):
-    """The cube of a point, the nearest one outside of the grid, and some cube for a NaN."""
-    cubes = probe_cubes.build(_shapes(_gaussians(3, 2.0), device), LOW, HIGH, 0.3)
-    random = np.random.default_rng(2)
-    x = np.concatenate([random.random((200, 3)) * 4 - 2, [LOW, HIGH, [np.inf, -np.inf, 1e30], [np.nan] * 3]])
-    x = x.astype(np.float32)
-    out = wp.zeros(len(x), dtype=int, device=device)
-    wp.launch(_cube_of, len(x), inputs=[cubes, array(x, wp.vec3, device)], outputs=[out], device=device)
-    place = np.clip(np.floor((x[:-1] - np.float32(LOW)) / np.float32(0.3)), 0, np.array([3, 2, 2])).astype(int)
-    np.testing.assert_array_equal(out.numpy()[:-1], np.ravel_multi_index(tuple(place.T), (4, 3, 3)))
-    assert 0 <= out.numpy()[-1] < 36
 
 
 def test_hard_gaussians(device: str):
@@ -179,23 +158,6 @@ def test_flat_boxes(device: str):
             counts = [*cubes.counts]
             assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
             assert _table(cubes, 40).any(0).all()
-
-
-def test_chosen_size(device: str):
-    """A quarter of the median reach, or coarser by powers of two where that makes too much."""
-    rows = _gaussians(100, 1.0, longest=0.1)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    assert cubes.size == pytest.approx(0.25 * CUT * 0.1)
-    rows[:, 3:6] = np.log(1e-3)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    most = 4096 + 8 * 100
-    assert most / 8 < np.prod([*cubes.counts]) <= most
-    doubled = np.log2(cubes.size / (0.25 * CUT * 1e-3))
-    assert doubled == pytest.approx(round(doubled), abs=1e-3)
-    # A few small ones don't make the lists of many large ones long.
-    rows[:45, 3:6] = np.log(0.5)
-    cubes = probe_cubes.build(_shapes(rows, device), LOW, HIGH)
-    assert len(cubes.item) <= 4096 + 256 * 100
 
 
 def test_everything_is_one_list(device: str):

@@ -58,9 +58,10 @@ def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
     return _run(march_lit, (), scene, device, toward, March(**march))
 
 
-@pytest.mark.parametrize("kind", TYPES)
-@pytest.mark.parametrize("perspective", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("turned", "perspective", "kind"),
+    [(False, False, "float"), (True, False, "half"), (False, True, "half"), (True, True, "float")],
+)
 def test_guide_against_reference(device: str, turned: bool, perspective: bool, kind: str):
     """Algorithm 1 with a march from each sample, at a step that divides no length."""
     scene = _scene(turned, perspective)
@@ -112,9 +113,9 @@ def test_cutoff(device: str):
         np.testing.assert_array_equal(cut[2], whole[2])
 
 
-@pytest.mark.parametrize("kind", TYPES)
-@pytest.mark.parametrize("inside", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("turned", "inside", "kind"), [(False, False, "half"), (True, False, "float"), (True, True, "half")]
+)
 def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind: str, monkeypatch):
     """The same samples, processed in slabs of a few planes, also from inside the smoke and for hot smoke."""
     scene = _scene(turned, inside=inside)
@@ -125,15 +126,6 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
     for plane in range(8):
         assert expected[plane].max() > 0.01
         close(result[plane], expected[plane], LOOSE, f"plane {plane}")
-
-
-def test_image_smaller_than_the_smoke(device: str):
-    """Smoke outside the image casts shadows: a smaller image equals a part of the larger one."""
-    scene = _scene(True)
-    scene.height = scene.width = 16
-    whole = _six(scene, device, step=0.8)
-    scene.height, scene.width = 4, 6
-    close(_six(scene, device, step=0.8), whole[:, 6:10, 5:11], LOOSE, "window")
 
 
 def test_six_way_against_single_lights(device: str):

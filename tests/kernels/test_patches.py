@@ -63,15 +63,6 @@ def test_samples(device: str):
     assert 0 < (patch["level"] == 0).sum() < len(level)
 
 
-def test_samples_are_exact_at_texels(device: str):
-    """At the centres of texels nothing is interpolated: 8 bits of the texel."""
-    image = _image()
-    corners = np.array([[[3, 4], [7, 4], [3, 8]]], float)
-    samples, _, _ = _sampled(image, corners, np.array([2], np.int32), device)
-    at = np.rint(reference.barycentrics(5) @ corners[0]).astype(int)
-    np.testing.assert_array_equal(_unpacked(samples, np.array([2]))[0], np.rint(image[at[:, 1], at[:, 0]] * 255))
-
-
 def test_orders_are_those_of_permuted_vertices(device: str):
     """A patch reordered equals, exactly, the patch of the triangle with its vertices permuted."""
     image, (corners, level) = _image(), _triangles(12)

@@ -100,15 +100,6 @@ def test_few_probes(device: str, count: int):
     _hold(run)
 
 
-def test_all_probes_are_padding(device: str):
-    """Nothing comes of no probes."""
-    run = Pass((9, 64, 27), 1, device)
-    run.groups.count = 0
-    run.launch()
-    loss, grad_f, grad = run.results()
-    assert loss == 0.0 and not grad_f.any() and not grad.any()
-
-
 def test_sums_in_parts(device: str):
     """On CUDA the Gaussians' sum comes in parts."""
     if device == "cpu":
@@ -130,16 +121,6 @@ def test_two_lanes_equal_one():
     np.testing.assert_array_equal(two.grad_f.numpy(), one.grad_f.numpy())
     close(two.partial.numpy().sum(0), one.partial.numpy().sum(0), 1e-6, "weights")
     close(two.loss.numpy().sum(), one.loss.numpy().sum(), 1e-6, "loss")
-
-
-def test_lanes_add():
-    """On the CPU a launch adds to what its buffers hold."""
-    run = Pass((9, 64, 27), GROUP, "cpu")
-    run.launch()
-    loss, _, grad = run.results()
-    run.launch()
-    assert run.results()[0] == pytest.approx(2 * loss, rel=1e-6)
-    close(run.results()[2], 2 * grad, 1e-6)
 
 
 def test_same_bits_every_time(device: str):
@@ -171,12 +152,3 @@ def test_by_differences(device: str):
     h = 2e-3
     slope = (8.0 * (loss(h) - loss(-h)) - (loss(2 * h) - loss(-2 * h))) / (12.0 * h)
     assert slope == pytest.approx(along, rel=1e-3)
-
-
-def test_sizes():
-    """How many weights there are, and that a block's probes fill a group."""
-    kernels = probe_network.network_kernels(9, 64, 27, "cpu")
-    assert kernels.parts(640) == probe_network.CPU_LANES
-    assert [probe_network.padded(n) for n in (1, 4, 27)] == [4, 4, 28]
-    for latent, hidden, outputs in ((1, 8, 3), (9, 64, 27), (12, 48, 12), (9, 128, 75), (32, 128, 75)):
-        assert GROUP % probe_network.probes_at_once(latent, hidden, outputs) == 0

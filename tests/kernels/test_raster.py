@@ -263,17 +263,6 @@ def test_exact_sign(device: str):
         np.testing.assert_array_equal(sign.numpy(), want)
 
 
-def test_top_left_rule(device: str):
-    """A square with its border on pixel centres, either winding, covers the pixels on its top and left."""
-    for order in ([0, 1, 2, 0, 2, 3], [2, 1, 0, 3, 2, 0]):
-        xy = (2 * np.array([[1, 1], [5, 1], [5, 5], [1, 5]]) + 1 - 8) / 8
-        want = np.zeros((8, 8), int)
-        want[1:5, 1:5] = 1
-        down = _run(_clip(xy * [1, -1]), order, 8, 8, device).coverage.numpy()
-        np.testing.assert_array_equal(down, want)
-        np.testing.assert_array_equal(_run((xy + 1) / 2, order, 8, 8, device).coverage.numpy(), want)
-
-
 def test_the_nearest_then_the_first(device: str):
     """Of two at the same depth the one of less number, whichever comes first in the list of large ones."""
     position = _clip(np.array([[-3, -3], [3, -3], [0, 3]]))

@@ -72,24 +72,6 @@ def test_slope_against_finite_differences(device: str, boundary: str):
         close(grad_uv[:, axis], (ends[1] - ends[0]) / 2.0**-7, 1e-3, "slope")
 
 
-def test_centres_and_borders(device: str):
-    """At a centre its texel, to the bit; at 0 and 1 what each boundary says."""
-    image = np.array([[[1.0], [2.0], [4.0], [8.0]]], np.float32)
-    centres = np.stack([(np.arange(-4, 8) + 0.5) / 4, np.full(12, 0.5)], 1).astype(np.float32)
-    ends = np.array([[0.0, 0.5], [1.0, 0.5]], np.float32)
-    want = {
-        "clamp": ([1, 1, 1, 1, 1, 2, 4, 8, 8, 8, 8, 8], [1, 8]),
-        "wrap": ([1, 2, 4, 8, 1, 2, 4, 8, 1, 2, 4, 8], [4.5, 4.5]),
-        "mirror": ([8, 4, 2, 1, 1, 2, 4, 8, 8, 4, 2, 1], [1, 8]),
-    }
-    for boundary, (at_centres, at_ends) in want.items():
-        for filter in FILTERS:
-            values = Reading(image, centres, device, filter=filter, boundary=boundary).forward()[:, 0]
-            np.testing.assert_array_equal(values, at_centres)
-        values = Reading(image, ends, device, boundary=boundary).forward()[:, 0]
-        np.testing.assert_array_equal(values, at_ends)
-
-
 def test_a_texel_at_a_centre_stands_alone(device: str):
     """An infinite neighbour without weight isn't read."""
     image = np.array([[[1.0], [np.inf]], [[np.nan], [3.0]]], np.float32)

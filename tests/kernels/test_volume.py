@@ -113,29 +113,6 @@ def test_points_that_nothing_covers(device: str):
     assert grid.read(np.zeros((0, 3)), np.zeros(3))[0].shape == (0, 3)
 
 
-def test_linear_field_is_exact(device: str):
-    """Where a level has all 8 blocks round a point, and no finer one has any, the level reproduces it."""
-    bases = np.full((3, 3), -SIDE // 2, np.int32)
-    grid = Grid(bases, SIZES, SIDE, 5, device)
-    slope, constant = np.random.default_rng(3).normal(size=(3, 5)), np.arange(5.0)
-    for level, size in enumerate(SIZES):
-        grid.write({name: (np.array(name[1:]) + 0.5) * size @ slope + constant for name in grid.window(level)})
-    origin = np.array([0.1, -0.1, 0.05])
-    points = np.random.default_rng(4).uniform(-1.0, 1.0, (3000, 3)) * np.repeat([0.75, 1.5, 6.0], 1000)[:, None]
-    values, level, weight = grid.read(points, origin)
-    close(weight, np.ones(len(points)), 1e-6, "weight")
-    # The outermost centres lie 1.5 blocks from the middle, and reach one block further.
-    away = np.abs(points).max(1)
-    for which, (first, last) in enumerate([(0.0, 0.75), (1.25, 1.5), (2.5, 6.0)]):
-        alone = (away >= first) & (away <= last)
-        close(values[alone], (points @ slope + constant)[alone], 1e-6, f"field at level {which}")
-        assert alone.sum() > 100 and (level[alone] == which).all()
-    # The finest answers alone: another field in the others changes not one bit.
-    grid.write({name: np.full(5, 1e6) for coarse in (1, 2) for name in grid.window(coarse)})
-    inner = away <= 0.75
-    np.testing.assert_array_equal(grid.read(points, origin)[0][inner], values[inner])
-
-
 def test_continuous_across_missing_blocks(device: str):
     """Over holes and borders of windows a small step never jumps, as long as some level has all."""
     bases = np.full((3, 3), -SIDE // 2, np.int32)

@@ -243,7 +243,7 @@ SHOWN = "light = vec4(wlm_radiance(pixel), 1.0);"
 
 @pytest.mark.parametrize("settings", AXES[1:5], ids=str)
 def test_the_shader_gives_the_decoders_light(settings, tmp_path):
-    """Of the other settings; `tests/export/shading` has the default ones, kinds of tiles and languages."""
+    """The other settings; `tests/export/shading` checks the default ones, kinds of tiles and languages."""
     model = random_sheet(**settings)
     export(file_of(model), tmp_path)
     uniforms, hour = lightmap_uniforms(tmp_path)
@@ -257,7 +257,7 @@ def test_the_shader_gives_the_decoders_light(settings, tmp_path):
 
 @pytest.mark.parametrize("time", TIMES[1:])
 def test_a_table_between_two_hours(time, tmp_path):
-    """Of networks that interpolate, with frames, which do not."""
+    """Networks that interpolate, with frames, which do not."""
     model = random_sheet((3, 4, 1, 2), interpolation="network")
     with pytest.raises(ValueError, match="expected a stored one"):
         hour_tables(random_sheet(), [time])

@@ -1,4 +1,4 @@
-"""What the demo's set reaches in a short fit: no change of the codec may cost this much of it."""
+"""A short fit of the demo's set must reach a PSNR, so that no change of the codec costs quality unnoticed."""
 
 from pathlib import Path
 

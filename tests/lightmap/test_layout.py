@@ -1,4 +1,4 @@
-"""Pictures of one atlas are told from those of several, whatever the light is."""
+"""Pictures of one atlas are distinguished from pictures of several atlases, whatever the light is."""
 
 import numpy as np
 import pytest

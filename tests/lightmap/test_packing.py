@@ -104,7 +104,7 @@ def test_what_is_not_read_changes_no_light(count, period, rows):
 
 
 def _changed(tmp_path, **tensors) -> str:
-    """What reading a file says whose parts were replaced."""
+    """Returns the error of a file whose parts were replaced."""
     model = random_model((3, 2, 1, 0))
     model.save(tmp_path / "a.wlm")
     artifact = read_artifact(tmp_path / "a.wlm")

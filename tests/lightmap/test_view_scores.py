@@ -87,7 +87,7 @@ def test_gaps_unfilled_are_seen_and_the_texels_do_not_tell():
     # 4 sides of 64 texels of 4,096.
     assert score.seen == pytest.approx(db(off * math.sqrt(1 / 24 / 16)), abs=0.3)
     assert score.worst_seen == {"psnr": score.seen, "time": 0.0, "tile": 0, "row": 0, "column": 0}
-    # What no read touches may be anything, and the ring with it but for its own score.
+    # Texels that no read touches may have any value, and the ring too except in its own score.
     ring = np.zeros_like(mask)
     ring[31:97, 31:97] = True
     far = np.where(ring[..., None], filled, np.nan).astype(np.float32)

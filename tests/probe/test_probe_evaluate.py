@@ -1,6 +1,5 @@
 """Scores of decoded probes, against plain sums and light whose score is known."""
 
-import json
 import math
 
 import numpy as np
@@ -57,6 +56,7 @@ def test_the_scores_are_those_of_plain_sums(pair):
     for band, part in enumerate((slice(0, 3), slice(3, 12), slice(12, 27))):
         assert report.psnr_by_band[band] == pytest.approx(decibels(error[:, part], peak))
     assert (report.name, report.probes, report.live, report.outputs) == ("room", 50, 48, 27)
+    assert report.bits_per_probe == 1000 * 8 / 50 and report.ratio == 1000 / (50 * 27 * 4)
 
 
 def test_irradiance_is_scored_where_light_falls(pair):
@@ -76,15 +76,6 @@ def test_an_error_that_no_diffuse_surface_sees_costs_no_irradiance():
     report = score(decoded, probes, 100)
     assert report.psnr < 20 and report.psnr_by_band[:3] == [PSNR_CAP_DB] * 3
     assert report.irradiance_psnr == PSNR_CAP_DB
-
-
-def test_noise_of_a_known_size_has_a_known_score():
-    values = np.zeros((4, 27), np.float32)
-    values[0, 0], values[1, 0] = 2.0, -2.0
-    report = score(values + np.float32(0.25), probe_set(values), 54)
-    assert report.psnr == pytest.approx(20 * math.log10(4 / 0.25))
-    assert (report.mse, report.max_abs_error) == (0.0625, 0.25)
-    assert report.bits_per_probe == 54 * 8 / 4 and report.ratio == 54 / (4 * 27 * 4)
 
 
 def test_an_exact_copy_has_the_capped_score(pair):
@@ -109,14 +100,6 @@ def test_a_model_is_scored_as_its_decode_is(device):
     assert evaluate(model, probes, device=device, file_bytes=7).bytes == 7
 
 
-def test_the_report_is_json(pair):
-    report = score(*pair, 1000)
-    document = report.to_json()
-    assert json.loads(json.dumps(document, allow_nan=False)) == document
-    assert document["psnr"] == report.psnr
-    assert document["worst_probe"]["position"] == report.worst_probe["position"]
-
-
 @pytest.mark.parametrize("offset", [0.0, 0.5])
 def test_without_a_range_there_is_no_psnr(offset):
     probes = probe_set(np.full((3, 27), 0.25))
@@ -124,13 +107,6 @@ def test_without_a_range_there_is_no_psnr(offset):
     assert math.isnan(report.psnr) and math.isnan(report.psnr_live) and report.to_json()["psnr"] is None
     assert all(math.isnan(score) for score in report.psnr_by_band)
     assert report.max_abs_error == offset
-
-
-def test_light_from_everywhere_has_no_range_of_irradiance():
-    values = np.zeros((3, 27), np.float32)
-    values[:, :3] = 1.0
-    report = score(values * np.float32(0.5), probe_set(values), 100)
-    assert math.isfinite(report.psnr) and math.isnan(report.irradiance_psnr)
 
 
 @pytest.mark.parametrize("outputs", [1, 2, 6, 28])
@@ -141,15 +117,9 @@ def test_numbers_that_are_no_bands_have_no_irradiance(outputs):
     assert report.psnr == pytest.approx(20 * math.log10(5 * outputs - 1))
 
 
-def test_one_probe():
-    values = np.arange(27.0)[None]
-    report = score(values.astype(np.float32), probe_set(values), 10)
-    assert report.psnr == PSNR_CAP_DB and report.bits_per_probe == 80
+def test_one_probe_and_none():
     report = score(np.ones((1, 1), np.float32), probe_set([[3.0]]), 10)
     assert math.isnan(report.psnr) and report.mse == 4.0 and report.worst_probe["probe"] == 0
-
-
-def test_no_live_probe():
     probes = probe_set(np.zeros((2, 27)), live=[False, False])
     report = score(probes.values, probes, 10)
     assert math.isnan(report.psnr_live) and math.isnan(report.irradiance_psnr) and report.live == 0

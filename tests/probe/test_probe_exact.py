@@ -65,7 +65,3 @@ def test_a_gaussian_ends_at_the_cut():
     nothing = decode64(model, middle + way)
     assert (inside != nothing[0]).any()
     np.testing.assert_allclose([outside, far], nothing[1:], rtol=1e-12)
-
-
-def test_no_point():
-    assert decode64(random_model(), np.zeros((0, 3))).shape == (0, 27)

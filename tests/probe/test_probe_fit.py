@@ -8,7 +8,7 @@ from builders.probe_sets import synthetic
 
 import wlm
 from wlm.errors import WlmError
-from wlm.probe.data import from_arrays, save_probes
+from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import compress, open_checkpoint
 from wlm.probe.gaussian import trainer as training
@@ -36,30 +36,6 @@ def test_it_learns_and_says_how_well():
     assert psnr - 1.0 < reports[-1].figures["PSNR dB"] < psnr + 0.1
 
 
-def test_from_file_to_light_by_the_public_names(tmp_path):
-    probes = synthetic(60)
-    save_probes(tmp_path / "street.npz", probes.position, probes.values, key="sh_12.00")
-    probes = wlm.probe.load(tmp_path / "street.npz", key="12.00")
-    model = wlm.probe.compress(probes, "small", steps=20, method="gaussians")
-    assert (model.profile.name, model.profile.hidden, model.profile.steps) == ("small", 24, 20)
-    points = RANDOM.random((5, 3))
-    light = model.decoder("cpu").decode(points)  # [M, 3] -> [M, 27]
-    assert light.shape == (5, 27) and np.isfinite(light).all()
-    model.save(tmp_path / "street.wlm")
-    np.testing.assert_array_equal(wlm.load(tmp_path / "street.wlm").decoder("cpu").decode(points), light)
-    with pytest.raises(WlmError, match="unknown key 'step'; did you mean 'steps'"):
-        wlm.probe.compress(probes, "small", step=20)
-    assert all(getattr(wlm.probe, name) is not None for name in wlm.probe.__all__)
-
-
-def test_one_seed_gives_one_result():
-    probes = synthetic(130, dead=9)
-    first, second = compress(probes, SMALL, seed=3), compress(probes, SMALL, seed=3)
-    assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(second), strict=True))
-    other = compress(probes, SMALL, seed=4)
-    assert not np.array_equal(first.content.net, other.content.net)
-
-
 @pytest.mark.parametrize("stop", [20, 52, 58])  # in each of the stages, which begin at 0, 50 and 55
 def test_a_stopped_fit_goes_on_exactly(tmp_path, stop):
     probes = synthetic(130)
@@ -71,21 +47,6 @@ def test_a_stopped_fit_goes_on_exactly(tmp_path, stop):
     trainer.close()
     again = compress(probes, SMALL, checkpoint=open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True))
     assert all(np.array_equal(a, b) for a, b in zip(arrays(whole), arrays(again), strict=True))
-
-
-def test_an_interrupt_is_kept(tmp_path):
-    probes = synthetic(130)
-    checkpoint = open_checkpoint(tmp_path / "a.wlm", probes, SMALL)
-
-    def stop(now):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        compress(probes, SMALL, progress=stop, checkpoint=checkpoint)
-    with pytest.raises(WlmError, match="seed"):
-        open_checkpoint(tmp_path / "a.wlm", probes, SMALL, seed=1, resume=True)
-    stored = open_checkpoint(tmp_path / "a.wlm", probes, SMALL, resume=True)
-    assert stored.running(0)["control"][0] == 60  # a short fit reports at its end
 
 
 def _input(probes):

@@ -209,17 +209,6 @@ def test_no_read_of_a_block_that_is_not_there(device: str):
     assert dropped > 0 and cached > 0
 
 
-def test_oscillation_costs_no_decode(device: str):
-    """To and fro over the border of a block: after one cycle, nothing is decoded and nothing waits."""
-    volume = _volume(_surface(), device)
-    ends = ([0.9, 1.0, 0.9], [1.1, 1.0, 1.1])
-    for end in ends:
-        settle(volume, end)
-    stats = [volume.update(ends[i % 2]) for i in range(6)]
-    assert sum(s.cached for s in stats) > 0
-    assert all((s.left, s.updated, s.queued, s.dropped, s.probes) == (0, 0, 0, 0, 0) for s in stats)
-
-
 def test_the_pool_gives_away_the_least_recently_used(device: str):
     """Three places of one block each, and rows for two: what was seen last is still there, what is seen never goes."""
     position = np.array([[1.0, 1.0, 1.0], [101.0, 1.0, 1.0], [201.0, 1.0, 1.0]])
@@ -305,13 +294,6 @@ def test_dead_probes_are_left_out(device: str):
         np.testing.assert_array_equal(got, want)
 
 
-def test_coincident_probes_count_alike(device: str):
-    place = np.array([[1.0, 1.0, 1.0]] * 3)
-    volume = Volume(place, StoredLight(np.array([[1.0], [2.0], [6.0]]), device))
-    volume.update([0.0, 0.0, 0.0])
-    assert volume.read(place[:1]).values[0, 0] == pytest.approx(3.0, rel=5e-6)
-
-
 def test_a_model_is_decoded_where_it_is_asked(device: str):
     """Blocks from a model are those from what it decodes to."""
     model = random_model(outputs=12, latent=5)
@@ -352,14 +334,11 @@ def test_a_wrong_viewpoint_changes_nothing(viewpoint: object):
     ("settings", "word"),
     [
         ({"block": 0.0}, "block"),
-        ({"block": np.inf}, "block"),
         ({"block": np.nan}, "block"),
         ({"ratios": ()}, "ratios"),
         ({"ratios": (1, 3)}, "ratios"),
-        ({"ratios": (2, 4)}, "ratios"),
         ({"ratios": (1, 2, 2)}, "ratios"),
         ({"side": 3}, "side"),
-        ({"side": 66}, "side"),
         ({"budget": 0}, "budget"),
         ({"rows": 63}, "rows"),
     ],

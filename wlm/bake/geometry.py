@@ -97,12 +97,7 @@ class Geometry:
 
 
 def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = False) -> Geometry:
-    """Reads a glTF file.
-
-    Args:
-        path: The file.
-        settings: Selects the lightmap UVs or how to unwrap them; None if no UVs are needed.
-        trust: Whether it may refer to files outside its folder.
+    """Reads a glTF file; `settings` selects the lightmap UVs or how to unwrap them, None if no UVs are needed.
 
     Raises:
         WlmError: It can't be read, has no triangle with area, is too small, too large or too far from the origin for
@@ -191,11 +186,6 @@ def unwrap(
 ) -> list[Replacement]:
     """Creates UVs in one unit square for all primitives together, in proportion to their world-space size.
 
-    Args:
-        document: The file, for messages.
-        primitives: The primitives without the new UV set.
-        settings: Resolution and padding.
-
     Returns:
         A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
 
@@ -244,10 +234,8 @@ def unwrap(
 def _without_lightmap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive]
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Returns a copy without the UV sets from 1 on, which belong to an old lightmap and are replaced.
-
-    Raises:
-        WlmError: A texture reads `TEXCOORD_1` or later.
+    """Returns a copy without the UV sets from 1 on, which belong to an old lightmap; a texture that reads one is an
+    error.
     """
     content = copy.deepcopy(document.content)
     for material in content.get("materials", []):

@@ -91,15 +91,13 @@ def bake_lightmaps(
     All hours use the same random numbers, so that remaining noise doesn't flicker between them.
 
     Args:
-        task: Result of `wlm.bake.work.open_task`.
+        task, checkpoint: Results of `wlm.bake.work.open_task` and `open_checkpoint`; the latter may be None.
         device: "cpu" or "cuda".
-        checkpoint: Result of `wlm.bake.work.open_checkpoint`, or None.
-        progress: Called from time to time.
+        progress: Called from time to time; a KeyboardInterrupt that it raises leaves a written checkpoint.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
             a lamp names a material that doesn't exist.
-        KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     scene = task.scene
     start(device)
@@ -191,15 +189,7 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
 
 
 def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:
-    """Writes a lightmap set for `wlm compress`, replacing an earlier one.
-
-    Args:
-        folder: The output folder, created if it doesn't exist.
-        task: The scene.
-        baked: The scene's lightmaps.
-
-    Returns:
-        The paths of the files.
+    """Writes a lightmap set for `wlm compress`, replacing an earlier one, and returns the paths of its files.
 
     Raises:
         WlmError: The folder contains other files, or can't be written.

@@ -113,12 +113,7 @@ class _Outside:
 def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool = False, report: Any = None) -> Gathered:
     """Computes irradiance at the texels of a lightmap, as the mean over their sample positions.
 
-    Args:
-        scene: The Mitsuba scene.
-        texels: `wlm.bake.texels.Texels`, T of them.
-        tracing: Settings of the path tracer.
-        directional: Whether to compute light directions, too.
-        report: Called with the finished share of the work.
+    `report` is called with the finished share of the work.
 
     Returns:
         Estimates with three channels, RGB. With `directional` three more: the sum of the directions of incident light,
@@ -166,12 +161,8 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
 
 
 def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Projects radiance at points onto orthonormal L2 spherical harmonics, in the order of `wlm.probe.sphere.basis`.
-
-    Args:
-        scene: The Mitsuba scene.
-        position: float [N, 3].
-        tracing, report: As for `irradiance`.
+    """Projects radiance at points [N, 3] onto orthonormal L2 spherical harmonics, in the order of
+    `wlm.probe.sphere.basis`.
 
     Returns:
         Estimates with 27 channels: red, green and blue of each coefficient.

@@ -41,12 +41,7 @@ class BakedProbes:
 
 
 def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
-    """Computes the probes' positions, float32 [N, 3].
-
-    Args:
-        settings: Spacing, and whether probes lie on surfaces or in a lattice.
-        geometry: The surfaces.
-        seed: Seed of the random positions on surfaces.
+    """Computes the probes' positions, float32 [N, 3]; `seed` is that of the random positions on surfaces.
 
     Raises:
         WlmError: There would be more than a million probes.

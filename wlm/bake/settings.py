@@ -193,11 +193,7 @@ class BakeScene(_Settings):
 
 
 def load_scene(path: str | os.PathLike[str], trust: bool = False) -> tuple[BakeScene, Path, Path | None]:
-    """Reads a scene.
-
-    Args:
-        path: The YAML file.
-        trust: Whether it may refer to files outside its folder.
+    """Reads a scene from its YAML file; with `trust` it may refer to files outside its folder.
 
     Returns:
         The settings, the path of the glTF file, and the path of the environment map or None.

@@ -60,12 +60,9 @@ class SixWayScene(BaseModel):
 def load_sixway(
     path: str | os.PathLike[str], *, device: str = "cpu", trust: bool = False
 ) -> tuple[SixWayScene, Frames]:
-    """Reads a scene and opens its smoke.
+    """Reads a scene from its YAML file and opens its smoke on a device.
 
-    Args:
-        path: The YAML file.
-        device: "cpu" or "cuda:N".
-        trust: Whether it may refer to files outside its folder, and whether volumes may exceed the size limits.
+    With `trust` it may refer to files outside its folder, and volumes may exceed the size limits.
 
     Raises:
         WlmError: A file can't be read, or a setting is wrong.
@@ -79,11 +76,6 @@ def load_sixway(
 
 def bake_sixway(volume: DensityVolume, camera: Camera, settings: SixWayScene) -> tuple[SixWay, float]:
     """Traces light from six directions; ray marching computes emission and transparency.
-
-    Args:
-        volume: The smoke.
-        camera: An orthographic camera.
-        settings: The settings of the scene.
 
     Returns:
         The lightmaps, with `settings.albedo`, and the RMS of their noise divided by the RMS of their light.

@@ -50,13 +50,9 @@ class Texels:
 
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
-    """Computes the sample positions of all texels: the covered points of a lattice in each texel.
+    """Computes the sample positions of all texels: the covered points of a lattice in each.
 
-    Args:
-        where: Name of the geometry in errors.
-        surfaces: The surfaces; those without lightmap UVs are skipped.
-        resolution: Texels along a side.
-        supersample: Sample positions along a texel's side.
+    Surfaces without lightmap UVs are skipped; `where` names the geometry in errors.
 
     Raises:
         WlmError: There are too many samples, no triangle covers one, or charts overlap.

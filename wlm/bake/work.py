@@ -44,10 +44,8 @@ class Task:
 def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bool = False) -> Task:
     """Reads a scene file and its environment map.
 
-    Args:
-        path: The YAML file.
-        trust: Whether it may refer to files outside its folder.
-        directional: Whether to bake light directions even if the file doesn't request them.
+    With `trust` the file may refer to files outside its folder. With `directional` light directions are baked even if
+    the file doesn't request them.
 
     Raises:
         WlmError: A file can't be read, a setting is wrong, or the image isn't an environment map.
@@ -71,14 +69,7 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
 def open_checkpoint(
     output: str | os.PathLike[str], task: Task, what: str, device: str, *, resume: bool = False
 ) -> Checkpoint:
-    """Opens the checkpoint file that stores a bake's finished hours, beside its output.
-
-    Args:
-        output: Output path of the bake.
-        task: The scene.
-        what: "lightmaps" or "probes".
-        device: "cpu" or "cuda".
-        resume: Whether to continue from the file if it exists.
+    """Opens the file beside `output` that stores a bake's finished hours; `what` is "lightmaps" or "probes".
 
     Raises:
         WlmError: With `resume`, the file is damaged or belongs to another bake.
@@ -99,12 +90,8 @@ def each_hour(
 ) -> list[dict[str, np.ndarray]]:
     """Computes the result of each hour, except those in the checkpoint.
 
-    Args:
-        hours: The hours.
-        checkpoint: Stores finished hours; None stores nothing.
-        table: The arrays of an hour's result.
-        make: Computes an hour's result, and calls its second argument with the finished share.
-        progress: Called regularly.
+    `make` computes the arrays of an hour, which `table` describes, and calls its second argument with the finished
+    share; `progress` is called regularly.
     """
     meter, results = Meter(progress, "bake", _REPORTS * len(hours)), []
     try:

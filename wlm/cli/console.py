@@ -181,12 +181,9 @@ def write_json(path: Path, value: Any) -> None:
 def check_output(path: Path, *suffixes: str) -> None:
     """Checks before long work that its output file can be written.
 
-    Args:
-        path: The file.
-        suffixes: Allowed suffixes of the name, so that an input given as the output is not overwritten.
-
     Raises:
-        WlmError: The name has another suffix, the folder is missing or read-only, or the path is no regular file.
+        WlmError: The name has none of the suffixes, which guards against an input given as the output; the folder is
+            missing or read-only; or the path is no regular file.
     """
     if path.suffix.lower() not in suffixes:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
@@ -235,13 +232,8 @@ def quiet_warp() -> None:
 def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """Shows progress on stderr: a bar on a terminal, else a plain line about every tenth of the work.
 
-    Work without a known number of steps gets one line at its beginning.
-
-    Args:
-        what: Name of the work in a word or two.
-
-    Yields:
-        A function to call with the finished steps, the total, and a text to show with them.
+    Work without a known number of steps gets one line at its beginning. Yields a function to call with the finished
+    steps, the total, and a text to show with them.
     """
     console = _console(stderr=True)
     clock = _Clock()

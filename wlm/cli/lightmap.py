@@ -283,13 +283,6 @@ def _show_report(file: Path, report: "Report") -> None:
     scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
     for stamp, *values in zip(report.times, *scores, strict=True):
         rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
-    rows.add_section()
-    for tile, values in enumerate(
-        zip(light.psnr_by_tile.ravel(), light.ssim_by_tile.ravel(), light.flip_by_tile.ravel(), strict=True)
-    ):
-        # Tiles that are empty or not in the file have no score.
-        if any(value == value for value in values):
-            rows.add_row(f"tile {tile}", *map(number, values, (".2f", ".4f", ".4f")))
     show(rows)
     _show_where_shown(report)
     _note_worst(light)

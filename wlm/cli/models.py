@@ -96,16 +96,10 @@ def export(
 def describe(
     file: Path, system: str, device: str | None, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]
 ) -> Any:
-    """Shows what a file contains: its settings, its sizes, and the facts of its system.
+    """Shows what a file of a system contains: its settings, its sizes, and the facts of its system; returns the model.
 
-    Args:
-        file, as_json: Values of the options.
-        system: Name of the system that must have written the file.
-        device: Device whose memory is shown; None for none.
-        facts: Returns the facts of a model as JSON values by name.
-
-    Returns:
-        The model.
+    `facts` returns the facts of a model as JSON values by name. With a device, the memory that the model needs there is
+    shown.
     """
     quiet_warp()
     from wlm.formats.artifact import read_artifact

@@ -7,11 +7,8 @@ import typer
 
 from wlm.cli.console import number, quiet_warp, running, show, show_files, table
 from wlm.cli.options import Device, Key, ModelFile, output_option
-from wlm.errors import WlmError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from wlm.probe import ProbeModel, ProbeSet
     from wlm.probe.views import ViewScore
 
@@ -41,7 +38,8 @@ def volume(
         ),
     ] = None,
     at: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Position of the viewer; default the middle of the probes.")
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Position of the viewer; default the middle of the probes."),
     ] = None,
     block: Annotated[
         float | None, typer.Option(help="Side of the finest blocks; default from the distances of the probes.")
@@ -54,6 +52,8 @@ def volume(
     Normals of PROBES keep light from passing through walls. wlm evaluate --volume scores walks through the scene.
     """
     quiet_warp()
+    import numpy as np
+
     from wlm.export import export
     from wlm.probe.places import probes_of
     from wlm.probe.volume.bundle import volume_bundle
@@ -66,20 +66,8 @@ def volume(
     light = model.decoder(device).light(known.position)
     made = Volume(known.position, light, live=known.live, normal=known.normal, block=block)
     lit = known.position[known.live]
-    settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else _point(at))
+    settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else np.array(at))
     show_files(output, export(volume_bundle(made), output))
-
-
-def _point(text: str) -> "np.ndarray":
-    import numpy as np
-
-    try:
-        point = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        point = np.zeros(0)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise WlmError(f"--at: expected three numbers as x,y,z, got {text}")
-    return point
 
 
 def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:

@@ -55,12 +55,8 @@ def register(
 ) -> None:
     """Adds a verb to the command line.
 
-    Args:
-        app: The root.
-        name: One of `VERBS`.
-        help_text: Text that `--help` shows without a file.
-        metavar, argument_help: The first argument in that text.
-        detect: Returns the system of a file; raises WlmError with the next step if there is none.
+    `metavar`, `argument_help` and `help_text` are what `--help` shows without a file. `detect` returns the system of a
+    file, or raises WlmError with the next step if there is none.
     """
 
     def general(
@@ -97,15 +93,10 @@ def variant(verb: str, system: str) -> Any:
 
 
 def first_argument(words: Sequence[str], options: Mapping[str, bool]) -> str | None:
-    """Finds the first argument of a command line, the first word that is neither an option nor its value.
+    """Returns the first word of a command line that is neither an option nor its value, or None.
 
-    Args:
-        words: The command line after the verb.
-        options: For each known option whether it takes a value. A word after another option, which is generated from a
-            setting, is its value unless it names an existing file or folder.
-
-    Returns:
-        The word, or None.
+    `options` states for each known option whether it takes a value. A word after another option, which is generated
+    from a setting, is its value unless it names an existing file or folder.
     """
     value: bool | None = False  # whether the next word is a value; None: unless it names a file
     for word in words:
@@ -119,11 +110,7 @@ def first_argument(words: Sequence[str], options: Mapping[str, bool]) -> str | N
 
 
 def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
-    """Removes `--system NAME` from a command line.
-
-    Raises:
-        WlmError: There is no such system.
-    """
+    """Removes `--system NAME` from a command line; an unknown name is an error."""
     words, system, rest = [], None, iter(args)
     for word in rest:
         if word == "--system" or word.startswith("--system="):

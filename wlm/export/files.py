@@ -29,16 +29,9 @@ _UNORM_16 = 65535
 
 
 def write_texture(folder: Path, name: str, texture: Texture, ending: str | None = None) -> dict[str, Any]:
-    """Writes a texture as a DDS file, or as KTX2 if DDS does not have its format.
+    """Writes a texture as a DDS file, or as KTX2 if DDS does not have its format, and returns its entry of the index.
 
-    Args:
-        folder: The folder; it must exist.
-        name: Name of the texture, and of the file without its ending.
-        texture: The texture.
-        ending: Ending of the file's name if it is not ".dds" or ".ktx2".
-
-    Returns:
-        The texture's entry of the index.
+    `ending` replaces the usual ending of the file's name, ".dds" or ".ktx2".
 
     Raises:
         WlmError: The texture is larger than GPUs accept, or the file cannot be written.

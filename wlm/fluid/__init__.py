@@ -38,7 +38,6 @@ _PLACES = {
     "Trajectory": "wlm.fluid.obstacles",
     "box_mesh": "wlm.fluid.obstacles",
     "from_array": "wlm.fluid.volume",
-    "from_grid": "wlm.fluid.volume",
     "load_volume": "wlm.fluid.volume",
     "save_volume": "wlm.fluid.volume",
 }

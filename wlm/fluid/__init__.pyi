@@ -12,6 +12,5 @@ from wlm.fluid.solver import Solver as Solver
 from wlm.fluid.solver import Source as Source
 from wlm.fluid.volume import DensityVolume as DensityVolume
 from wlm.fluid.volume import from_array as from_array
-from wlm.fluid.volume import from_grid as from_grid
 from wlm.fluid.volume import load_volume as load_volume
 from wlm.fluid.volume import save_volume as save_volume

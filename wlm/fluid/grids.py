@@ -66,12 +66,10 @@ class Lattice:
 
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
-    """Puts grids on one lattice, aligned with the first grid, over the bounding box of all grids.
+    """Puts grids on one lattice of at most `most` voxels, aligned with the first grid, over the bounding box of all
+    grids.
 
-    Args:
-        grids: At least one.
-        most: Largest number of voxels of the lattice.
-        up: "x", "y" or "z", the axis of the grids' world that becomes +y.
+    `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
 
     Returns:
         The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
@@ -195,11 +193,8 @@ class NanoVdbEntry:
     codec: int
 
     def load(self, where: str, trust: bool) -> wp.Volume:
-        """Decompresses the grid.
-
-        Args:
-            where: Name of the file in messages.
-            trust: Whether the grid may be as large as it claims.
+        """Decompresses the grid; `trust` tells whether it may be as large as it claims, and `where` names the file in
+        messages.
 
         Raises:
             WlmError: The grid is too large for its compressed size.
@@ -270,13 +265,8 @@ def entries(data: bytes) -> Iterator[NanoVdbEntry]:
 def dense(volume: wp.Volume, name: str, most: int) -> Grid:
     """Makes a grid dense over the box of its active voxels, on its device; over voxel 0 if none is active.
 
-    Args:
-        volume: A grid of floats.
-        name: Name in messages.
-        most: Largest number of voxels of the box.
-
     Raises:
-        WlmError: The grid does not contain floats, or is too large.
+        WlmError: The grid does not contain floats, or its box has more than `most` voxels.
     """
     if volume.dtype is not wp.float32:
         raise WlmError(f"{name}: expected a grid of floats, found {volume.get_grid_info().type_str}")

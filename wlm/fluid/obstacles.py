@@ -68,11 +68,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Trajectory":
-        """Makes a trajectory.
-
-        Args:
-            positions: [K, 3], or one constant position (3,), cells.
-            times: [K], steps.
+        """Makes a trajectory through positions [K, 3] in cells at times [K] in steps, or one constant position (3,).
 
         Raises:
             ValueError: A shape is wrong, a number is not finite, or the times do not increase.
@@ -180,11 +176,7 @@ Obstacle = Sphere | Mesh
 
 
 def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
-    """Makes a box with its edges along the axes.
-
-    Args:
-        path: Path of the centre.
-        size: (3,), lengths of the edges in cells, above 0.
+    """Makes a box with its edges along the axes, of lengths `size` in cells, centred on the path.
 
     Raises:
         ValueError: A length is not above 0.

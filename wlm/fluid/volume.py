@@ -55,14 +55,11 @@ EDGE = 8
 
 
 def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Extracts the bricks in which any of several fields is not 0.
-
-    Args:
-        fields: [X, Y, Z] each, of one shape, on one device.
+    """Extracts the bricks in which any of several fields [X, Y, Z] of one shape is not 0.
 
     Returns:
-        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0 outside
-        the box.
+        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0
+        outside the box.
     """
     margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
     cut = []
@@ -278,11 +275,8 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
     """Writes a volume as `.npz`, atomically; `load_volume` reads it back.
 
-    Args:
-        path: The file.
-        volume: The smoke.
-        bricks: Whether to omit empty bricks instead of compressing everything by deflate: much faster, but the file is
-            larger and other programs cannot read it.
+    With `bricks` empty bricks are omitted instead of compressing everything by deflate: this is much faster, but the
+    file is larger and other programs cannot read it.
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.
@@ -384,44 +378,6 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
             # A tensor, which `from_array` need not copy.
             arrays[field] = torch.from_numpy(arrays[field])
     return arrays
-
-
-def from_grid(
-    density: wp.Volume,
-    temperature: wp.Volume | None = None,
-    *,
-    extinction: float = 1.0,
-    emission: float = 1.0,
-    name: str = "grid",
-    trust: bool = True,
-    up: str = "y",
-) -> DensityVolume:
-    """Makes a validated volume from a NanoVDB grid, on the grid's device, over the box of its active voxels.
-
-    The volume is dense: a march reads eight voxels per sample, each of which would be a traversal of the tree.
-
-    Args:
-        density: A grid of floats.
-        temperature: Another grid, or None.
-        extinction: Extinction per unit of length at density 1.
-        emission: Light emitted per unit of length at temperature 1.
-        name: Name in messages.
-        trust: Whether the box may be large although the grid stores few voxels; false for files of unknown origin.
-        up: "x", "y" or "z", the axis of the grid's world that becomes +y.
-
-    Returns:
-        The volume, repaired as in the module's table.
-
-    Raises:
-        WlmError: An error of the module's table.
-    """
-    grids = {_DENSITY: density} | ({} if temperature is None else {_TEMPERATURE: temperature})
-    parts = []
-    for field, grid in grids.items():
-        stored = grid.array().size
-        most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * stored))
-        parts.append(dense(grid, f"{name}: {grid.get_grid_info().name or field}", most))
-    return _from_parts(parts, up, trust, extinction=extinction, emission=emission, name=name)
 
 
 def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:

@@ -72,14 +72,14 @@ class Artifact:
     """Content of an artifact.
 
     Attributes:
-        system: The system that wrote it, "lightmap" for example.
-        version: The format's version.
-        settings: What it was made with; of a compact one `name`, that of the file, alone.
-        source: A hash of what it was made from, as the writer gave it; empty of a compact one.
-        tensors: The parts by name: read-only views of the mapped file.
-        parts: The parts' sizes by name, bytes.
-        file_bytes: The size on disk: the header and all parts.
-        header_bytes: What isn't a part: the length, the header and its padding.
+        system: The system that wrote it, for example "lightmap".
+        version: Version of the format.
+        settings: Settings of the fit; for a compact artifact only `name`, that of the file.
+        source: Hash of the input, as given by the writer; empty for a compact artifact.
+        tensors: The parts by name, as read-only views of the mapped file.
+        parts: Sizes of the parts by name, in bytes.
+        file_bytes: Size of the file.
+        header_bytes: Size of everything before the parts: the length, the header and its padding.
     """
 
     system: str
@@ -99,18 +99,12 @@ def write_artifact(
     tensors: Mapping[str, np.ndarray],
     source: str,
 ) -> int:
-    """Writes an artifact, whole or not at all. The same arguments give the same bytes.
-
-    Args:
-        path: The file to write; its folder must exist.
-        system, settings, tensors, source: As for `encode_artifact`.
-
-    Returns:
-        The size of the file, bytes.
+    """Writes an artifact atomically and returns its size in bytes. Equal arguments give equal bytes; see
+    `encode_artifact`.
 
     Raises:
-        ValueError: A name, a setting or a type that the format can't hold.
-        WlmError: The file can't be written; what was there before stays.
+        ValueError: A name, a setting or a type that the format cannot store.
+        WlmError: The file cannot be written; an earlier one stays.
     """
     return atomic_write(path, encode_artifact(system, settings, tensors, source))
 
@@ -118,20 +112,20 @@ def write_artifact(
 def encode_artifact(
     system: str, settings: Mapping[str, Any], tensors: Mapping[str, np.ndarray], source: str
 ) -> list[bytes | np.ndarray]:
-    """Lays out an artifact in memory; the tensors are not copied where they are contiguous.
+    """Encodes an artifact in memory; contiguous tensors are not copied.
 
     Args:
-        system: The system's name, without spaces.
-        settings: Plain JSON values; NaN and Inf are none.
-        tensors: The parts by name: any shape; a bool, an integer of 8 to 64 bits or a float of 16 to 64.
-        source: A hash of the input, without spaces. Empty: the artifact is compact, its parts are those of
-            `wlm.formats.compact`, and it has no settings.
+        system: Name of the system, without spaces.
+        settings: Plain JSON values without NaN and infinity.
+        tensors: The parts by name, of any shape: bool, integers of 8 to 64 bits or floats of 16 to 64 bits.
+        source: A hash of the input, without spaces. If it is empty, the artifact is compact: it has the parts of
+            `wlm.formats.compact` and no settings.
 
     Returns:
-        The file's content as consecutive buffers: the header, then the tensors.
+        The content of the file as consecutive buffers: the header, then the tensors.
 
     Raises:
-        ValueError: A name, a setting or a type that the format can't hold.
+        ValueError: A name, a setting or a type that the format cannot store.
     """
     if not source:
         if settings:
@@ -174,18 +168,14 @@ def encode_artifact(
 
 
 def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:
-    """Maps an artifact and checks every byte of it against its digest, but for what is read piece by piece.
+    """Maps an artifact and compares all its bytes with its digest, except tensors that are read piece by piece.
 
-    Args:
-        path: The file.
-        system: The system that must have written it; default any.
-
-    Returns:
-        The artifact; its tensors stay valid while they are referenced, even if the file is replaced.
+    `system` is the system that must have written it; None accepts any. The tensors stay valid while they are
+    referenced, even if the file is replaced.
 
     Raises:
-        WlmError: The file is missing, not an artifact, cut short, damaged, from a newer version or from
-            another system.
+        WlmError: The file is missing, not an artifact, cut short, damaged, from a newer version or from another
+            system.
     """
     mapped = _map(path)
     size = len(mapped)

@@ -12,17 +12,11 @@ from wlm.formats.lock import temporary
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path beside `path`, and moves the file written there onto `path` at the end.
+    """Yields the path of an empty temporary file beside `path`, which replaces `path` at the end.
 
     If the block raises, the temporary file is removed and `path` keeps its content. If the process is killed, `path`
     keeps its content too, and the next write to it removes the temporary file. A link is followed: its target is
     replaced.
-
-    Args:
-        path: The file to write; its folder must exist.
-
-    Yields:
-        The path of an empty file in the same folder.
 
     Raises:
         WlmError: The folder is missing, `path` is not a regular file, or the system refuses (a full disk).
@@ -58,17 +52,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) -> int:
-    """Writes a file completely or not at all.
+    """Writes a file completely or not at all, and returns its number of bytes; see `atomic_path`.
 
-    Args:
-        path: The file to write; its folder must exist.
-        data: The content, or its pieces in order, as objects with the buffer protocol.
-
-    Returns:
-        The number of bytes written.
-
-    Raises:
-        WlmError: See `atomic_path`.
+    `data` is the content, or its pieces in order, as objects with the buffer protocol.
     """
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
     total = 0

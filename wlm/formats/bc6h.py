@@ -129,13 +129,9 @@ _ROWS = _rows()
 
 
 def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
-    """Decodes unsigned BC6H, bit-exactly.
+    """Decodes unsigned BC6H blocks, uint8 [B, 16], bit-exactly to half [B, 16, 3], texels row by row.
 
-    Args:
-        blocks: uint8 [B, 16].
-
-    Returns:
-        half [B, 16, 3], texels row by row; blocks of a reserved mode are black.
+    Blocks of a reserved mode are black.
 
     Raises:
         ValueError: Wrong shape or type.

@@ -60,13 +60,7 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 
 def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the endpoints and indices of blocks; the inverse of `pack_mode6`.
-
-    Args:
-        blocks: uint8 [..., 16].
-
-    Returns:
-        The endpoints, uint8 [..., 2, 4], and the indices, uint8 [..., 16].
+    """Reads the endpoints, uint8 [..., 2, 4], and indices, uint8 [..., 16], of blocks; the inverse of `pack_mode6`.
 
     Raises:
         ValueError: Wrong shape or type.
@@ -89,13 +83,7 @@ def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def decode_mode6(blocks: np.ndarray) -> np.ndarray:
-    """Decodes blocks to texels, bit-exact to the format.
-
-    Args:
-        blocks: uint8 [..., 16].
-
-    Returns:
-        The texels, uint8 [..., 16, 4], row-major, RGBA.
+    """Decodes blocks, uint8 [..., 16], bit-exactly to RGBA texels, uint8 [..., 16, 4], row-major.
 
     Raises:
         ValueError: Wrong shape or type.
@@ -110,18 +98,7 @@ def decode_mode6(blocks: np.ndarray) -> np.ndarray:
 
 
 def decode_image(blocks: np.ndarray) -> np.ndarray:
-    """Decodes the blocks of an image.
-
-    Args:
-        blocks: uint8 [H/4, W/4, 16].
-
-    Returns:
-        The image, uint8 [H, W, 4], RGBA.
-
-    Raises:
-        ValueError: Wrong shape or type.
-        WlmError: A block is of another mode.
-    """
+    """Decodes the blocks of an image, uint8 [H/4, W/4, 16], to RGBA, uint8 [H, W, 4]; errors as for `decode_mode6`."""
     if blocks.ndim != 3:
         raise ValueError(f"expected blocks [H/4, W/4, 16], got {blocks.shape}")
     return blocks_image(decode_mode6(blocks))

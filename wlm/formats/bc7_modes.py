@@ -94,10 +94,10 @@ _PIECE = 1 << 16  # blocks decoded at once: 8 MiB of unpacked bits
 
 
 def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.ndarray:
-    """Encodes an opaque image by Intel's ISPC texture compressor, in one thread.
+    """Encodes an opaque image, uint8 [H, W, 3] with sizes in multiples of 4, by Intel's ISPC texture compressor, in one
+    thread.
 
     Args:
-        picture: uint8 [H, W, 3], multiples of 4.
         extra: Name of the optional extra for the error message.
         profile: One of `ENCODERS`.
 
@@ -129,13 +129,9 @@ def block_modes(blocks: np.ndarray) -> np.ndarray:
 
 
 def decode_blocks(blocks: np.ndarray) -> np.ndarray:
-    """Decodes blocks of any mode, bit-exact to the format; reserved blocks become transparent black.
+    """Decodes blocks of any mode, uint8 [..., 16], bit-exactly to RGBA texels, uint8 [..., 16, 4], row-major.
 
-    Args:
-        blocks: uint8 [..., 16].
-
-    Returns:
-        The texels, uint8 [..., 16, 4], row-major, RGBA.
+    Reserved blocks become transparent black.
 
     Raises:
         ValueError: Wrong shape or type.

@@ -39,9 +39,6 @@ ENCODINGS = ("linear", "srgb", "rgbm", "dldr", "rgbe")
 def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...], bool]:
     """Reads all channels of an EXR file, a PNG (8 bits, or grey of 16 bits) or another picture of light.
 
-    Args:
-        path: The file.
-
     Returns:
         The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the
         values are PNG levels, which are divided by the largest level.
@@ -79,14 +76,7 @@ def _read_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
 
 
 def read_encoded(path: str | os.PathLike[str], encoding: str) -> np.ndarray:
-    """Reads the light of a PNG.
-
-    Args:
-        path: The file.
-        encoding: One of `ENCODINGS`.
-
-    Returns:
-        Linear light, float32 [H, W, 3], the top row first.
+    """Reads the light of a PNG with one of `ENCODINGS`: linear, float32 [H, W, 3], the top row first.
 
     Raises:
         WlmError: The encoding is unknown; the file is missing, damaged or not a PNG; or it lacks colour, or the alpha

@@ -34,11 +34,7 @@ class Pace:
     """Schedules saves: at a fixed interval, or less often where saving would take over a twentieth of the time."""
 
     def __init__(self, every: float) -> None:
-        """Starts the clock.
-
-        Args:
-            every: Seconds from one save to the next; 0: save whenever asked.
-        """
+        """Starts the clock; `every` is the number of seconds between two saves, 0 to save at each request."""
         self._every = self._wait = every
         self._last = time.monotonic()
         self._took = 0.0
@@ -133,14 +129,9 @@ class Checkpoint:
         return self._running.get(number)
 
     def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
-        """Restores the state of a batch that was running.
+        """Restores the state of a batch that was running, and returns whether there was one.
 
-        Args:
-            number: The batch.
-            load: Restores a state; it raises ValueError, before it changes anything, for an invalid one.
-
-        Returns:
-            Whether a state was restored.
+        `load` restores a state; for an invalid one it raises ValueError before it changes anything.
 
         Raises:
             WlmError: The state is invalid.

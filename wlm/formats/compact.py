@@ -38,25 +38,15 @@ def digest(*pieces: bytes | np.ndarray) -> bytes:
 
 
 def encode_compact(system: str, parts: Mapping[str, np.ndarray]) -> list[bytes | np.ndarray]:
-    """Lays out a compact artifact.
-
-    Args:
-        system: One of `SYSTEMS`.
-        parts: `BODY`, uint8 [B].
-
-    Returns:
-        The file's content as consecutive buffers.
+    """Encodes a compact artifact of one of `SYSTEMS`, whose only part is `BODY`, uint8 [B]; returns consecutive
+    buffers.
     """
     begin = _MAGIC + bytes([SYSTEMS.index(system) << 4 | _VERSION])
     return [begin + digest(begin, parts[BODY]), parts[BODY]]
 
 
 def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, dict[str, np.ndarray], int]:
-    """Splits a compact artifact and checks its digest.
-
-    Args:
-        where: The file, for messages.
-        mapped: Its content.
+    """Splits the mapped content of a compact artifact and checks its digest; `where` names the file in messages.
 
     Returns:
         System, version, parts as views, and the number of bytes before them.

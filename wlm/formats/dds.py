@@ -172,13 +172,7 @@ def _slice_bytes(fmt: str, width: int, height: int) -> int:
 
 
 def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest level of a DDS file of light.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channels' names.
+    """Reads the largest level of a DDS file of light: float32 [H, W, 3 or 4], and the names of its channels.
 
     Raises:
         WlmError: The file is missing, is not a DDS file, is cut short or damaged, has another format, is an array, a

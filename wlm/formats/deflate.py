@@ -4,13 +4,9 @@ import zlib
 
 
 def inflate(data: bytes, size: int, where: str, expected: str) -> bytes:
-    """Decompresses a stream and never allocates more than one byte beyond the expected size.
+    """Decompresses one zlib stream and never allocates more than one byte beyond its expected size.
 
-    Args:
-        data: One zlib stream, with nothing after it.
-        size: Expected size, in bytes.
-        where: Name of the stream for messages.
-        expected: Description of the expected content for messages.
+    `where` names the stream and `expected` its content in messages.
 
     Raises:
         ValueError: The stream is damaged or has another size.

@@ -33,18 +33,15 @@ _NOTE = "wlm"  # the header's attribute
 def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the colour channels of a single-part EXR file, over its data window.
 
-    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values
-    are returned unchanged, NaN and infinity included: the caller checks them.
-
-    Args:
-        path: The EXR file.
+    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values are
+    returned unchanged, NaN and infinity included.
 
     Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channels' names, ("R", "G", "B") or ("R", "G", "B", "A").
+        The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data,
-            or lacks one of R, G and B.
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data, or
+            lacks one of R, G and B.
     """
     channels = read_part(path).channels
     if any(name not in channels for name in _COLOUR):
@@ -72,12 +69,10 @@ def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], name
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
-    """Writes RGB or RGBA pixels as an EXR file of scan lines with lossless ZIP compression, atomically.
+    """Writes linear pixels [H, W, 3 or 4] as an EXR file of scan lines with lossless ZIP compression, atomically.
 
-    Args:
-        path: The file to write; its folder must exist.
-        pixels: Linear values, [H, W, 3 or 4], neither side empty.
-        half: Whether to round to half floats. Values beyond their range, infinity included, become +-65504; NaN stays.
+    With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
+    stays.
 
     Raises:
         ValueError: The shape is not that of a picture.
@@ -125,9 +120,6 @@ def write_planes(
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Reads all channels of a single-part EXR file.
-
-    Args:
-        path: The EXR file.
 
     Returns:
         The planes by name, float32 [H, W], unchanged, NaN included; and the note of the header, empty if the file has

@@ -18,15 +18,10 @@ _QUALITY = 8  # imageio-ffmpeg's quality, 0 to 10
 
 @contextmanager
 def film(path: str | os.PathLike[str], height: int, width: int, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Writes a film atomically, at the end of the block.
+    """Writes an `.mp4` film atomically, at the end of the block.
 
-    Args:
-        path: The `.mp4` to write; its folder must exist.
-        height, width: Size of each frame, in pixels; even, since chroma has half the resolution.
-        rate: Frames per second.
-
-    Yields:
-        A function that adds a frame, uint8 [H, W, 3] in sRGB.
+    Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. The sizes are even, since chroma has half the
+    resolution; `rate` is the number of frames per second.
 
     Raises:
         WlmError: The package is missing, a size is odd, or the file cannot be written.

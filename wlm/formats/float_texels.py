@@ -59,13 +59,9 @@ class Layout:
 
 
 def check_picture(path: str | os.PathLike[str], held: int, width: int, height: int, texel: int) -> None:
-    """Checks the claimed size of a picture before memory is allocated.
+    """Checks the claimed size of a picture, in texels of `texel` decoded bytes, before memory is allocated.
 
-    Args:
-        path: The file, for messages.
-        held: Size of the file, in bytes.
-        width, height: Claimed size, in texels.
-        texel: Bytes of a decoded texel.
+    `held` is the size of the file in bytes, `path` names it in messages.
 
     Raises:
         WlmError: The picture has no texels, too many, or more than a file of this size may expand to.

@@ -29,10 +29,7 @@ _NUMBERS = re.compile(r"\[\n([^\[\]{}\"]*)\]")
 def claim(folder: Path, index: str, format_name: str) -> None:
     """Checks, before long work, that a folder can be written and holds no files other than an earlier output.
 
-    Args:
-        folder: The folder; it need not exist.
-        index: Name of the index file.
-        format_name: The index's `format`.
+    The earlier output is recognised by its index file and the `format` in it.
 
     Raises:
         WlmError: The path is a file, the folder holds other files, or it or its parent cannot be written.

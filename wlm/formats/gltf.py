@@ -179,26 +179,17 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a document of one mesh from arrays.
-
-    Args:
-        position: [V, 3], in any unit; stored as float32.
-        triangle: int [F, 3], at least one.
-        uv: [V, 2]; u right, v down; stored as float32, as `TEXCOORD_0`.
-        name: Name of the mesh.
-
-    Returns:
-        The document and its one primitive.
-    """
+    """Makes a document of one mesh, see `document_from_meshes`; returns it with its one primitive."""
     document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
     return document, primitive
 
 
 def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a document of several meshes from arrays. Each mesh has its own node.
+    """Makes a document of several meshes, each with a node of its own.
 
     Args:
-        meshes: Name, positions, triangles and UVs of each mesh, as for `document_from_arrays`; at least one.
+        meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
+            [V, 2], u right, v down, stored as float32 `TEXCOORD_0`.
         name: Name of the document.
 
     Returns:
@@ -244,10 +235,6 @@ def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocum
 def elements(document: GltfDocument, number: int) -> np.ndarray:
     """Reads the encoded elements of an accessor, with its sparse part applied.
 
-    Args:
-        document: The document.
-        number: Index of the accessor.
-
     Returns:
         uint8 [count, bytes of an element], with the column padding that glTF requires for small matrices; it may be a
         view of the file's bytes.
@@ -289,18 +276,10 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
 
 
 def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
-    """Reads the numbers of an accessor in their stored type.
-
-    Args:
-        document: The document.
-        number: Index of the accessor.
-        kind: The required type, for example "VEC3".
-
-    Returns:
-        [count, components].
+    """Reads the numbers of an accessor in their stored type, [count, components].
 
     Raises:
-        WlmError: The accessor has another type, or an error of `elements` occurs.
+        WlmError: The accessor is not of `kind`, for example "VEC3", or an error of `elements` occurs.
     """
     accessor = document.item("accessors", number)
     if accessor.get("type") != kind:
@@ -563,17 +542,7 @@ def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes 
 def _load_buffers(
     path: str | os.PathLike[str], buffers: Sequence[dict[str, Any]], binary: bytes | None, trust: bool
 ) -> tuple[bytes, ...]:
-    """Returns the bytes of each buffer, at least the stated number.
-
-    Args:
-        path: The document.
-        buffers: The entries of the buffers in the tree.
-        binary: The binary chunk of the `.glb`, if it has one.
-        trust: Whether buffers may be files outside the folder of the document.
-
-    Raises:
-        WlmError: A buffer cannot be read, is too short, or is the file of an earlier buffer.
-    """
+    """Returns the bytes of each buffer, at least the stated number; with `trust` also of files outside the folder."""
     files: dict[Path, int] = {}
     return tuple(_load_buffer(path, number, buffer, binary, trust, files) for number, buffer in enumerate(buffers))
 

@@ -66,18 +66,8 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Writes the `.glb` file of `encode_glb`, atomically.
-
-    Args:
-        path: The file to write; its folder must exist.
-        document, replacements, uv_set: See `encode_glb`.
-
-    Returns:
-        The number of bytes written.
-
-    Raises:
-        ValueError: See `encode_glb`.
-        WlmError: See `encode_glb`; or the file cannot be written.
+    """Writes the file of `encode_glb` atomically and returns its number of bytes; errors as there, or it cannot be
+    written.
     """
     return atomic_write(path, encode_glb(document, replacements, uv_set, path))
 
@@ -127,12 +117,7 @@ def encode_glb(
 
 
 class _Tree:
-    """A growing copy of a document: its JSON tree, and the bytes of each buffer view.
-
-    Attributes:
-        content: The JSON tree.
-        payloads: The bytes of each buffer view.
-    """
+    """A growing copy of a document: its JSON tree, and the bytes of each buffer view."""
 
     def __init__(self, document: GltfDocument) -> None:
         self._document = document

@@ -22,6 +22,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.limits import BAKE_BYTES, check_growth
 from wlm.formats.reading import read_file
+from wlm.formats.zstd import decompress
 
 COEFFICIENTS = 9
 _TYPE = "LightmapGIData"
@@ -156,9 +157,6 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Reads the light probes of a Godot 4 lightmap bake.
 
-    Args:
-        path: The `.lmbake` file.
-
     Returns:
         The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
         description defines them); N is at least 1.
@@ -172,14 +170,7 @@ def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
-    """Replaces the light of the probes of a bake and keeps everything else.
-
-    Args:
-        path: The `.lmbake`, not compressed.
-        sh: [N, 9, 3], coefficients for each of its N probes, as stored in the file.
-
-    Returns:
-        The new content of the file.
+    """Replaces the coefficients [N, 9, 3] of the N probes of a bake, and returns the new content of the file.
 
     Raises:
         WlmError: See `read_lmbake`; or the bake is compressed.
@@ -428,12 +419,6 @@ def _decompress(reader: _Reader) -> bytes:
         raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}: save without compression")
     if not 0 < block <= _LARGEST_BLOCK:
         raise WlmError(f"{path}: compression: expected blocks of 1 to {_LARGEST_BLOCK} bytes, found {block}")
-    try:
-        import imagecodecs
-    except ImportError as error:
-        raise WlmError(
-            f"{path}: is compressed: needs the extra: pip install 'wlm[baselines]', or save it in Godot without"
-        ) from error
     # The last block contains the rest and is stored even if it is empty.
     full, rest = divmod(total, block)
     sizes = np.frombuffer(reader.take(4 * (full + 1)), "<u4")
@@ -442,15 +427,10 @@ def _decompress(reader: _Reader) -> bytes:
     for i, size in enumerate(sizes.tolist()):
         expected = block if i < full else rest
         packed = bytes(reader.take(size))
-        if expected == 0:
-            continue
         try:
-            piece = imagecodecs.zstd_decode(packed, out=expected)
-        except (RuntimeError, ValueError) as error:
-            raise WlmError(f"{path}: compressed block {i} is damaged: {error}") from error
-        if len(piece) != expected:
-            raise WlmError(f"{path}: compressed block {i}: expected {expected} bytes, found {len(piece)}")
-        pieces.append(piece)
+            pieces.append(decompress(packed, expected, f"compressed block {i}") if expected else b"")
+        except ValueError as error:
+            raise WlmError(f"{path}: {error}") from error
     return b"".join(pieces)
 
 

@@ -43,12 +43,10 @@ def need(package: str, extra: str) -> ModuleType:
 
 
 def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
-    """Encodes unsigned BC6H by Intel's ISPC texture compressor.
+    """Encodes texels, half [H, W, 3], finite and not negative, as unsigned BC6H by Intel's ISPC texture compressor.
 
-    Args:
-        texels: half [H, W, 3], finite, not negative; H and W multiples of 4.
-        profile: One of `BC6H_PROFILES`, from the fastest to the best.
-        extra: Name of the optional extra for the error message.
+    H and W are multiples of 4, `profile` is one of `BC6H_PROFILES`, and `extra` is the optional extra for the error
+    message.
 
     Raises:
         WlmError: The package is missing.
@@ -116,16 +114,13 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
-    """Returns the codec of a setting; equal settings share one codec.
+    """Returns the codec of a setting, one for equal settings.
 
     Args:
         block: One of `ASTC_BLOCKS`.
         quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
-        extra: Name of the optional extra for the error message.
+        extra: Name of the optional extra for the error message that the package is missing.
         ldr: Whether to use the LDR profile, for values in [0, 1]; else HDR.
-
-    Raises:
-        WlmError: The package is missing.
     """
     return _astc(need("astc_encoder", extra), block, float(quality), ldr)
 

@@ -209,13 +209,10 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
 def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the largest level of a KTX2 file of light, plain or compressed by zstd or zlib.
 
-    The first row of the result is the top one, whatever `KTXorientation` states.
-
-    Args:
-        path: The file.
+    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
 
     Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channel names. The alpha of ASTC is ignored.
+        The pixels, float32 [H, W, 3 or 4], and the channel names.
 
     Raises:
         WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a

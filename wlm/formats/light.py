@@ -38,12 +38,9 @@ def read_light(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...
 
     Values are returned unchanged, including NaN, infinity and negative ones: the caller checks them.
 
-    Args:
-        path: The file.
-
     Returns:
-        The pixels, float32 [H, W, 3 or 4], the top row first, and the channels' names, ("R", "G", "B") or
-        ("R", "G", "B", "A").
+        The pixels, float32 [H, W, 3 or 4], the top row first, and the names of the channels, ("R", "G", "B") or ("R",
+        "G", "B", "A").
 
     Raises:
         WlmError: The file is missing, of another kind, cut short or damaged.

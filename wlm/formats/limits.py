@@ -103,14 +103,10 @@ def check_sides(where: str, width: int, height: int) -> None:
 
 
 def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure: int = SURE_BYTES) -> None:
-    """Checks the claimed size of decompressed data.
+    """Checks the claimed size of decompressed data in bytes, `large`, against the compressed size, `small`.
 
-    Args:
-        where: The file and the field.
-        small: Compressed size, in bytes.
-        large: Claimed decompressed size, in bytes.
-        growth: Largest allowed expansion.
-        sure: Decompressed bytes that are allowed for any compressed size.
+    It may be `sure` bytes or `growth` times the compressed size, whichever is more; `where` names the file and the
+    field.
 
     Raises:
         WlmError: The claimed size is larger.

@@ -39,9 +39,6 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
 
     The lock is on a file beside the output, which is removed at the end. Locks may be nested within one process.
 
-    Args:
-        output: A file or a folder; it need not exist.
-
     Raises:
         WlmError: Another process holds the lock.
     """
@@ -65,14 +62,9 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Makes an empty file or folder beside its destination, and removes it at the end if it still exists.
+    """Yields the path of an empty file or folder beside its destination, and removes it at the end if it still exists.
 
-    Args:
-        target: The destination, without links.
-        folder: Whether to make a folder.
-
-    Yields:
-        The path. Its name is short, since the name of the destination may have the longest length allowed.
+    `target` has no links. The name is short, since the name of the destination may have the longest length allowed.
 
     Raises:
         OSError: The file or folder cannot be made.

@@ -37,7 +37,6 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
     """Reads a PNG as bool [H, W]: valid where any colour channel is above 0.
 
     Args:
-        path: The PNG.
         beside: The lightmap of the mask, for messages.
         size: Expected rows and columns.
         others: Alternatives to a PNG, for the message of a missing file.

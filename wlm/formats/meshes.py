@@ -38,10 +38,7 @@ class MeshArrays:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
-    """Reads all triangles of a file as one mesh.
-
-    Args:
-        path: A file whose name ends in one of `SUFFIXES`.
+    """Reads all triangles of a file, whose name ends in one of `SUFFIXES`, as one mesh.
 
     Raises:
         WlmError: The file is missing, too large or malformed, a position or UV is NaN or infinite, or a triangle names
@@ -74,11 +71,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
 
 
 def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Extracts and checks the positions, UVs or None, and triangles of a mesh.
-
-    Raises:
-        ValueError: A number is not finite, or a triangle names a vertex that is not there.
-    """
+    """Extracts the positions, UVs or None, and triangles of a mesh; wrong numbers raise ValueError."""
     position, triangle = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     uv = getattr(mesh.visual, "uv", None)
     if uv is not None and len(uv):

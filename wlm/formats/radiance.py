@@ -33,11 +33,9 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
     Values are divided by every `EXPOSURE` and `COLORCORR` of the header, which are factors that were applied to them;
     `PRIMARIES` are ignored.
 
-    Args:
-        path: The file.
-
     Returns:
-        The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the channels' names.
+        The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the names of the
+        channels.
 
     Raises:
         WlmError: The file is missing, is not a Radiance picture, is cut short or damaged, contains XYZ or

@@ -21,12 +21,7 @@ _LONGEST_NAME = 1024  # characters; systems allow 255 for each component
 def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
     """Opens a regular file; system errors inside the block become one-line errors that name it.
 
-    Args:
-        path: The file. Links are followed.
-        what: Description of the file for messages, for example "the OBJ file".
-
-    Yields:
-        The open file.
+    Links are followed. `what` describes the file in messages, for example "the OBJ file".
 
     Raises:
         WlmError: The file is missing, is a folder, a device or a pipe, or cannot be read.
@@ -51,16 +46,7 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
 
 
 def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | None = None) -> bytes:
-    """Reads a regular file.
-
-    Args:
-        path: The file.
-        limit: Most bytes to read.
-        what: Description of the file for messages.
-        first: Number of bytes to read from the start; None: all.
-
-    Returns:
-        The bytes.
+    """Reads a regular file of at most `limit` bytes, or its first `first` bytes.
 
     Raises:
         WlmError: See `open_file`; or the file is larger than the limit, shorter than `first`, or changes meanwhile.
@@ -80,12 +66,7 @@ def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | 
 
 
 def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_BYTES) -> Any:
-    """Reads a JSON file in UTF-8.
-
-    Args:
-        path: The file.
-        what: Description of the file for messages.
-        limit: Most bytes to read.
+    """Reads a JSON file in UTF-8 of at most `limit` bytes.
 
     Raises:
         WlmError: See `read_file`; or the content is not JSON.

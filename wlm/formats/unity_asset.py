@@ -124,10 +124,6 @@ _NAMES = [f"sh[{i:2d}]" for i in range(_COEFFICIENTS * _CHANNELS)]
 def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, Any, bytes, str]]:
     """Lists the type, layout, bytes and byte order of each object in a file; only the type for types that are not read.
 
-    Args:
-        path: The file.
-        data: Content of the file.
-
     Raises:
         ValueError: UnityPy cannot read the file.
     """

@@ -68,11 +68,7 @@ class VdbFile:
     """
 
     def __init__(self, data: bytes, where: str) -> None:
-        """Reads the list of grids.
-
-        Args:
-            data: Content of the file.
-            where: Name of the file for messages.
+        """Reads the list of grids from the content of a file, which `where` names in messages.
 
         Raises:
             WlmError: The content is no OpenVDB file, is too old or too new, or is damaged.
@@ -85,11 +81,7 @@ class VdbFile:
         self.others = tuple(f"{entry.name} ({entry.type})" for entry in entries if entry.type not in _FLOATS)
 
     def read(self, name: str, most: int) -> VdbGrid:
-        """Reads a grid.
-
-        Args:
-            name: One of `names`.
-            most: Most voxels of its bounding box.
+        """Reads the grid of one of `names`, whose bounding box may have at most `most` voxels.
 
         Raises:
             WlmError: The grid is damaged, is a frustum, or has a bounding box that is too large.

@@ -32,12 +32,8 @@ def compress(*pieces: bytes) -> bytes:
 
 
 def decompress(frame: bytes, size: int, name: str) -> bytes:
-    """Unpacks a frame and never allocates more than its expected size.
-
-    Args:
-        frame: One frame with nothing behind it.
-        size: Number of bytes that it must unpack to.
-        name: What the frame is, for messages.
+    """Unpacks one frame with nothing behind it to `size` bytes, and never allocates more; `name` describes it in
+    messages.
 
     Raises:
         ValueError: The frame is damaged or has another size.
@@ -58,9 +54,6 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
 def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Shapes]:
     """Packs the parts of an artifact.
 
-    Args:
-        parts: Arrays by name.
-
     Returns:
         Each part as a frame, uint8 [bytes]; a part stays as it is if its frame would be larger, or so much smaller
         that `unpack_parts` would refuse it. And the shapes of the parts that became frames.
@@ -74,15 +67,10 @@ def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], 
 
 
 def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Unpacks parts that `pack_parts` packed. Their values still have to be checked by `check_parts`.
-
-    Args:
-        tensors: The parts as read.
-        shapes: The shapes of those that are frames.
-        table: The types of all parts.
+    """Unpacks parts that `pack_parts` packed, of the types in `table`. `check_parts` still has to check their values.
 
     Raises:
-        ValueError: A frame is damaged, is none of the table's, or claims far more bytes than it can hold.
+        ValueError: A frame is damaged, is not in the table, or claims far more bytes than it can hold.
     """
     result = dict(tensors)
     for name, shape in shapes.items():

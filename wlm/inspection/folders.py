@@ -59,13 +59,8 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def input_system(path: str | os.PathLike[str]) -> str:
-    """Finds the system that compresses an input, from names and headers alone.
-
-    Args:
-        path: The file or the folder.
-
-    Returns:
-        "lightmap", "atlas", "probe" or "smoke".
+    """Finds the system that compresses a file or folder, from names and headers alone: "lightmap", "atlas", "probe" or
+    "smoke".
 
     Raises:
         WlmError: It does not exist or cannot be read, or it is not one of these inputs; the line says what to do.

@@ -106,9 +106,6 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
         name: Name of the bundle.
         source: Hash of the input.
         device: Device that decodes the reference.
-
-    Raises:
-        WlmError: As for `bundle`.
     """
     textures = {key: texture for encoding in ENCODINGS for key, texture in encoding.textures(model).items()}
     for key, texture in textures.items():

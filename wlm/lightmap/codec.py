@@ -64,9 +64,6 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
 
     Returns:
         The settings, the parts and the hash of its source.
-
-    Raises:
-        WlmError: The arrays can not be stored.
     """
     headers, parts, atlases = [], {"times": _shortened(model.times)}, set()
     for number, (sheet, own) in enumerate(model.sheets.items()):
@@ -205,11 +202,7 @@ def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
 
 
 def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
-    """Reads the tiles into the arrays of a sheet.
-
-    Raises:
-        WlmError, ValueError: The frames are not those of these tiles.
-    """
+    """Reads the tiles into the arrays of a sheet."""
     numbers = _packed_tiles(sheet)
     for number in set(np.flatnonzero(sheet.kind).tolist()).difference(numbers):
         encoding_of(sheet.kind[number]).unpack(sheet, number, np.empty(0, np.uint8))

@@ -1,47 +1,19 @@
 """Lightmap sets over time, read from files or arrays and checked.
 
-"Inside" means inside the mask. Repairs are counted in texels, over all channels, and listed in `LightmapSet.warnings`,
-one line for each file and kind of repair.
+The rules of input; a repair counts texels and becomes a line of `LightmapSet.warnings`:
 
-====================================  ================================================================
-input                                 behaviour
-====================================  ================================================================
-NaN, Inf inside                       the texel takes the value of the nearest finite texel inside the
-                                      mask at that time; warning
-a frame with no finite texel inside   error
-negative inside                       the channel is clamped to 0; warning
-above 65,504 inside (half's maximum)  the channel is clamped to 65,504; warning
-any of these outside                  0, 0 and 65,504, without a warning: those texels are never shown
-all zero                              accepted
-an empty mask                         error
-one time                              accepted
-times out of order                    sorted, with their frames; warning
-two equal times                       error that names both files
-more than 100,000 times               error
-an alpha NaN or infinite              the texel is outside a mask from alpha; warning
-frames of different atlases           warning, if light or an alpha ends at the borders of charts
-texels that only some frames have     at other times they are fitted to the frame nearest in time that
-                                      has them; scored only at their own times; warning
-files, mask or mesh outside the       error, unless the set is trusted
-folder of their `set.json`
-frames beyond 1 GiB that small files  error, unless the set is trusted
-only claim
-frames beyond 1 GiB                   in an unnamed file in the folder for temporary files (TMPDIR);
-                                      error if there is not enough space
-a time outside [0, period)            error: 24 h is 0 h, and wrapping would hide a mistake in the list
-a NaN or infinite time                error
-frames, mask or `set.json` that       error that names both files
-disagree in size
-PNG, integers, arrays, cubes, XYZ,    error that says what was found; accepted formats: docs/formats.md
-and other content that is no light
-a file missing or damaged, a          error that names the file, and the field
-malformed `set.json`
-values beyond a linear layer's range  clamped to it; warning inside the mask
-a PNG of a linear layer               its levels run from the least value to the greatest
-a layer or atlas that a state lacks   error that names the state, and one that has it
-channels that a file lacks            error that names the file and its channels
-more than 12 channels of an atlas     error
-====================================  ================================================================
+- Inside the mask a NaN or infinite texel takes the value of the nearest finite texel at that time, negative channels
+  are clamped to 0, and values above 65,504, the maximum of half floats, to that. Outside it the same happens silently.
+- A time without a finite texel inside, an empty mask, two equal times, a NaN or infinite time, a time outside [0,
+  period) and more than 100,000 times are errors. Times out of order are sorted.
+- A texel whose alpha is NaN or infinite is outside a mask from alpha. Texels that only some frames have are fitted at
+  the other times to the frame nearest in time that has them, and are only scored at their own times.
+- Frames whose light or alpha ends at the borders of other charts may be of different atlases, which is a warning.
+- A set that is not trusted names only files in its folder, and no frames beyond 1 GiB that small files claim. Larger
+  frames are kept in an unnamed file in the folder for temporary files (TMPDIR).
+- Frames, mask and `set.json` have one size. Content that is no light is refused with a line that says what was found.
+- Values beyond the range of a linear layer are clamped to it. A PNG of such a layer runs from the least to the greatest
+  value. A state without a layer or channel that another state has, and more than 12 channels of an atlas, are errors.
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
 """
@@ -403,13 +375,7 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """The pictures of a layer of an atlas.
-
-    Attributes:
-        frames: Levels of each of its sheets, float32 [T, H, W, 3], in the order of the times.
-        alpha: bool [T, H, W], true where a texel has an alpha above 0; None if the mask is not taken from it.
-        warnings: Lines about alphas.
-    """
+    """The pictures of a layer of an atlas."""
 
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None
@@ -425,12 +391,7 @@ class _Reader:
         self._made = 0  # bytes of the sheets that memory was allocated for
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
-        """Reads a layer of an atlas at all times.
-
-        Args:
-            atlas, layer: The atlas and the layer.
-            mask: "alpha" requires an alpha channel, None reads one if the first picture has it, "all" ignores it.
-        """
+        """Reads a layer of an atlas at all times."""
         sources = [state[atlas.name, layer.name] for state in self._listing.states]
         first = sources[0]
         pixels, names = _read(first, layer)
@@ -533,16 +494,7 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """The states of a set, in the order given, and the words that messages need.
-
-    Attributes:
-        labels: Names of the states.
-        times: float64 [T], checked.
-        period: Length of the day, or None.
-        where: The set, for messages.
-        mask_from: The origin of the mask, for messages.
-        warn_order: Whether times that are out of order deserve a warning.
-    """
+    """The states of a set, in the order given, and the words that messages need."""
 
     labels: Sequence[str]
     times: np.ndarray
@@ -565,16 +517,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Applies the module's table to the frames of a sheet.
-
-        Args:
-            name: Name of the set.
-            sheet: The sheet.
-            frames: [T, H, W, 3] in the order of the times, repaired in place.
-            mask: [H, W], or [T, H, W] in the order of the times.
-            warnings: Lines that come first.
-            mesh: See `SheetFrames`.
-        """
+        """Applies the module's table to the frames of a sheet."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")

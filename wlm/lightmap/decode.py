@@ -18,11 +18,7 @@ _PIECE = 1024  # tiles that are decoded at once: 192 MiB
 
 
 def gelu_of(model: SheetModel, gelu: str | None) -> str:
-    """Returns the form of the GELU to decode with: `gelu`, or the model's for None.
-
-    Raises:
-        WlmError: There is no such form.
-    """
+    """Returns the form of the GELU to decode with: `gelu`, or the model's for None."""
     gelu = gelu or model.profile.gelu
     if gelu not in GELUS:
         raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
@@ -49,9 +45,6 @@ class SheetDecoder:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
             gelu: Another form of the GELU than the model was trained with, for speed; None: the model's.
-
-        Raises:
-            WlmError: There is no such device or form.
         """
         self.model, self.device = model, interop.check_device(device)
         gelu, self._grid = gelu_of(model, gelu), model.grid
@@ -104,11 +97,7 @@ class SheetDecoder:
         return np.ascontiguousarray(light[top : top + TILE + 2 * border, left : left + TILE + 2 * border])
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0.
-
-        Raises:
-            WlmError: The time is not finite.
-        """
+        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0."""
         self.model.axis.wrap(time)
         out = np.zeros((len(numbers), TILE, TILE, 3), np.float32)
         for tiles in self._tiles:
@@ -123,9 +112,6 @@ class SheetDecoder:
         Returns:
             uint8 [n, 128, 128, 4] and the bound b of each tile, float32 [n]: radiance = (byte / 255 * b) ** gamma.
             Alpha is 255, and 0 in empty tiles.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         self.model.axis.wrap(time)
         out, bounds = np.zeros((len(numbers), TILE, TILE, 4), np.uint8), np.zeros(len(numbers), np.float32)
@@ -165,9 +151,6 @@ class Decoder:
         Args:
             model: The model.
             device, gelu: As for `SheetDecoder`.
-
-        Raises:
-            WlmError: There is no such device or form of the GELU.
         """
         self.model = model
         self.sheets: dict[Sheet, SheetDecoder] = {
@@ -198,20 +181,13 @@ class Decoder:
 
         Returns:
             The channels, float32 [H, W, C]: linear radiance, or values. Tiles without a valid texel have the level 0.
-
-        Raises:
-            WlmError: There is no such layer, or the time is not finite.
         """
         sheets = self.model.layer(layer, atlas)
         frames = [sheet.to_values(self.sheets[sheet].frame(time)) for sheet in sheets]
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 
     def frames(self, time: float) -> dict[str, dict[str, np.ndarray]]:
-        """Decodes everything: by atlas and layer the channels, float32 [H, W, C].
-
-        Raises:
-            WlmError: The time is not finite.
-        """
+        """Decodes everything: by atlas and layer the channels, float32 [H, W, C]."""
         result: dict[str, dict[str, np.ndarray]] = {}
         for atlas, layer in dict.fromkeys((sheet.atlas, sheet.layer) for sheet in self.sheets):
             result.setdefault(atlas, {})[layer] = self.frame(time, layer, atlas)

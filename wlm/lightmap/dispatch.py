@@ -48,14 +48,7 @@ class Batch:
 
 @dataclass(eq=False)
 class _Running:
-    """A batch that a worker is fitting.
-
-    Attributes:
-        batch: The batch.
-        step: Steps done; None until the worker has begun.
-        deaths: Workers that it has lost since its state was last saved.
-        saving: Whether its state is requested before it goes on.
-    """
+    """A batch that a worker is fitting."""
 
     batch: Batch
     step: int | None = None
@@ -64,11 +57,9 @@ class _Running:
 
 
 def worker_devices(device: str, workers: int | None, cluster: str | None, samples: int = 0) -> list[str]:
-    """Chooses the device of each worker.
+    """Chooses the device of each worker; arguments as for `wlm.lightmap.compress`.
 
-    Args:
-        device, workers, cluster: As for `wlm.lightmap.compress`.
-        samples: Samples that the whole fit takes; short fits get fewer processes.
+    A short fit, judged by the samples that it takes, gets fewer processes.
 
     Raises:
         WlmError: There is no such device, or the number of workers is below 1.
@@ -89,13 +80,7 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
 def start_workers(
     devices: list[str], workers: int | None, cluster: str | None, batches: int, seed: int, track: bool
 ) -> Workers:
-    """Starts a `Fitter` for each device, or on the machines of a cluster.
-
-    Args:
-        devices: From `worker_devices`.
-        workers, cluster, seed: As for `wlm.lightmap.compress`.
-        batches: Number of batches, the largest number of workers on a cluster.
-        track: Whether the fitters report their PSNR.
+    """Starts a `Fitter` for each device, or on the machines of a cluster at most one for each batch.
 
     Raises:
         WlmError: The cluster is not there, or the system has no room for the processes.
@@ -120,16 +105,8 @@ class Dispatch:
         meter: Meter,
         checkpoint: Checkpoint | None,
     ) -> None:
-        """Takes the data that all batches share.
-
-        Args:
-            workers: Workers with a `Fitter` each.
-            batches: The batches to fit.
-            steps: Steps of a batch.
-            done: Number of batches that were done before.
-            meter: Meter of the steps of all batches.
-            checkpoint: Keeps states and results; None keeps nothing.
-        """
+        """Takes the workers, the batches of `steps` steps each, the number of batches that were done before, the meter
+        of all steps, and the checkpoint that keeps states and results, or None."""
         self._workers, self._steps, self._done = workers, steps, done
         self._meter, self._checkpoint = meter, checkpoint
         self._waiting = deque(batches)

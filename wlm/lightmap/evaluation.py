@@ -55,11 +55,9 @@ class SheetReport(ShownScore):
         worst_psnr: Lowest PSNR of any tile at any time.
         worst_tile: Its place: `time`, `tile` (its number), `row`, `column`; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the units of the input.
-        max_abs_error_unscored: The same over texels without a score.
         scored: Tiles times times that count in the means.
         not_scored: The others, by reason: `empty` (no valid texel), `not_held` (valid texels, but not in the file),
             `few_texels`, `zero_range` (see `wlm.metrics`).
-        no_ssim: Number of scored ones without an SSIM.
         format_limited: `time`, `tile` of the scored ones that only span a few steps of half float.
         kinds: Number of tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
         warnings: Tiles that were not scored, or light that was lost and that the means hide.
@@ -82,10 +80,8 @@ class SheetReport(ShownScore):
     worst_psnr: float
     worst_tile: dict[str, float | int] | None
     max_abs_error: float
-    max_abs_error_unscored: float
     scored: int
     not_scored: dict[str, int]
-    no_ssim: int
     format_limited: list[dict[str, float | int]]
     kinds: dict[str, int]
     warnings: list[str]
@@ -189,8 +185,7 @@ def evaluate(
         chosen = [metric for metric in metrics if not (sheet.linear and metric == "flip")]
         count = 0 if sheet.linear or "seen" not in metrics else views
         report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, len(reports))
-        errors = report.max_abs_error * sheet.span, report.max_abs_error_unscored * sheet.span
-        reports[sheet] = replace(report, max_abs_error=errors[0], max_abs_error_unscored=errors[1])
+        reports[sheet] = replace(report, max_abs_error=report.max_abs_error * sheet.span)
         warnings += report.warnings
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
     # Texels of one sheet of each atlas: layers share an area.
@@ -262,16 +257,12 @@ def _layer_psnr(reports: dict[Sheet, SheetReport], layer: str) -> float:
 
 
 def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.ndarray) -> float:
-    """Computes the PSNR of one lightmap of a sheet, dB: `SheetReport.psnr_by_time` of its hour.
+    """Computes the mean PSNR over the tiles of one lightmap of a sheet, dB: `SheetReport.psnr_by_time` of its hour.
 
     Args:
-        model: The sheet's model.
-        lightmaps: The input, of the model's size.
+        model, lightmaps: The sheet and its input, of one size.
         number: Number of the lightmap in the sheet.
         decoded: float32 [H, W, 3], the decoded map at its hour.
-
-    Returns:
-        The mean over the tiles; NaN if none has a score.
     """
     mask, name = lightmaps.mask & _stored(model), f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
@@ -281,18 +272,8 @@ def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
     """Looks for fireflies that a fit lost: tiles whose light is in few texels are decoded at their times.
 
-    `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB.
-
-    Args:
-        model: The model.
-        lightmaps: The input.
-        device: Device that decodes.
-
-    Returns:
-        Lines with the number of texels and the largest loss.
-
-    Raises:
-        WlmError: As for `evaluate`.
+    `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB. The lines
+    have the number of texels and the largest loss.
     """
     lines = []
     for sheet, own in model.sheets.items():
@@ -336,9 +317,6 @@ def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
         model: The sheet's model.
         mask: Valid texels of the input, bool [H, W].
         size: Bytes.
-
-    Raises:
-        WlmError: The model holds no tile.
     """
     return size * 8 / (_area(model, mask) * len(model.times))
 
@@ -368,9 +346,6 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
 
     Returns:
         bool [H, W], the valid texels of stored tiles: the texels that are scored.
-
-    Raises:
-        WlmError: As for `evaluate`.
     """
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
@@ -417,10 +392,8 @@ def _sheet_report(
         worst_psnr=summary.worst_psnr,
         worst_tile=None if summary.worst_tile is None else place(summary.worst_tile),
         max_abs_error=summary.max_abs_error,
-        max_abs_error_unscored=summary.max_abs_error_unscored,
         scored=summary.scored,
         not_scored=left_out,
-        no_ssim=summary.no_ssim,
         format_limited=[place(where) for where in summary.format_limited],
         kinds=count_kinds(model),
         warnings=warnings,

@@ -24,9 +24,6 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
 
     Returns:
         Linear radiance, float64 [128, 128, 3]; 0 in an empty tile.
-
-    Raises:
-        WlmError: There is no such tile, or the time is not finite.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
@@ -74,9 +71,6 @@ def bound64(model: SheetModel, number: int, time: float) -> float:
         model: The sheet.
         number: Number of the tile in the grid.
         time: Between two stored times the larger of both bounds holds.
-
-    Raises:
-        WlmError: As `decode_tile64`.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.EMPTY:

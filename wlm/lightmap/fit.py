@@ -189,13 +189,7 @@ class SheetFit:
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
     ) -> None:
-        """Classifies the tiles and encodes those that are stored as frames.
-
-        Args:
-            lightmaps: The sheet.
-            profile: Its settings.
-            tiles: Numbers of the tiles; None: all.
-            progress: Called in the stages "tiles" and "frames" if they take long.
+        """Classifies the tiles, all or those with the given numbers, and encodes those that are stored as frames.
 
         Raises:
             WlmError: A number is outside the grid or given twice, there is none, or the encoder of frames is missing.
@@ -299,11 +293,7 @@ class SheetFit:
         nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
 
     def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Stores the parts of a batch that are finished in a checkpoint; returns whether there are any.
-
-        Raises:
-            WlmError: The parts are wrong.
-        """
+        """Stores the parts of a batch that are finished in a checkpoint; returns whether there are any."""
         parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
         if parts is None:
             return False

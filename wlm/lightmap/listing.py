@@ -4,8 +4,9 @@ No pixels are read here. The layout follows the scene configuration of neural-dy
 of atlases and layers; the plain set of one lightmap for each time has one atlas "0" with one layer "light".
 """
 
+import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,7 @@ from typing import Any
 from wlm.errors import WlmError
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
-from wlm.formats.reading import named_file
-from wlm.lightmap.fields import field, is_list, is_number, is_size, is_text, kind, name_of, period_of, read_set
+from wlm.formats.reading import named_file, read_json_file
 from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, VALUE_RANGES
 
 SET_FILE = "set.json"
@@ -116,15 +116,9 @@ def list_set(
 ) -> Listing:
     """Lists a set, as `wlm.lightmap.load` describes.
 
-    Args:
-        path: The `set.json` or the folder.
-        times: A time for each state, replacing those of the set.
-        layers: Names of the layers to read; None reads all.
-        trust: Whether a `set.json` may name files outside its folder.
-
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, or the states do not have the same pictures; the message names the file and the field.
+            many states, or the states do not have the same pictures.
     """
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE
@@ -307,12 +301,12 @@ def _labelled(path: Path, *place: int) -> Source:
 
 def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
     """Reads a `set.json`."""
-    content = read_set(path)
+    content = _read_set(path)
     plain = "layers" not in content
     if plain:
         layers = (LayerInfo(LIGHT.layer, LIGHT.encoding),)
         expected = "a whole number of texels above 0"
-        size = tuple(field(path, content, key, "", is_size, expected) for key in ("height", "width"))
+        size = tuple(_field(path, content, key, "", _is_size, expected) for key in ("height", "width"))
         atlases = (AtlasInfo(LIGHT.atlas, _mask(path, content, "", trust), size, _mesh(path, content, "", trust)),)
     else:
         named = _named(path, content, "layers", "an object of layers")
@@ -321,8 +315,12 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         atlases = tuple(_atlas(path, name, value, trust) for name, value in named.items())
     if len(layers) > MOST_CHANNELS or len(layers) * len(atlases) > MOST_SHEETS:
         raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers and {MOST_SHEETS} of all atlases together")
-    entries = field(path, content, "lightmaps", "", is_list, "a list of lightmaps")
-    name, period = name_of(path, content), period_of(path, content)
+    entries = _field(path, content, "lightmaps", "", _is_list, "a list of lightmaps")
+    name, period = path.resolve().parent.name, None
+    if content.get("name") is not None:
+        name = _field(path, content, "name", "", is_text, "a name")
+    if content.get("period_hours") is not None:
+        period = float(_field(path, content, "period_hours", "", _is_positive, "a number above 0"))
     if len(entries) > TIMES:
         raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
     states, stamps, found = [], [], {}
@@ -330,15 +328,15 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         place = f"lightmaps[{i}]"
         if not isinstance(entry, dict):
             keys = "time_hours, file" if plain else "time_hours, files"
-            raise WlmError(f"{path}: {place}: expected an object ({keys}), got {kind(entry)}")
+            raise WlmError(f"{path}: {place}: expected an object ({keys}), got {_kind(entry)}")
         if plain:
-            field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
+            _field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
             source = _source(path, entry["file"], f"{place}.file", found, trust)
             states.append({(LIGHT.atlas, LIGHT.layer): replace(source, label=source.path.name)})
         else:
             states.append(_state(path, entry, place, layers, atlases, found, trust))
         if times is None:
-            stamps.append(float(field(path, entry, "time_hours", f"{place}.", is_number, "a finite number")))
+            stamps.append(float(_field(path, entry, "time_hours", f"{place}.", _is_number, "a finite number")))
     if times is not None:
         _check_count(path, states, times, "lightmap" if plain else "state")
     labels = [source.label for state in states for source in state.values()] if plain else None
@@ -364,20 +362,20 @@ def _state(
     trust: bool,
 ) -> dict[tuple[str, str], Source]:
     """Reads the pictures of one time of a set with layers."""
-    files = field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
+    files = _field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
     state = {}
     for atlas in atlases:
-        of_atlas = field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
+        of_atlas = _field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
         for layer in layers:
             at = f"{place}.files.{atlas.name}."
-            value = field(path, of_atlas, layer.name, at, _is_source, "a file, or an object (file, slice, slices)")
+            value = _field(path, of_atlas, layer.name, at, _is_source, "a file, or an object (file, slice, slices)")
             state[atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
     return state
 
 
 def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> dict[str, Any]:
     """Returns an object of named entries, which must not be empty."""
-    values = field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
+    values = _field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
     for name in values:
         if not is_name(name):
             raise WlmError(f"{path}: {key}: expected names of 1 to {MOST_NAME} printable characters")
@@ -388,12 +386,14 @@ def _layer(path: Path, name: str, value: Any) -> LayerInfo:
     """Reads a layer: an encoding, or an object with `encoding` and optional `channels`."""
     place, options = f"layers.{name}", {"encoding": value} if isinstance(value, str) else value
     if not isinstance(options, dict):
-        raise WlmError(f"{path}: {place}: expected an encoding or an object (encoding, channels), got {kind(value)}")
+        raise WlmError(f"{path}: {place}: expected an encoding or an object (encoding, channels), got {_kind(value)}")
     names = ", ".join(VALUE_RANGES)
-    encoding = field(path, options, "encoding", f"{place}.", lambda text: text in list(VALUE_RANGES), f"one of {names}")
+    encoding = _field(
+        path, options, "encoding", f"{place}.", lambda text: text in list(VALUE_RANGES), f"one of {names}"
+    )
     if options.get("channels") is None:
         return LayerInfo(name, encoding)
-    channels = field(path, options, "channels", f"{place}.", is_list, f"a list of 1 to {MOST_CHANNELS} channels")
+    channels = _field(path, options, "channels", f"{place}.", _is_list, f"a list of 1 to {MOST_CHANNELS} channels")
     named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
     if not named or len(set(channels)) < len(channels):
         raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names, each channel of a layer once")
@@ -404,11 +404,11 @@ def _atlas(path: Path, name: str, value: Any, trust: bool) -> AtlasInfo:
     """Reads an atlas: an object with optional `width` and `height`, `mask` and `mesh`."""
     place = f"atlases.{name}"
     if not isinstance(value, dict):
-        raise WlmError(f"{path}: {place}: expected an object (width, height, mask, mesh), got {kind(value)}")
+        raise WlmError(f"{path}: {place}: expected an object (width, height, mask, mesh), got {_kind(value)}")
     size = None
     if value.get("width") is not None or value.get("height") is not None:
         expected = "a whole number of texels above 0"
-        size = tuple(field(path, value, key, f"{place}.", is_size, expected) for key in ("height", "width"))
+        size = tuple(_field(path, value, key, f"{place}.", _is_size, expected) for key in ("height", "width"))
     place += "."
     return AtlasInfo(name, _mask(path, value, place, trust), size, _mesh(path, value, place, trust))
 
@@ -417,14 +417,14 @@ def _mask(path: Path, holder: dict[str, Any], place: str, trust: bool) -> str:
     """Reads the mask of an atlas: "all", "alpha" or the path of a PNG; "all" if none is named."""
     if holder.get("mask") is None:
         return "all"
-    mask = field(path, holder, "mask", place, is_text, 'the name of a PNG, "alpha" or "all"')
+    mask = _field(path, holder, "mask", place, is_text, 'the name of a PNG, "alpha" or "all"')
     return mask if mask in _MASK_WORDS else str(named_file(path, mask, f"{path}: {place}mask", trust))
 
 
 def _mesh(path: Path, holder: dict[str, Any], place: str, trust: bool) -> Path | None:
     if holder.get("mesh") is None:
         return None
-    file = field(path, holder, "mesh", place, is_text, "the name of a mesh")
+    file = _field(path, holder, "mesh", place, is_text, "the name of a mesh")
     return named_file(path, file, f"{path}: {place}mesh", trust)
 
 
@@ -434,14 +434,14 @@ def _source(path: Path, value: Any, place: str, found: dict[str, Path], trust: b
     `found` holds the files that were named before, so that links are followed once.
     """
     options = {"file": value} if isinstance(value, str) else value
-    file = field(path, options, "file", f"{place}.", is_text, "the name of a picture")
+    file = _field(path, options, "file", f"{place}.", is_text, "the name of a picture")
     if file not in found:
         found[file] = named_file(path, file, f"{path}: {place}", trust)
     if "slice" not in options and "slices" not in options:
         return _labelled(found[file])
-    slices = field(path, options, "slices", f"{place}.", is_size, "a whole number above 0")
+    slices = _field(path, options, "slices", f"{place}.", _is_size, "a whole number above 0")
     expected = f"a whole number from 0 to {slices - 1}"
-    index = field(path, options, "slice", f"{place}.", lambda at: at == 0 or (is_size(at) and at < slices), expected)
+    index = _field(path, options, "slice", f"{place}.", lambda at: at == 0 or (_is_size(at) and at < slices), expected)
     return _labelled(found[file], int(index), slices)
 
 
@@ -451,3 +451,69 @@ def _is_object(value: object) -> bool:
 
 def _is_source(value: object) -> bool:
     return is_text(value) or isinstance(value, dict)
+
+
+def _read_set(path: Path) -> dict[str, Any]:
+    """Reads a `set.json`.
+
+    Raises:
+        WlmError: It cannot be read, or is not a JSON object.
+    """
+    content = read_json_file(path, "the set")
+    if not isinstance(content, dict):
+        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
+    return content
+
+
+def _field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
+    """Returns the value of a field of an object at a place of the file, such as `lightmaps[0].`, if `ok` accepts it.
+
+    Raises:
+        WlmError: The field is missing or wrong; the line names the place, the key and the expected values.
+    """
+    if key not in holder:
+        raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
+    if not ok(holder[key]):
+        raise WlmError(f"{path}: {place}{key}: expected {expected}, got {_kind(holder[key])}")
+    return holder[key]
+
+
+def is_text(value: object) -> bool:
+    """Returns whether a value is text that can be a name."""
+    # File names cannot have a NUL or half of a surrogate pair.
+    if not isinstance(value, str) or not value.strip() or "\0" in value:
+        return False
+    return not any("\ud800" <= character <= "\udfff" for character in value)
+
+
+def _is_number(value: object) -> bool:
+    """Returns whether a value is a finite number of a usable size."""
+    # Python's True is an int, and its JSON reader accepts NaN, Infinity and integers of any length.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= 1e300
+
+
+def _is_positive(value: object) -> bool:
+    """Returns whether a value is such a number above 0."""
+    return _is_number(value) and value > 0
+
+
+def _is_list(value: object) -> bool:
+    """Returns whether a value is a list that is not empty."""
+    return isinstance(value, list) and bool(value)
+
+
+def _is_size(value: object) -> bool:
+    """Returns whether a value is a whole number above 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _kind(value: object) -> str:
+    """Describes a JSON value in a message: the value itself, or its kind if it is long."""
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list):
+        return f"a list of {len(value)}" if value else "an empty list"
+    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -135,11 +135,7 @@ class TimeAxis:
         return (2.0 if self.periodic else 1.0) * math.pi
 
     def wrap(self, t: float) -> float:
-        """Wraps a time by the period, or clamps it to the first and last stored time.
-
-        Raises:
-            WlmError: The time is not finite.
-        """
+        """Wraps a time by the period, or clamps it to the first and last stored time."""
         if not math.isfinite(t):
             raise WlmError(f"time: expected a finite number, got {t}")
         if self.period is not None:

@@ -56,9 +56,6 @@ class RuntimeDecoder:
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         raise NotImplementedError
 
@@ -153,15 +150,11 @@ class MatrixDecoder(_ScratchDecoder):
     "fast"."""
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is the first stored one.
-
-        Args:
-            model: The sheet, with a hidden width that is a multiple of 16.
-            device: "cuda" or "cuda:N".
-            shared: As for `StripDecoder`.
+        """Uploads the dynamic tiles of a sheet, whose hidden width is a multiple of 16; arguments as for
+        `StripDecoder`.
 
         Raises:
-            WlmError: There is no such device, the width is another one, or the sheet has no dynamic tile.
+            WlmError: The device is not a GPU, the width is another one, or the sheet has no dynamic tile.
         """
         name, hidden = interop.check_device(device), model.profile.hidden
         if name == "cpu":
@@ -199,16 +192,7 @@ class FrameDecoder(RuntimeDecoder):
     """The tiles that are stored as frames: one thread reads one texel of one or two frames."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", shared: bool = False) -> None:
-        """Uploads the frames of a sheet and allocates all buffers; the time is the first stored one.
-
-        Args:
-            model: The sheet.
-            device: "cpu", "cuda" or "cuda:N".
-            shared: As for `StripDecoder`.
-
-        Raises:
-            WlmError: There is no such device, or the sheet has no frames.
-        """
+        """Uploads the frames of a sheet and allocates all buffers; arguments as for `StripDecoder`."""
         device = interop.check_device(device)
         self._tiles = FrameTiles(model, device)
         self._inverse = wp.empty(len(self._tiles.numbers), dtype=float, device=device)
@@ -223,14 +207,7 @@ class FrameDecoder(RuntimeDecoder):
 
 
 def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
-    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder`, if the width and the GELU allow it.
-
-    Args:
-        model, device, shared: As for `StripDecoder`.
-
-    Raises:
-        WlmError: As for `StripDecoder`.
-    """
+    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder`, if the width and the GELU allow it."""
     device = interop.check_device(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:
@@ -239,14 +216,7 @@ def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -
 
 
 def runtime_decoders(model: SheetModel, device: str = "cpu", shared: bool = False) -> list[RuntimeDecoder]:
-    """Makes the fastest decoder of each kind of tile that a sheet has; constant tiles need none.
-
-    Args:
-        model, device, shared: As for `StripDecoder`.
-
-    Raises:
-        WlmError: There is no such device.
-    """
+    """Makes the fastest decoder of each kind of tile that a sheet has; constant tiles need none."""
     decoders: list[RuntimeDecoder] = []
     if (model.kind == TileKind.DYNAMIC).any():
         decoders.append(fast_decoder(model, device, shared))

@@ -79,9 +79,6 @@ class MapDecoder:
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
-
-        Raises:
-            WlmError: The time is not finite.
         """
         for decoder in self.decoders:
             decoder.set_time(time)

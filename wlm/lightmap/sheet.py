@@ -113,9 +113,6 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
         sheets: The sheets to choose from.
         layer: Name of the layer; None takes the first layer of radiance, or the first layer.
         atlas: Name of the atlas; None takes the first atlas that has the layer.
-
-    Raises:
-        WlmError: There is no such layer.
     """
     sheets = list(sheets)
     named = [sheet for sheet in sheets if atlas in (None, sheet.atlas) and layer in (None, sheet.layer)]

@@ -70,9 +70,6 @@ class TileGrid:
 
         Args:
             index: Number of the tile in [0, count).
-
-        Raises:
-            WlmError: The number is outside the grid.
         """
         if not 0 <= index < self.count:
             raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
@@ -80,11 +77,7 @@ class TileGrid:
         return row * TILE, column * TILE
 
     def window(self, index: int) -> tuple[slice, slice]:
-        """Returns the rows and the columns of the map that a tile covers.
-
-        Raises:
-            WlmError: The number is outside the grid.
-        """
+        """Returns the rows and the columns of the map that a tile covers."""
         y, x = self.origin(index)
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
 
@@ -219,10 +212,9 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
     """Computes the pattern of each tile whose product with the means approximates a tile that only changes in strength.
 
-    It is the sum of the colours over time divided by the sum of the means: times count in proportion to their means, so
-    that a nearly black time, whose texels are a few steps of half float apart, hardly counts, and nothing is divided by
-    a mean of 0. `means * pattern` is exact if the tile is the product of one colour per time and a pattern, in gamma
-    space and so in linear space.
+    It is the sum of the colours over time divided by the sum of the means, so that a nearly black time hardly counts
+    and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a colour per time and a
+    pattern.
 
     Args:
         colour: `[N, T, 128, 128, 3]`, as in `TileData`.
@@ -244,12 +236,10 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
     In linear space, over the valid texels:
 
     - `EMPTY`: the tile has no valid texel.
-    - `CONSTANT`: at every time no channel spans more than one step of half float, measured at the channel's least
-      value. A half-float source has nothing finer. An all-zero tile is constant.
-    - `STATIC`: `means * static_pattern` is good enough at every time: its PSNR, with the range of the tile at that time
-      as the peak (neural-dynamic-gi, section 10.2), is at least the budget, or no channel of any texel is off by more
-      than one step of half float. The second condition covers times whose range is zero or so small that the PSNR would
-      measure the half float. A set of one time is such a product exactly.
+    - `CONSTANT`: at every time no channel spans more than one step of half float at its least value.
+    - `STATIC`: `means * static_pattern` has a PSNR of at least the budget at every time, relative to the range of the
+      tile at that time (neural-dynamic-gi, section 10.2), or no channel of any texel is off by more than a step of half
+      float.
     - `DYNAMIC`: all other tiles.
 
     For values that are not light, `peak` replaces the range, and a tile is also constant if at every time the means of

@@ -85,16 +85,9 @@ class Trainer:
         device: str,
         track: bool = False,
     ):
-        """Uploads the targets and draws the initial parameters.
+        """Uploads the targets of STATIC or DYNAMIC tiles and draws the initial parameters.
 
-        Args:
-            profile: The settings.
-            axis: The time axis.
-            targets: The training data.
-            temporal_maps: Whether the tiles are DYNAMIC instead of STATIC.
-            seed: Seed of the initial parameters and of all samples.
-            device: As `interop.check_device` returns it.
-            track: Whether to sum the errors that `psnr` needs.
+        The seed is that of the parameters and of all samples; `track` sums the errors that `psnr` needs.
         """
         self._track = track
         self.axis, self.device, self.temporal = axis, device, temporal_maps
@@ -408,11 +401,7 @@ class Trainer:
             )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps depend on.
-
-        Raises:
-            WlmError: As for `check`.
-        """
+        """Returns everything that later steps depend on."""
         self.check()
         result = {key: getattr(self, key) for key in _STATE} | self._moments
         for name, adam in self._adams.items():
@@ -486,16 +475,7 @@ class Fitter:
     """Fits batches of tiles one after another, in this process or in another one (`wlm.workers`)."""
 
     def __init__(self, seed: int, device: str, track: bool) -> None:
-        """Takes the settings that all batches share.
-
-        Args:
-            seed: Seed of the fit.
-            device: "cpu", "cuda" or "cuda:N".
-            track: Whether to report the PSNR during the fit.
-
-        Raises:
-            WlmError: There is no such device.
-        """
+        """Takes the seed, the device and whether to report the PSNR, which all batches share."""
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
         self._trainer: Trainer | None = None
 
@@ -519,11 +499,7 @@ class Fitter:
         return Advance(self._trainer.step)
 
     def advance(self, seconds: float) -> Advance:
-        """Trains for some seconds, at least a few steps, or to the end of the batch.
-
-        Raises:
-            WlmError: The fit diverged.
-        """
+        """Trains for some seconds, at least a few steps, or to the end of the batch."""
         trainer = self._trainer
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
@@ -544,11 +520,7 @@ class Fitter:
         return Advance(step, *figures, parts)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps of the batch depend on.
-
-        Raises:
-            WlmError: The fit diverged.
-        """
+        """Returns everything that later steps of the batch depend on."""
         return self._trainer.state()
 
     def close(self) -> None:

@@ -4,33 +4,23 @@ The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels 
 elsewhere: it filters, so that texels of the gaps between charts and of neighbouring tiles count too, at any hour. The
 scores here are over the same tiles and times, relative to the same range, that of the tile at that time:
 
-- `seen`: bilinear reads at 4 random points of each valid texel, uniform over its area and the same in every run, from
-  the decoded map and from the original whose gaps hold the nearest valid texel. Both are clamped at the map's ends.
-- `ring`: the texels of the gaps that touch a valid one, corners included, against the same original. A tile with fewer
-  than `wlm.metrics.MIN_VALID_TEXELS` of them has none.
-- `between`: the valid texels half-way between neighbouring stored times, against the mean of the two originals, which
-  is the light of eq. 2 of neural-dynamic-gi; in a set with a period also between the last time and the first.
-- `border`: of the points of `seen`, the ones that read two tiles or more against the other points of the same tiles:
-
-      sqrt(sum n b / sum n i)     n count of the former, b and i both mean squares, summed over tiles and times
-
-  of errors relative to the range of the tile that a texel belongs to, before they are filtered. Relative to the range
-  of the reading tile, a dark tile beside a bright one would be blamed for the other's error: noise of an equal share of
-  every tile's range would score 1.39 and 4.6 on two lightmaps of a game, where no border is visible.
-
+- `seen`: bilinear reads at 4 random points of each valid texel, the same in every run, from the decoded map and from
+  the original whose gaps hold the nearest valid texel. Both are clamped at the ends of the map.
+- `ring`: the texels of gaps that touch a valid texel, corners included, against the same original.
+- `between`: the valid texels half-way between neighbouring stored times, against the mean of both originals (eq. 2 of
+  neural-dynamic-gi); in a set with a period also between the last time and the first.
+- `border`: the RMS error of the points of `seen` that read two tiles or more, divided by that of the other points of
+  the same tiles. Errors are relative to the range of the tile that a texel belongs to, so that a dark tile beside a
+  bright one is not blamed for the error of the other.
 - `flicker`: two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
-  times, spread evenly over the day. With D the decoded and R the original light (eq. 2), the mean over valid texels of
+  times. With D the decoded and R the original light, the mean over valid texels, tiles and steps of
 
       max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
 
-  and over tiles and steps. 0: nothing moves faster than in the original. An interval shorter than the two steps has
-  shorter ones.
-
-Views: cameras are spread evenly on a sphere around the set's mesh (`wlm.ops.views`), each at one of the set's times in
-turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the lightmap's light at its
-surface point, read bilinearly, without shading; the gaps of the original are filled. Both are displayed alike: with the
-exposure of that time, from the valid texels of the original (`wlm.texels.exposure`), Reinhard's curve and sRGB. Pixels
-without a surface are black in both, and do not count.
+Views: cameras are spread evenly on a sphere around the mesh of the set (`wlm.ops.views`), each at one of its times in
+turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the light of the lightmap at its
+surface point, read bilinearly, displayed with the exposure of that time (`wlm.texels.exposure`), Reinhard's curve and
+sRGB. Pixels without a surface do not count.
 """
 
 from __future__ import annotations
@@ -397,12 +387,7 @@ class Tally:
 
 
 class _Texels:
-    """Some texels of a map, and sums over those of each tile.
-
-    Attributes:
-        at: Their rows and columns, int [K] each.
-        count: int [rows, columns] of the grid, number in each tile.
-    """
+    """Some texels of a map, and sums over those of each tile."""
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)

@@ -47,15 +47,9 @@ def check_pair(
 
 
 def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean squared error over the valid texels and all channels.
+    """Mean squared error over the valid texels and all channels of linear images [H, W, C]; NaN with an empty mask.
 
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts; None for all.
-
-    Returns:
-        The mean in squared units of the images; NaN with an empty mask.
+    `mask`, [H, W], is true where a texel counts; None counts all.
 
     Raises:
         WlmError: Shapes differ, or a valid texel is NaN or infinite.
@@ -67,14 +61,8 @@ def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> fl
 
 
 def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Maximum minus minimum over the valid texels and all channels (neural-dynamic-gi, section 10.2).
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts; None for all.
-
-    Returns:
-        The range in the image's units; NaN with an empty mask.
+    """Maximum minus minimum of a linear image [H, W, C] over the valid texels (neural-dynamic-gi, section 10.2); see
+    `mse`.
 
     Raises:
         WlmError: The mask does not fit, or a valid texel is NaN or infinite.
@@ -84,17 +72,10 @@ def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def psnr(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, peak: float | None = None) -> float:
-    """Peak signal-to-noise ratio `10 log10(peak² / mse)` over the valid texels and all channels.
+    """Peak signal-to-noise ratio `10 log10(peak² / mse)` in decibels over the valid texels and all channels; see `mse`.
 
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts; None for all.
-        peak: The signal's peak in the images' units; None takes the reference's `dynamic_range`.
-
-    Returns:
-        Decibels, at most `PSNR_CAP_DB`, the score of an exact reconstruction; NaN with an empty mask or a
-        peak of zero, which define no scale.
+    `peak` is in the images' units; None takes the reference's `dynamic_range`. The result is at most `PSNR_CAP_DB`, the
+    score of an exact reconstruction; it is NaN with an empty mask or a peak of zero, which define no scale.
 
     Raises:
         WlmError: Shapes differ, a valid texel is NaN or infinite, or the peak is negative or not finite.

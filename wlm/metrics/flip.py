@@ -59,11 +59,8 @@ def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[flo
 
 
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """LDR-FLIP between two display images, at flip_evaluator's default of 67 pixels per degree.
-
-    Args:
-        ref: `[H, W, 3]`, sRGB in [0, 1].
-        test: `[H, W, 3]`, sRGB in [0, 1].
+    """LDR-FLIP between two display images, sRGB in [0, 1], [H, W, 3], at flip_evaluator's default of 67 pixels per
+    degree.
 
     Returns:
         `[H, W]` float64 in [0, 1].

@@ -40,11 +40,7 @@ class Pictures:
     """
 
     def __init__(self, structural: bool = False) -> None:
-        """Creates an empty collection.
-
-        Args:
-            structural: Whether SSIM is also computed.
-        """
+        """Creates an empty collection; `structural` tells whether SSIM is also computed."""
         self._structural = structural
         self.count = 0
         self._squared, self._flip, self._pixels, self._similar, self._windows = 0.0, 0.0, 0, 0.0, 0
@@ -67,15 +63,10 @@ class Pictures:
         return self._similar / self._windows if self._windows else math.nan
 
     def add(self, reference: np.ndarray, test: np.ndarray, seen: np.ndarray) -> dict[str, float] | None:
-        """Adds a pair.
+        """Adds a pair of pictures [H, W, 3], sRGB in [0, 1], and returns its `psnr` and `flip`; None if no pixel is
+        covered.
 
-        Args:
-            reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.
-            test: [H, W, 3], sRGB in [0, 1].
-            seen: bool [H, W], true for covered pixels.
-
-        Returns:
-            `psnr` and `flip` of this pair; None if no pixel is covered.
+        `seen`, bool [H, W], is true for covered pixels; all others have the same value in both pictures.
         """
         count = int(np.count_nonzero(seen))
         if not count:

@@ -80,13 +80,10 @@ class Summary:
         worst_psnr: Lowest PSNR of a tile.
         worst_tile: `(lightmap, tile row, tile column)` of that tile; None if no tile is scored.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the images' units.
-        max_abs_error_unscored: Largest absolute error in the tiles without a score.
         tiles: Number of tiles in all lightmaps.
         scored: Number of tiles that count in the means.
         few_texels: Number of tiles excluded for fewer than `MIN_VALID_TEXELS` valid texels, including empty tiles.
         zero_range: Number of tiles excluded because the reference is constant.
-        no_ssim: Number of scored tiles without an SSIM (no valid texel has its window inside the tile); 0 if SSIM was
-            not requested.
         format_limited: `(lightmap, tile row, tile column)` of each scored tile that spans only a few
             half-float steps.
     """
@@ -104,12 +101,10 @@ class Summary:
     worst_psnr: float
     worst_tile: tuple[int, int, int] | None
     max_abs_error: float
-    max_abs_error_unscored: float
     tiles: int
     scored: int
     few_texels: int
     zero_range: int
-    no_ssim: int
     format_limited: list[tuple[int, int, int]]
 
 
@@ -189,14 +184,7 @@ def evaluate_frame(
 
 
 def summarise(frames: Sequence[FrameMetrics]) -> Summary:
-    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
-
-    Args:
-        frames: One `FrameMetrics` per lightmap, all with the same grid of tiles and the same metrics, in order of
-            time.
-
-    Returns:
-        Means, means by tile and by time, the worst tile, and the number of excluded tiles by reason.
+    """Averages the scores of a scene's lightmaps, in order of time, over all tiles and lightmaps.
 
     Raises:
         WlmError: No frames, or frames of different grids or metrics.
@@ -232,12 +220,10 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
         worst_psnr=math.nan if worst_tile is None else float(psnr[worst_tile]),
         worst_tile=worst_tile,
         max_abs_error=_nanmax(errors),
-        max_abs_error_unscored=_nanmax(errors[~scored]),
         tiles=scored.size,
         scored=int(scored.sum()),
         few_texels=int((~enough).sum()),
         zero_range=int((enough & ~scored).sum()),
-        no_ssim=int((scored & np.isnan(ssim)).sum()) if "ssim" in first.metrics else 0,
         format_limited=[tuple(int(i) for i in where) for where in np.argwhere(limited)],
     )
 

@@ -69,13 +69,9 @@ class Indoors:
 
 
 def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device: str = "cpu") -> Indoors:
-    """Finds the valid eye positions in a scene; the result is the same in every run.
+    """Finds the valid eye positions in a scene of positions float [V, 3], y up, and at least one triangle, int [F, 3].
 
-    Args:
-        position: float [V, 3], y up.
-        triangle: int [F, 3], at least one.
-        metres: Whether the unit is known to be the metre.
-        device: "cpu" or "cuda:N".
+    The result is the same in every run. `metres` tells whether the unit is known to be the metre.
 
     Raises:
         WlmError: There is no such device.

@@ -14,13 +14,7 @@ Shape = tuple[int | None, ...]
 
 
 def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
-    """Checks a float32 tensor.
-
-    Args:
-        name: Name of the tensor in the message.
-        tensor: The tensor, on `device`, or on any device that Warp supports.
-        shape: Expected sizes.
-        device: Expected device; None allows any.
+    """Checks that a float32 tensor has a shape and is on a device; None allows any device that Warp supports.
 
     Raises:
         ValueError: Its shape, type or device doesn't fit.
@@ -46,14 +40,13 @@ def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device
 
 
 def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors: torch.Tensor | None) -> None:
-    """Checks that tensors of one device contain finite numbers; skipped while a CUDA graph is captured.
+    """Checks that tensors of one device contain finite numbers, within `ranges` by name; the check waits for the GPU
+    once.
 
-    Args:
-        ranges: Least and greatest allowed value of a tensor, by name.
-        **tensors: Tensors by their name in the message; None and empty tensors are skipped.
+    None and empty tensors are skipped, and so is the whole check while a CUDA graph is captured.
 
     Raises:
-        ValueError: A number isn't finite or in range. The check waits for the GPU once for all tensors.
+        ValueError: A number isn't finite or in range.
     """
     present = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None and tensor.numel()}
     if not present or any(_capturing(tensor) for tensor in present.values()):

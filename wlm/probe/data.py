@@ -68,12 +68,12 @@ class ProbeSet:
 
     @property
     def probes(self) -> int:
-        """N, live and dead."""
+        """Number of probes, N, live and dead."""
         return self.values.shape[0]
 
     @property
     def outputs(self) -> int:
-        """D, numbers per probe: 27 for L2 in RGB."""
+        """Numbers per probe, D: 27 for L2 in RGB."""
         return self.values.shape[1]
 
     @property
@@ -216,7 +216,7 @@ def save_probes(
         raise ValueError(f"expected positions [N, 3] and values [N, D], got {position.shape} and {values.shape}")
     if not (np.isfinite(position).all() and np.isfinite(values).all()):
         raise ValueError("expected finite positions and values")
-    # The last two are parameters of NumPy's writer.
+    # `file` and `allow_pickle` are parameters of NumPy's writer.
     if key in (_POSITION, _CONVENTION, _PROBES, *_BESIDE, "file", "allow_pickle"):
         raise WlmError(f"{path}: expected another name for the values, {key!r} means something else")
     engine = _convert(str(path), values, convention, from_canonical)

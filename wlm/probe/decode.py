@@ -72,19 +72,11 @@ class Decoder(ABC):
         """
 
     def own_positions(self) -> np.ndarray:
-        """Returns the positions of the model's own probes, float64 [N, 3].
-
-        Raises:
-            WlmError: They were not given, and the model stores none.
-        """
+        """Returns the positions of the model's own probes, float64 [N, 3]; a WlmError if none are known."""
         return self.model.stored_positions() if self._position is None else self._position
 
     def check_own(self, position: np.ndarray) -> None:
-        """Checks that positions can be those of the model's own probes.
-
-        Raises:
-            WlmError: Their number or their box differs.
-        """
+        """Raises a WlmError if the number or the box of positions is not that of the model's own probes."""
         if not self.model.has_probes_at(np.asarray(position, np.float64)):
             expected = f"expected the positions of its own {self.model.probes} probes, in their order"
             raise WlmError(f"{self.model.name}: {expected}")

@@ -213,13 +213,9 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
 def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
     """Scores decoded light half-way from each live probe to its nearest neighbour, where no bake exists.
 
-    Args:
-        decoder: A decoder that has the positions of its probes.
-        probes: The input.
-
-    Returns:
-        PSNR in dB against the eight nearest probes of the input, weighted by the inverse square of their distance; the
-        peak is the range of the live probes. NaN for fewer than two live probes.
+    The decoder must have the positions of its probes. The reference at those points is the input, interpolated from the
+    eight nearest probes with weights 1 / distance². The PSNR is over the range of the live probes, and NaN for fewer
+    than two of them.
     """
     place, values = probes.position[probes.live], probes.values[probes.live]
     if len(place) < 2:

@@ -48,8 +48,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
 
 
 def components64(model: ProbeModel) -> np.ndarray:
-    """Computes the light of all probes of a model of principal components, float64 [N, D]; see "
-    "`wlm.probe.pca.model`."""
+    """Computes the light of all probes of a model of principal components (`wlm.probe.pca.model`), float64 [N, D]."""
     content = model.content
     low, step = content.bounds.astype(np.float64)
     number = low + content.code * step

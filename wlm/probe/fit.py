@@ -22,7 +22,7 @@ from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.pca.model import ENOUGH, fit_components
 from wlm.system import Meter, OnProgress
 
-_CHUNK = {"cpu": 5, "cuda": 500}  # steps between two looks at the clock
+_CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
 def open_checkpoint(

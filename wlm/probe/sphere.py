@@ -1,4 +1,4 @@
-"""Spherical harmonics (SH) on the sphere of directions: the basis, radiance and irradiance.
+"""Spherical harmonics (SH) on the sphere of directions: the basis and the irradiance.
 
 The convention of this package is the orthonormal real basis, band by band, within a band from m = -l to l, all signs
 plus (no Condon-Shortley phase): 1, y, z, x, xy, yz, 3z²-1, xz, x²-y², ... times positive constants. A probe's
@@ -100,7 +100,9 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: As for `basis`.
     """
-    values = _checked(values)
+    values = np.asarray(values, np.float64)
+    if values.ndim < 2 or values.shape[-1] != 3:
+        raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
     factors = [cosine_factor(band) for band in coefficient_bands(values.shape[-2]).tolist()]
     return (basis(normals, values.shape[-2]) * factors) @ values
 
@@ -111,10 +113,3 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     phi = np.arange(count) * (math.pi * (3.0 - math.sqrt(5.0)))
     radius = np.sqrt(1.0 - z * z)
     return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
-
-
-def _checked(values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    if values.ndim < 2 or values.shape[-1] != 3:
-        raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
-    return values

@@ -32,13 +32,7 @@ class Canvas:
     """The panels of a plotter. A mesh is identified by panel and name; drawing it again updates what changed."""
 
     def __init__(self, pyvista: ModuleType, plotter: Any, panels: int) -> None:
-        """Uses the first renderers of a plotter as panels.
-
-        Args:
-            pyvista: The package.
-            plotter: Its plotter.
-            panels: Number of panels.
-        """
+        """Uses the first renderers of a plotter of the package pyvista as panels."""
         self._pyvista, self._plotter = pyvista, plotter
         self.renderers = plotter.renderers[:panels]
         self._drawn: dict[tuple[int, str], tuple[Any, Any]] = {}  # the actor and its data
@@ -59,11 +53,8 @@ class Canvas:
         """Draws triangles with a texture; later calls only change the texture.
 
         Args:
-            panel: Index of the panel.
-            name: Name of the mesh.
-            position: [V, 3].
-            triangle: int [F, 3].
-            uv: [V, 2], with v down.
+            panel, name: Index of the panel, and name of the mesh.
+            position, triangle, uv: [V, 3], int [F, 3] and [V, 2], with v down.
             picture: uint8 [H, W, 3].
             nearest: Whether the texture is read without a filter.
             one_sided: Whether triangles that face away from the camera are hidden.
@@ -90,16 +81,9 @@ class Canvas:
         shape: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles with vertex colours.
+        """Draws triangles with vertex colours, uint8 [V, 3]; the other arguments are those of `textured`.
 
-        Args:
-            panel: Index of the panel.
-            name: Name of the mesh.
-            position: [V, 3].
-            triangle: int [F, 3].
-            colours: uint8 [V, 3].
-            shape: Whether a light at the camera shades the mesh, to show its shape.
-            one_sided: As of `textured`.
+        With `shape` a light at the camera shades the mesh.
         """
         drawn = self._drawn.get((panel, name))
         if drawn is not None and len(drawn[1].points) == len(position) and drawn[1].n_cells == len(triangle):

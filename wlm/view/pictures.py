@@ -20,14 +20,8 @@ _MARGIN, _FONT = 4, 14  # pixels
 
 
 def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
-    """Converts linear light to sRGB bytes.
-
-    Args:
-        light: [H, W, 3], or [H, W] for grey.
-        white: The light that becomes white; brighter light is clipped.
-
-    Returns:
-        uint8 [H, W, 3].
+    """Converts linear light, [H, W, 3], or [H, W] for grey, to sRGB bytes, uint8 [H, W, 3]; light above `white` is
+    clipped.
 
     Raises:
         ValueError: `white` is not above 0.

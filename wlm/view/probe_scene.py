@@ -213,7 +213,7 @@ class _ProbeScene(Scene):
         if state.view == "volume" and self._stats is not None:
             held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
             size = self.volume.sizes[0]
-            text += f"; {held:,} blocks, the least {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
+            text += f"; {held:,} blocks, the finest {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
 
     def describe(self, hit: Hit, state: State) -> str:
@@ -292,14 +292,14 @@ def _mean(values: np.ndarray) -> str:
 
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
+    """Returns vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
     sphere = need("pyvista", "view").Icosphere(nsub=subdivisions)
     points = np.asarray(sphere.points, np.float64)
     return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
 
 
 def _block() -> tuple[np.ndarray, np.ndarray]:
-    """Corners [24, 3] of the six faces of a unit cube around the origin, and the normals of the faces there."""
+    """Returns the corners [24, 3] of the six faces of a unit cube around the origin, and the faces' normals there."""
     offsets, normals = np.zeros((len(_SIDES), 3)), np.zeros((len(_SIDES), 3))
     for number, (axis, end, first, second) in enumerate(_SIDES):
         offsets[number, [axis, (axis + 1) % 3, (axis + 2) % 3]] = np.array([end, first, second]) - 0.5
@@ -308,7 +308,7 @@ def _block() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(geometry: Geometry) -> np.ndarray:
-    """Area-weighted vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
+    """Returns area-weighted vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
     corners = geometry.position.astype(np.float64)[geometry.triangle]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros(geometry.position.shape)
@@ -319,7 +319,7 @@ def _normals(geometry: Geometry) -> np.ndarray:
 
 
 def _facing(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Irradiance float64 [V, 3] of spherical harmonics [V, C, 3] for normals [V, 3]."""
+    """Returns the irradiance, float64 [V, 3], of spherical harmonics [V, C, 3] at normals [V, 3]."""
     count = values.shape[1]
     factors = [cosine_factor(band) for band in coefficient_bands(count).tolist()]
     return np.einsum("vc,vcd->vd", basis(normals, count) * factors, values)

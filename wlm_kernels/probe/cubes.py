@@ -23,8 +23,8 @@ MOST_PAIRS = 2**30 - 1
 # Finer cubes make shorter sums, and lists that take longer to build. Cubes of a quarter of the reach sum 1.2 to 1.6
 # times as fast as cubes of the whole reach.
 _FIRST_SIZE = 0.25  # of the median reach
-_CUBES_EACH = 8  # cubes a Gaussian
-_PAIRS_EACH = 256  # pairs a Gaussian
+_CUBES_EACH = 8  # cubes per Gaussian
+_PAIRS_EACH = 256  # pairs per Gaussian
 _FEW = 4096  # cubes and pairs that are always allowed
 
 # Enlargement of a reach against rounding, as a share of it: u is computed in float32 for Gaussians up to 100 times as

@@ -69,7 +69,7 @@ class _Kernels:
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds (once) the kernels of `sum` and its adjoints for latents of length L."""
+    """Builds the kernels of `sum` and its adjoints for latents of length L, once."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope

@@ -135,7 +135,6 @@ class GaussianFunctions:
     """The `wp.func`s for latents of one length; `rows` is float [K, 10 + L], `cut` in standard deviations.
 
     Attributes:
-        latent: L.
         vec_latent: vec of L floats.
         vec_sums: vec of 9 + L floats, sums of `accumulate` over points.
         add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
@@ -145,7 +144,6 @@ class GaussianFunctions:
             latent.
     """
 
-    latent: int
     vec_latent: Any
     vec_sums: Any
     add: Any
@@ -229,4 +227,4 @@ def functions(latent: int) -> GaussianFunctions:
             g[6 + c] = dq[c]
         return g
 
-    return GaussianFunctions(latent, vec_latent, vec_sums, add, accumulate, slope, chain)
+    return GaussianFunctions(vec_latent, vec_sums, add, accumulate, slope, chain)

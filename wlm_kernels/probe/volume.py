@@ -110,7 +110,7 @@ def _read(
                 if left * here > most:
                     most = left * here
                     by = level
-                # The sum of the missing weights is exactly 0 if no corner is missing, which 1 - here is not.
+                # The sum of the missing weights is exactly 0 if no corner is missing; 1 - here may differ by rounding.
                 left *= missing
     if covered > 0.0:
         for c in range(start, stop):

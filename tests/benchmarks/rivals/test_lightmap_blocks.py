@@ -1,12 +1,8 @@
 """The block codecs on small lightmaps with known answers."""
 
-import builtins
-
 import astc_encoder
-import imagecodecs
 import numpy as np
 import pytest
-import texture2ddecoder
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
@@ -36,19 +32,6 @@ def test_size_and_error(name):
     assert 0 < result.disk_bytes < 0.95 * result.bytes
     assert FLOOR[name] < psnr(image, result.decoded) < 90.0
     assert result.encode_seconds > 0.0 and result.decode_seconds > 0.0
-
-
-def test_more_bits_less_error():
-    # Noise, so that the blocks and not half float's rounding limit the quality.
-    image = smooth_light() * (1.0 + 0.05 * np.random.default_rng(0).standard_normal((120, 120, 3)))
-    mask = np.ones((120, 120), bool)
-    quality = [psnr(image, encode_astc(image, mask, block).decoded) for block in (4, 5, 6, 8, 10, 12)]
-    assert quality == sorted(quality, reverse=True)
-    assert psnr(image, encode_8bit(image, mask).decoded) > psnr(image, encode_bc7(image, mask).decoded)
-    low, high = (psnr(image, encode_astc(image, mask, 12, quality=q).decoded) for q in (0.0, 98.0))
-    assert low < high
-    low, high = (psnr(image, encode_bc6h(image, mask, profile).decoded) for profile in ("veryfast", "slow"))
-    assert low < high
 
 
 def test_a_range_for_each_tile():
@@ -153,14 +136,8 @@ def test_shapes_and_settings_are_checked():
             encode_bc6h(bad, np.ones(bad.shape[:2], bool))
     with pytest.raises(WlmError, match="mask"):
         encode_8bit(image, mask[:8])
-    with pytest.raises(WlmError, match="'best'"):
-        encode_bc6h(image, mask, profile="best")
-    with pytest.raises(WlmError, match="'best'"):
-        encode_bc7(image, mask, profile="best")
     with pytest.raises(WlmError, match="got 7"):
         encode_astc(image, mask, block=7)
-    with pytest.raises(WlmError, match="quality"):
-        encode_astc(image, mask, quality=101.0)
     with pytest.raises(WlmError, match="'sdr'"):
         encode_astc(image, mask, profile="sdr")
 
@@ -172,31 +149,3 @@ def test_a_reused_astc_context_forgets_the_last_lightmap(profile):
     encode_astc(1000.0 * smooth_light(36, 36)[::-1], mask, profile=profile)
     again = encode_astc(smooth_light(36, 36), mask, profile=profile)
     np.testing.assert_array_equal(first.decoded, again.decoded)
-
-
-def test_bc7_is_decoded_as_another_decoder_does(monkeypatch):
-    """imagecodecs against texture2ddecoder, on the very blocks that were encoded."""
-    calls = []
-    original = imagecodecs.bcn_decode
-
-    def spy(data, *args, **kwargs):
-        texels = original(data, *args, **kwargs)
-        calls.append((builtins.bytes(data), texels))
-        return texels
-
-    monkeypatch.setattr(imagecodecs, "bcn_decode", spy)
-    encode_bc7(smooth_light(32, 48), np.ones((32, 48), bool))
-    data, texels = calls[0]
-    bgra = np.frombuffer(texture2ddecoder.decode_bc7(data, 48, 32), np.uint8).reshape(32, 48, 4)
-    np.testing.assert_array_equal(texels[..., :3], bgra[..., 2::-1])
-
-
-def test_ldr_astc_is_decoded_as_another_decoder_does():
-    """astcenc at 16 bits against texture2ddecoder's 8."""
-    codec = hdr_blocks.astc((6, 6), 60.0, "baselines", ldr=True)
-    levels = smooth_light(36, 48) / 5.0
-    data = codec.encode(levels.astype(np.float16))
-    texels = codec.decode(data, 36, 48).astype(np.float32)
-    bgra = np.frombuffer(texture2ddecoder.decode_astc(data, 48, 36, 6, 6), np.uint8).reshape(36, 48, 4)
-    np.testing.assert_allclose(texels, bgra[..., 2::-1] / 255.0, atol=1.0 / 255.0)
-    np.testing.assert_allclose(texels, levels, atol=0.03)

@@ -41,13 +41,6 @@ def test_a_day_comes_back():
     assert "6 bits of latents a texel, 300 steps on cpu" in long.option
 
 
-def test_one_seed_gives_one_result():
-    frames = moving_light(24, 24).light.frames
-    a, b, c = (encode(frames, steps=20, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(a.decoded, b.decoded)
-    assert not np.array_equal(a.decoded, c.decoded)
-
-
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 1), (3, 5, 3), (2, 3, 131)])
 def test_sizes(shape):
     frames = moving_light(*shape[1:], hours=tuple(range(shape[0]))).light.frames
@@ -71,7 +64,7 @@ def test_what_lies_in_the_gaps_changes_nothing():
     zeros, garbage = frames.copy(), frames.copy()
     zeros[:, ~mask] = 0.0
     garbage[:, ~mask] = np.nan
-    a, b = (encode(given, mask, steps=300) for given in (zeros, garbage))
+    a, b = (encode(given, mask, steps=150) for given in (zeros, garbage))
     np.testing.assert_array_equal(a.decoded, b.decoded)
     # The ring that a filtered read reaches is like the texels beside it; beyond it nothing is stored.
     np.testing.assert_allclose(a.decoded[:, 7, 12:33], frames[:, 6, 12:33], atol=0.25 * frames.max())
@@ -91,24 +84,6 @@ def test_a_network_for_each_region(monkeypatch):
     alone = encode(frames[:, :, :20], steps=20)
     # The first half is fitted as it would be alone, but for the ranges of the tile.
     assert abs(psnr(frames[:, :, :20], halves.decoded[:, :, :20]) - psnr(frames[:, :, :20], alone.decoded)) < 2.0
-
-
-def test_more_latents_are_better_and_larger():
-    noise = np.random.default_rng(0).uniform(0.1, 1.0, (4, 32, 32, 3))
-    rivals = [encode(noise, latents=latents, steps=200) for latents in (Latents(4, 2, 8, 2), Latents(2, 16, 4, 16))]
-    quality = [psnr(noise, rival.decoded) for rival in rivals]
-    assert quality[0] + 2.0 < quality[1] and rivals[0].bytes < rivals[1].bytes
-    bits = [latents.bits for latents in LADDER.values()]
-    assert bits == sorted(bits) and 0.25 < bits[0] / 26 < 0.4 and 1.5 < bits[-1] / 26 < 3.0
-
-
-def test_ranges_are_of_tiles():
-    """A dark tile beside a bright one is as good, relative to its own light."""
-    frames = moving_light(16, 256, hours=(0.0, 12.0)).light.frames.copy()
-    frames[:, :, 128:] *= 1e-3
-    decoded = encode(frames, steps=300).decoded
-    bright, dark = psnr(frames[:, :, :128], decoded[:, :, :128]), psnr(frames[:, :, 128:], decoded[:, :, 128:])
-    assert abs(bright - dark) < 4.0 and dark > 20.0
 
 
 def test_it_is_a_method_that_takes_a_device(monkeypatch):

@@ -125,17 +125,6 @@ def test_variants_take_about_the_same_bytes():
     assert Features.of(Profile.load("M")) == VARIANTS["hybrid"]
 
 
-def test_texels_need_maps_of_their_size():
-    """Stripes of single texels that swap during the day: F_uv tells them apart, F_uvt alone doesn't."""
-    stripes = (np.arange(128) % 2)[None, :, None] * np.ones((128, 1, 3))
-    light = np.stack([share * stripes + (1.0 - share) * (1.0 - stripes) + 0.1 for share in (0.0, 0.2, 1.0, 0.6)])
-    errors = {}
-    for name in ("hybrid", "3D alone"):
-        fit = plain_fit(*patch(light, 200), VARIANTS[name])
-        errors[name] = np.mean([float(fit.step()) for _ in range(200)][-10:])
-    assert errors["hybrid"] < 0.3 * errors["3D alone"]
-
-
 def test_bc7_of_free_texels():
     """Texels of one line come back; noise, which no block holds, doesn't."""
     ramp = torch.linspace(0.0, 1.0, 16).reshape(1, 1, 16, 1) * torch.tensor([1.0, 0.5, 0.25, 1.0])

@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import pytest
 
-from benchmarks.rivals import probe as baselines
 from benchmarks.rivals import probe_mbd, probe_pca
 from benchmarks.rivals.probe import (
     RIVALS,
@@ -151,7 +150,7 @@ def test_weights_keep_the_ends_of_each_range():
 
 def test_clusters_by_place_are_nearest_centres():
     random = np.random.default_rng(3)
-    centre = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [10, 10, 10]])
+    centre = 10.0 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     truth = random.integers(0, 5, 300)
     partition = probe_pca.by_place(centre[truth] + random.normal(size=(300, 3)), 5, 0)
     assert partition.count == 5 and len(set(zip(truth, partition.label, strict=True))) == 5
@@ -189,13 +188,6 @@ def test_closest_subspace_is_found():
     assert total == pytest.approx(error.min(1).sum())
 
 
-def test_comparison_in_chunks_changes_nothing(monkeypatch):
-    values = _probes()[1].astype(np.float64)
-    whole = probe_pca.by_signal(values, 6, 2, 0)
-    monkeypatch.setattr(probe_pca, "_CHUNK", 100)
-    np.testing.assert_array_equal(probe_pca.by_signal(values, 6, 2, 0).label, whole.label)
-
-
 @pytest.mark.parametrize("grid", [1, 4])
 def test_moving_basis_never_gets_worse_and_beats_pca(grid):
     position, values = _probes()
@@ -217,29 +209,6 @@ def test_moving_basis_never_gets_worse_and_beats_pca(grid):
             assert found < _error(values, global_pca(position, values, k).decoded)
     none = moving_basis(position, values, 3, grid, 0).decoded
     assert _error(values, none) == pytest.approx(_error(values, global_pca(position, values, 3).decoded), rel=1e-3)
-
-
-def test_corners_make_up_for_rounded_weights():
-    position, values = _probes()
-    wide = values.astype(np.float64)
-    solver = probe_mbd.Solver(position, wide, 3, 2)
-    solver.step(5)
-    cell = probe_mbd._interpolation(position, 2)[2]
-    count = cell.max() + 1
-    stored = probe_pca.write_weights(solver.weight, cell, count, 2)
-    solver.weight = probe_pca.read_weights(stored, cell, count, 3, 2)
-    found = _error(values, moving_basis(position, values, 3, 2, 5, bits=2).decoded)
-    assert found < 0.9 * solver.error() / wide.size
-
-
-def test_moving_basis_fits_a_basis_that_moves():
-    random = np.random.default_rng(5)
-    position = random.uniform(size=(300, 3))
-    ends = random.normal(size=(2, 12))
-    turning = ends[0] + position[:, :1] * (ends[1] - ends[0])
-    values = (random.normal(size=(300, 1)) * turning).astype(np.float32)
-    plain = _error(values, global_pca(position, values, 1).decoded)
-    assert _error(values, moving_basis(position, values, 1, 1, 60).decoded) < 2e-3 * plain
 
 
 @pytest.mark.parametrize("bits", [None, 8])
@@ -293,10 +262,6 @@ def test_settings_that_cannot_be(name):
             METHODS[name](position, light, 1, 2)
     with pytest.raises(WlmError, match="positions of 20 of 20 probes"):
         METHODS[name](position * np.nan, values, 1, 2)
-
-
-def test_other_settings_that_cannot_be():
-    position, values = _probes(count=20)
     with pytest.raises(ValueError, match="iterations"):
         moving_basis(position, values, 1, 2, -1)
     with pytest.raises(ValueError, match="grid"):
@@ -358,18 +323,12 @@ def test_unreal_keeps_all_light_and_clamps_what_is_none():
     beyond = values.reshape(200, 9, 3) * np.where(np.arange(9) == 2, 50.0, 1.0)[:, None]
     decoded = unreal_packing(np.zeros((200, 3)), beyond.reshape(200, 27)).decoded.reshape(200, 9, 3)
     assert (np.abs(decoded[:, 2]) <= np.sqrt(3.0) * decoded[:, 0] * 1.000001).all()
-    # Fewer bands are the first bytes' values and then zeros.
-    less = unreal_packing(np.zeros((200, 3)), values, 2)
-    assert less.bytes == 200 * 13 and not less.decoded[:, 12:].any()
-    np.testing.assert_array_equal(less.decoded[:, :12], result.decoded[:, :12])
 
 
 def test_unreal_refuses():
     position, values = _probes(count=20)
     assert unreal_packing(position, values).bytes == 20 * 13
     assert unreal_packing(position[:1], np.zeros((1, 27))).decoded.any() == np.False_
-    with pytest.raises(ValueError, match="bands"):
-        unreal_packing(position, values, 3)
     with pytest.raises(WlmError, match="3, 12 or 27"):
         unreal_packing(position, values[:, :5])
     with pytest.raises(WlmError, match="values of"):
@@ -378,14 +337,14 @@ def test_unreal_refuses():
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_at_bytes_keeps_the_size_and_uses_it(name):
-    position, values = _probes(count=300)
-    budgets = [int(share * values.nbytes) for share in (0.09, 0.28, 0.5)]
+    position, values = _probes(count=150)
+    budgets = [int(share * values.nbytes) for share in (0.15, 0.28, 0.5)]
     results = [at_bytes(name, position, values, budget) for budget in budgets]
     for result, budget in zip(results, budgets, strict=True):
         assert result.name == name and result.bytes <= budget
     errors = [_error(values, result.decoded) for result in results]
     assert errors[0] > errors[1] >= errors[2]
-    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 300 probes"):
+    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 150 probes"):
         at_bytes(name, position, values, 20)
 
 
@@ -396,7 +355,7 @@ def test_at_bytes_finds_the_best_of_all_settings():
         result
         for bits in (8, None)
         for k in range(1, 13)
-        for clusters in range(1, 60, 4)
+        for clusters in range(1, 40, 6)
         if (result := clustered_pca(position, values, k, clusters, bits=bits)).bytes <= budget
     ]
     best = min(_error(values, result.decoded) for result in tried)
@@ -406,23 +365,6 @@ def test_at_bytes_finds_the_best_of_all_settings():
     assert "half floats" in half.option and _error(values, half.decoded) >= _error(values, found.decoded)
 
 
-def test_at_bytes_stops_where_fewer_components_gain_nothing(monkeypatch):
-    position, values = _probes(count=50)
-    runs = []
-    measure = baselines.measure
-    monkeypatch.setattr(baselines, "measure", lambda *args, **more: runs.append(args) or measure(*args, **more))
-    found = at_bytes("global_pca", position, values, 10**6, (None,))
-    assert found.option == "K=12, 1 part, half floats" and len(runs) == 3
-
-
-def test_at_bytes_finishes_the_moving_basis():
-    position, values = _probes(count=300)
-    found = at_bytes("moving_basis", position, values, int(0.3 * values.nbytes), (None,))
-    components, grid = (int(word.strip("K=,")) for word in found.option.split()[0:3:2])
-    again = moving_basis(position, values, components, grid)
-    np.testing.assert_array_equal(found.decoded, again.decoded)
-
-
 def test_at_bytes_with_little_and_wrong_input():
     position, values = _probes(count=300)
     assert at_bytes("global_pca", position[:1], values[:1], 1000).bytes <= 1000
@@ -430,5 +372,3 @@ def test_at_bytes_with_little_and_wrong_input():
         at_bytes("zip", position, values, 1000)
     with pytest.raises(ValueError, match="bits"):
         at_bytes("global_pca", position, values, 1000, (8, 0))
-    with pytest.raises(WlmError, match="3, 12 or 27"):
-        at_bytes("unreal", position, values[:, :5], 10**6)

@@ -96,34 +96,6 @@ def test_loss_falls_and_seeds_repeat():
     assert losses(3) == first and losses(4) != first
 
 
-def test_run_counts_steps_and_seconds(device):
-    x, values = room(40)
-    fit = dense(x, values, device=device)
-    fit.run(3)
-    once = fit.seconds
-    assert fit.steps_done == 3 and once > 0.0
-    fit.run(2)
-    assert fit.steps_done == 5 and fit.seconds > once
-    fit.run(0)
-    assert fit.steps_done == 5
-
-
-def test_the_start_is_k_means_and_the_nearest_centre():
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5]])
-    x = np.repeat(corners, 10, 0) + 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
-    fit = dense(x, np.ones((40, 3)), count=4, seed=1)
-    centre, log_scale = (p.detach().numpy() for p in fit.parameters[:2])
-    means = x.astype(np.float32).reshape(4, 10, 3).mean(1)
-    nearest = np.linalg.norm(centre[:, None] - means, axis=2).argmin(1)
-    away = np.linalg.norm(centre[:, None] - centre, axis=2) + np.diag([9.0] * 4)
-    np.testing.assert_allclose(np.exp(log_scale), away.min(1)[:, None].repeat(3, 1), rtol=1e-5)
-    # Two clusters may share a centre, as k-means does, but a centre is the mean of what is nearest to it.
-    own = np.linalg.norm(x[:, None] - centre, axis=2).argmin(1)
-    for k in range(4):
-        np.testing.assert_allclose(centre[k], x[own == k].mean(0), atol=1e-6)
-    assert len(set(nearest.tolist())) >= 3
-
-
 def test_one_probe_and_probes_at_one_place():
     for x, values, count in (
         (np.full((1, 3), 0.5), np.ones((1, 1)), 1),
@@ -135,15 +107,6 @@ def test_one_probe_and_probes_at_one_place():
         assert np.isfinite(losses).all() and len(fit.parameters[0]) == count
         # Where all is one place, or one value, the best there is, is the mean.
         np.testing.assert_allclose(fit.decoded(), values.mean(0)[None].repeat(len(x), 0), atol=1e-2)
-
-
-def test_a_number_that_never_changes_is_exact():
-    x, values = room(60)
-    values = values.copy()
-    values[:, 4] = 3.0
-    fit = dense(x, values)
-    fit.run(5)
-    np.testing.assert_array_equal(fit.decoded()[:, 4], np.float32(3.0))
 
 
 def test_what_is_refused():

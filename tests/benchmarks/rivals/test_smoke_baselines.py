@@ -1,7 +1,6 @@
 """What the network is compared with: a billboard that is seen from elsewhere."""
 
 import numpy as np
-import pytest
 import torch
 from builders.smoke_plumes import plume
 
@@ -62,16 +61,3 @@ def test_billboard_moves_with_the_image(device: str):
     away = _camera(volume, target=(9.0, 9.0, 9.0))
     shown = billboard(baked, first, away, volume.centre)
     assert not shown.lightmaps.any() and (shown.transparency == 1).all()
-
-
-def test_billboard_wrong_use(device: str):
-    """Each wrong argument is named."""
-    volume = plume(device=device)
-    camera = _camera(volume)
-    baked = bake(volume, camera, estimate=False)
-    with pytest.raises(ValueError, match="orthographic"):
-        billboard(baked, camera, _camera(volume, perspective=True), volume.centre)
-    with pytest.raises(ValueError, match="32 x 32"):
-        billboard(SixWay(baked.lightmaps[:, 1:], None), camera, camera, volume.centre)
-    with pytest.raises(ValueError, match="transparency"):
-        billboard(SixWay(baked.lightmaps, None), camera, camera, volume.centre)

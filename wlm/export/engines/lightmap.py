@@ -36,12 +36,7 @@ ivec2 wlm_lightmap_place(int i, float hour)
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of a lightmap.
-
-    Args:
-        bundle: The bundle of one sheet of light.
-        folder: The folder; it must exist.
-        engine: One of `wlm.export.ENGINES`.
+    """Writes the kit of one sheet of light for an engine into an existing folder.
 
     Returns:
         Entries of the index: shader, textures and buffers.

@@ -40,11 +40,7 @@ def lightmap_page(
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
-    """Makes the page of the first sheet of light of a lightmap model.
-
-    Args:
-        paths: The model's file.
-        mesh, original, hours, up, progress: As for `wlm.export.page.pages.make_page`.
+    """Makes the page of the first sheet of light of a lightmap model; for the arguments see `make_page`.
 
     Raises:
         WlmError: The mesh or the set cannot be read, or the set has another size.

@@ -22,15 +22,11 @@ _PAGES = {
 
 
 def write_page(path: str | os.PathLike[str], files: Sequence[str | os.PathLike[str]], **options: Any) -> int:
-    """Writes an HTML page that shows a file and needs no network.
+    """Writes an HTML page that shows a file and needs no network, and returns its size in bytes.
 
     Args:
         path: The page, `.html`; its folder must exist.
-        files: As for `make_page`.
-        options: As for `make_page`.
-
-    Returns:
-        Size of the page in bytes.
+        files, options: As for `make_page`.
 
     Raises:
         WlmError: A file is missing, damaged, or of a kind that no page shows; or an option has no meaning for it.

@@ -70,12 +70,6 @@ def probe_page(
 ) -> Page:
     """Makes the page of a probe model: spheres at its positions or at those of the original.
 
-    Args:
-        paths: The model's file.
-        mesh, original, key, up: As for `wlm.export.page.pages.make_page`.
-
-    The page holds the buffers of the model's bundle.
-
     Raises:
         WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the
             original cannot be read; or the original has other probes.

@@ -34,11 +34,8 @@ class _Macro:
 
 
 def read_words(text: str, defined: Iterable[str] = ()) -> list[Word]:
-    """Splits a shader into tokens; expands macros and evaluates conditional directives.
-
-    Args:
-        text: GLSL.
-        defined: Macros that are defined before the text, with the value 1.
+    """Splits GLSL into tokens; expands macros, those in `defined` with the value 1, and evaluates conditional
+    directives.
 
     Raises:
         ValueError: An unsupported directive, or a character that is not part of GLSL.

@@ -81,11 +81,7 @@ class Encoding(ABC):
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately.
-
-        Raises:
-            WlmError: The arrays can not be stored.
-        """
+        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately."""
         return []
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027

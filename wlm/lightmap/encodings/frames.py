@@ -60,17 +60,13 @@ def missing_encoder(count: int) -> str | None:
 def choose_frames(
     kinds: np.ndarray, numbers: Sequence[int] | np.ndarray, mask: np.ndarray, times: int, profile: Profile
 ) -> np.ndarray:
-    """Chooses the tiles that are stored as frames, see `Profile.frames`.
+    """Chooses the tiles that are stored as frames, see `Profile.frames`, bool [N].
 
     Args:
-        kinds: int [N], from `wlm.lightmap.tiles.classify`.
-        numbers: Numbers of the N tiles in the grid.
+        kinds, numbers: Kinds of N tiles and their numbers in the grid.
         mask: bool [H, W], the valid texels of the map.
-        times: T, the number of stored times.
+        times: Number of stored times.
         profile: The settings.
-
-    Returns:
-        bool [N].
     """
     chosen = np.isin(kinds, (TileKind.STATIC, TileKind.DYNAMIC))
     if profile.frames == "auto":
@@ -82,14 +78,11 @@ def choose_frames(
 
 
 def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Finds the blocks of a tile that a filtered read may reach: those with a texel within `REACH` of a valid one.
+    """Finds the blocks of a tile with a texel within `REACH` of a valid one, which filtered reads reach: bool [32, 32].
 
     Args:
         mask: bool [H, W], the valid texels of the map.
         number: Number of the tile in the grid.
-
-    Returns:
-        bool [32, 32].
     """
     y, x = TileGrid.of(*mask.shape).origin(number)
     near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
@@ -142,12 +135,7 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
 
 
 def round_half(values: np.ndarray, toward: float) -> np.ndarray:
-    """Rounds to half floats in one direction, for bounds.
-
-    Args:
-        values: Any shape.
-        toward: Infinity for upper bounds, minus infinity for lower bounds.
-    """
+    """Rounds to half floats toward infinity, for upper bounds, or minus infinity, for lower bounds."""
     nearest = values.astype(np.float16)
     wrong = nearest > values if toward < 0 else nearest < values
     return np.where(wrong, np.nextafter(nearest, np.float16(toward)), nearest)
@@ -157,11 +145,7 @@ class FrameTiles(DeviceTiles):
     """The frames of a sheet on a device."""
 
     def __init__(self, sheet: SheetModel, device: str) -> None:
-        """Uploads the frames.
-
-        Raises:
-            WlmError: The sheet has none.
-        """
+        """Uploads the frames."""
         super().__init__(sheet.numbers(TileKind.FRAMES))
         if not len(self.numbers):
             raise WlmError(f"{sheet.name}: expected at least one tile of frames, found none")

@@ -108,15 +108,9 @@ def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray
 
 
 def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads | None) -> dict[str, np.ndarray]:
-    """Sets texels that no valid texel reads to zero; the decoded light stays the same.
+    """Sets texels of a tile that no valid texel, bool [128, 128], reads to zero; the decoded light stays the same.
 
-    Args:
-        parts: `uv`, uint8 [32, 32, 16], and of a dynamic tile `uvt`, `ut` and `vt`.
-        used: bool [128, 128], the valid texels of the tile.
-        reads: The reads of a dynamic tile; None for a static one.
-
-    Returns:
-        The same parts.
+    The parts are `uv`, uint8 [32, 32, 16], and with the reads of a dynamic tile `uvt`, `ut` and `vt`.
     """
     result = dict(parts)
     result["uv"] = _cleared(parts["uv"].reshape(-1, BLOCK_BYTES), _by_block(used)).reshape(parts["uv"].shape)
@@ -150,12 +144,7 @@ def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
-    """Checks the maps and networks of tiles before they are used.
-
-    Args:
-        parts: `uv`, `net` and, of dynamic tiles, `uvt`, as a trainer returns them.
-        profile: The settings.
-        dynamic: Whether the tiles are dynamic instead of static.
+    """Checks the maps and networks of tiles, as a trainer returns them, before they are used.
 
     Raises:
         WlmError: A block is not of BC7 mode 6, or a network is not on the levels that the settings state.
@@ -275,11 +264,7 @@ class MapTiles(DeviceTiles):
     """
 
     def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
-        """Uploads the tiles of a kind, DYNAMIC or STATIC.
-
-        Raises:
-            WlmError: The sheet has none.
-        """
+        """Uploads the tiles of a kind, DYNAMIC or STATIC."""
         profile, dynamic = sheet.profile, kind == TileKind.DYNAMIC
         rows = np.flatnonzero(sheet.kind[sheet.mapped] == kind)
         if not len(rows):

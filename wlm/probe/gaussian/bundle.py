@@ -1,8 +1,7 @@
 """Gaussians as GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
 
-A runtime stores Gaussians and network with 16 bits per number (gaussian-probe-compression, section 5.3.2 and table 3).
-The paper's numbers are half floats. Here those of the Gaussians are the fit's own codes: they take as many bytes and
-decode to exactly what was trained, whereas a half float can move a centre by a 4096th of the box.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the numbers of the Gaussians are the
+fit's own codes: they take as many bytes and decode to exactly the trained numbers.
 """
 
 import numpy as np

@@ -131,7 +131,7 @@ class Gaussians(Content):
 
     @property
     def count(self) -> int:
-        """K."""
+        """Number of Gaussians, K."""
         return len(self.code)
 
     @property

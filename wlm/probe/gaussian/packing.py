@@ -1,4 +1,4 @@
-"""Quantising a fit for its file: integers as coarse as cost next to nothing.
+"""Quantising a fit for its file: integers with steps as coarse as an error budget allows.
 
 The rounding of one number is compensated by those that are rounded after it. The latents are fitted anew to the rounded
 Gaussians, so that the sums of the latents stay; each layer of the network is fitted to what entered the next layer, the
@@ -38,9 +38,9 @@ DROP = 0.05
 _MANY = 20_000  # most probes that numbers are fitted to; fitting to few probes would favour them over the rest
 _TOGETHER = 1024  # most Gaussians whose latents are fitted together: the matrix has as many rows and columns
 _PIECE = 1 << 22  # probes times Gaussians per piece
-_FAINT = 1e-10  # share of the squared range below which an error is rounding
-# Shares of the natural steps of each group with which a bit is worth as much in all; measured within a third of each
-# other on the sets `livingroom` and `city`.
+_FAINT = 1e-10  # share of the squared range below which an error counts as float32 rounding
+# Factors of the groups' natural steps with which one bit less costs about the same error in each group; the best
+# factors of the sets `livingroom` and `city` are within a third of these.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
 _NEAR = 0.85  # share of the allowed growth that ends the search
 _TRIES = 8
@@ -85,7 +85,7 @@ def _error(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: 
 
 
 class _Steps(NamedTuple):
-    """Steps of each group of numbers.
+    """Quantisation steps of each group of numbers.
 
     Attributes:
         centre, scale, rotation: Steps of a Gaussian's numbers.
@@ -160,11 +160,11 @@ class _Search:
         return best
 
     def finest(self) -> WholeNumbers:
-        """Returns integers with steps so fine that rounding changes next to nothing."""
+        """Returns integers with steps so fine that rounding has hardly any effect."""
         return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
 
     def _natural(self) -> np.ndarray:
-        """Returns steps that do about as much harm in each group at `_SHARES` of them, float64 [8]."""
+        """Returns the steps, float64 [8], at which each group of numbers adds about as much error."""
         rows, (first, second, third) = self._rows, self._layers
         latents = first[: len(self._of_latent)]
         slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
@@ -264,7 +264,7 @@ def _feed(square: np.ndarray, share: float) -> np.ndarray:
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
-    """Rounds numbers [I, O] row by row to integers of at most `most`, each row making up for those before it."""
+    """Rounds numbers [I, O] row by row to integers of at most `most`, each row compensating for the rows before it."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
         whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
@@ -283,7 +283,7 @@ def _with_one(inputs: torch.Tensor) -> torch.Tensor:
 
 
 def _positive(numbers: np.ndarray) -> np.ndarray:
-    """Replaces numbers that are next to nothing by the largest one."""
+    """Replaces numbers below a thousandth of the largest one by that one."""
     most = float(numbers.max()) or 1.0
     return np.where(numbers > 1e-3 * most, numbers, most)
 

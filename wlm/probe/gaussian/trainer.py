@@ -421,7 +421,7 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
 def first_gaussians(
     x: np.ndarray, values: np.ndarray, count: int, detail: float, first_scale: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places centres by k-means that starts where the light varies, with scales from the nearest other centre.
+    """Places centres by k-means that starts where the light varies (gaussian-probe-compression, section 3.2).
 
     Args:
         x: float32 [N, 3], normalised positions.
@@ -431,7 +431,7 @@ def first_gaussians(
         random: Source of the draw.
 
     Returns:
-        Centres, float64 [K, 3], and scales, float64 [K].
+        Centres, float64 [K, 3], and scales, float64 [K], which follow from the distance to the nearest other centre.
     """
     distinct, index = np.unique(x, axis=0, return_index=True)
     count = min(count, len(distinct))

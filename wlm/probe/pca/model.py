@@ -2,10 +2,10 @@
 
     sh_i = m_i sum_k c_ik b_k,   m_i = exp(low_0 + step_0 q_i0),   c_ik = low_k + step_k q_ik,   q in 0 ... 255
 
-The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe: a
-bright probe costs the others nothing. The directions b_k are the right singular vectors of all probes' numbers; with as
-many directions as numbers they are the unit vectors, which take no memory. Sloan et al., Clustered Principal Components
-for Precomputed Radiance Transfer (2003), use several clusters; on sets this small one cluster is as good.
+The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe. The
+directions b_k are the right singular vectors of all probes' numbers; with as many directions as numbers they are the
+unit vectors, which take no memory. This is the method of Sloan et al., Clustered Principal Components for Precomputed
+Radiance Transfer, 2003, with one cluster.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Components(Content):
 
     @property
     def count(self) -> int:
-        """K."""
+        """Number of components, K."""
         return self.code.shape[1] - 1
 
     @property

@@ -25,12 +25,8 @@ _ABOUT = {
 }
 
 
-def volume_bundle(volume: Volume, name: str = "volume") -> Bundle:
-    """Returns what a GPU holds of a volume around its viewer.
-
-    Args:
-        volume: A volume that has been updated.
-        name: Name of the bundle.
+def volume_bundle(volume: Volume) -> Bundle:
+    """Returns what a GPU holds of a volume around the viewer of its last update.
 
     Raises:
         WlmError: The volume has no block yet.
@@ -56,7 +52,7 @@ def volume_bundle(volume: Volume, name: str = "volume") -> Bundle:
     }
     return Bundle(
         system="probe",
-        name=name,
+        name="volume",
         shader=volume_glsl(volume.channels),
         document=document,
         buffers={

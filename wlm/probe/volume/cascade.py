@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -82,16 +83,8 @@ class Reading:
     weight: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """Copies of the device's arrays, as `wlm_kernels.probe.volume` describes them.
-
-    Attributes:
-        pool: float32 [R, D], blocks.
-        pages: int32 [L * side^3], row of each slot's block, or -1.
-        bases: int32 [L, 3], first block of each window, relative to `BlockIndex.start`.
-        views: float32 [L, 4], position of the viewer in each window, and 1 / side of a block.
-    """
+class State(NamedTuple):
+    """Copies of the device's arrays, which `wlm_kernels.probe.volume` describes; bases are relative to the index."""
 
     pool: np.ndarray
     pages: np.ndarray

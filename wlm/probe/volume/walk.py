@@ -165,27 +165,19 @@ def _statistics(values: Sequence[float]) -> dict[str, float] | None:
     return {"mean": float(np.mean(values)), "p95": float(np.percentile(values, 95)), "max": float(np.max(values))}
 
 
-def loop_frames(position: np.ndarray, step: float, up: int = 1) -> int:
-    """Returns the number of frames in which `camera_path` closes with a given step, at most 100,000.
-
-    Args:
-        position: [N, 3], of the live probes.
-        step: Distance per frame, in the unit of the positions.
-        up: As for `camera_path`.
-    """
-    sides = np.delete(np.ptp(np.asarray(position, np.float64), axis=0), up)
+def loop_frames(position: np.ndarray, step: float) -> int:
+    """Returns the number of frames in which `camera_path` closes with a step in the unit of positions, y up."""
     # Ramanujan's circumference of an ellipse, within 0.1% up to an aspect ratio of 3.
-    a, b = _LOOP * sides
+    a, b = _LOOP * np.ptp(np.asarray(position, np.float64), axis=0)[[0, 2]]
     around = math.pi * (3 * (a + b) - math.sqrt((3 * a + b) * (a + 3 * b)))
     return int(np.clip(math.ceil(around / step), 1, _MOST_FRAMES))
 
 
 def camera_path(position: np.ndarray, frames: int, *, up: int = 1) -> np.ndarray:
-    """Returns a closed loop through a scene: an ellipse in the probes' box that follows the ground at eye height,
-    an 80th of the longest side of the box.
+    """Returns a closed loop through a scene: an ellipse in the probes' box that follows the ground at eye height.
 
-    The ground at a point is the median height of the 16 probes nearest to it in plan, averaged over an eighth of the
-    loop, so that the viewer does not jump onto a roof.
+    The eye height is an 80th of the longest side of the box. The ground at a point is the median height of the 16
+    probes nearest to it in plan, averaged over an eighth of the loop, so that the viewer does not jump onto a roof.
 
     Args:
         position: [N, 3], of the live probes.
