@@ -35,17 +35,3 @@ def test_three_at_an_edge_and_a_triangle_twice():
 def test_none_and_one():
     assert charts(np.zeros((0, 3), np.int32)).shape == (0,)
     np.testing.assert_array_equal(charts(np.array([[7, 8, 9]])), [0])
-
-
-def test_many():
-    """A row of strips, against counting."""
-    strips, length = 50, 40
-    first = (length + 2) * np.arange(strips)[:, None] + np.arange(length)
-    corner = np.stack([first, first + 1, first + 2], -1).reshape(-1, 3)
-    random = np.random.default_rng(0).permutation(len(corner))
-    chart = charts(corner[random])
-    assert chart.max() + 1 == strips
-    strip = random // length
-    assert len(np.unique(np.stack([chart, strip]), axis=1).T) == strips
-    first = np.unique(chart, return_index=True)[1]
-    assert (np.diff(first) > 0).all(), "numbered in the order of their first triangles"

@@ -146,15 +146,11 @@ def test_sizes_are_those_of_texels():
     assert [SIZES[k] for k in level] == [5, 5, 9, 9, 5, 2, 2, 33]
 
 
-def test_no_triangle(device: str):
-    clusters = cluster(np.zeros((0, 2)), np.zeros((0, 3), int), _lightmap(), device=device)
-    assert clusters.group.shape == clusters.representative.shape == (0,)
-
-
-def test_one_triangle(device: str):
-    clusters = cluster(*_mesh(1), _lightmap(), device=device)
-    _sound(clusters, 1)
-    assert clusters.representative.tolist() == [0] and not clusters.excluded.any()
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_triangle_and_one(device: str, count: int):
+    clusters = cluster(*_mesh(count), _lightmap(), device=device)
+    assert clusters.representative.tolist() == list(range(count)) and clusters.group.shape == (count,)
+    assert not clusters.excluded.any()
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.3, 2.0])
