@@ -189,19 +189,19 @@ def test_an_export_keeps_to_its_own_folder(subject, tmp_path):
     data = subject.data()
     model = subject.compress(data)
     folder = tmp_path / "engine"
-    files = subject.export(model, data, folder)
+    files = subject.export(model, folder)
     content = {path: path.read_bytes() for path in files}
     assert files and all(path.parent == folder for path in files) and set(folder.iterdir()) == set(files)
     (folder / "readme.txt").write_text("mine")
-    assert set(subject.export(model, data, folder)) == set(files), "an earlier export is written over"
+    assert set(subject.export(model, folder)) == set(files), "an earlier export is written over"
     assert {path: path.read_bytes() for path in files} == content
     assert (folder / "readme.txt").read_text() == "mine", "and nothing else"
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "notes.txt").write_text("mine")
-    one_line(lambda: subject.export(model, data, foreign), "foreign", "expected an empty folder")
+    one_line(lambda: subject.export(model, foreign), "foreign", "expected an empty folder")
     assert [path.name for path in foreign.iterdir()] == ["notes.txt"]
     shutil.rmtree(folder)
     folder.write_text("a file")
-    one_line(lambda: subject.export(model, data, folder), "engine")
+    one_line(lambda: subject.export(model, folder), "engine")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["engine", "foreign"], "nothing is left behind"

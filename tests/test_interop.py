@@ -6,7 +6,6 @@ import pytest
 import torch
 import warp as wp
 
-from wlm import interop
 from wlm.errors import WlmError
 from wlm.interop import StepGraph, available_devices, check_device, device_name, no_collection, stream, to_warp
 
@@ -162,14 +161,6 @@ def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):
         StepGraph(broken, device)()
     with pytest.raises(ValueError, match="warmup"):
         StepGraph(broken, device, warmup=0)
-
-
-def test_one_side_stream_a_device(device):
-    if device == "cpu":
-        with stream(device) as side:
-            assert side is None
-    else:
-        assert interop._side_stream(device) is interop._side_stream(device)
 
 
 def test_a_tensor_is_wrapped_before_anything_has_started_warp():

@@ -18,7 +18,7 @@ from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
 from wlm.bake.probes import BakedProbes, place_probes, write_probes
-from wlm.bake.settings import BakeScene, Lamp, LightmapSettings, ProbeSettings, load_scene
+from wlm.bake.settings import Lamp, LightmapSettings, ProbeSettings, load_scene
 from wlm.bake.texels import place_texels
 from wlm.bake.work import each_hour, open_checkpoint, open_task
 from wlm.cli import app
@@ -240,18 +240,6 @@ def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):
         )
         assert run.exit_code == 2 and "mitsuba is missing" in run.stderr and "pip install 'wlm[bake]'" in run.stderr
         assert run.stderr.count("\n") == 1 and not (tmp_path / output).exists()
-
-
-def test_the_demo_scene_is_of_all_parts():
-    scene, geometry, picture = load_scene(ROOM / "room.yaml")
-    assert isinstance(scene, BakeScene) and geometry.is_file() and picture is None
-    assert {each.material.name for each in read_geometry(geometry, None).surfaces} == {
-        "white",
-        "red",
-        "green",
-        "lamp",
-        "box",
-    }
 
 
 def textured(folder, transform, data=None):

@@ -1,7 +1,8 @@
-"""The four systems as the contract's tests take them: a file each, what it decodes to, and a fit of a moment."""
+"""The four systems as the contract's tests take them: a stored file, what it decodes to, and a fit of a few seconds."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,137 +21,101 @@ class Subject:
     """One system.
 
     Attributes:
-        name: Of its package.
-        file: Written before the systems had a contract.
-        decode: Turns a loaded model into arrays, by the names of `stored`.
-        stored: What the file decoded to when it was written; None: nothing is kept of it.
-        data: Makes a small input.
-        compress: Fits it within seconds; takes the keywords of `compress`.
-        evaluate: Scores a model of that data within a second.
-        export: Exports a model into a folder.
-        open_checkpoint: Opens a checkpoint of that fit: (data, output, resume) and `every`; None: nothing is fitted.
+        name: Name of its package.
+        kind: Name of its stored file.
+        decode: Turns a loaded model into arrays, by the names in `stored`.
+        data: Makes a small input; None where nothing is fitted.
+        profile: The profile of the fit, or its name.
+        scores: Keywords of `evaluate`.
+        options: Keywords of `compress`.
     """
 
     name: str
-    file: Path
+    kind: str
     decode: Callable[[Any], dict[str, np.ndarray]]
-    stored: Path
     data: Callable[[], Any] | None = None
-    compress: Callable[..., Any] | None = None
-    evaluate: Callable[[Any, Any], Any] | None = None
-    export: Callable[[Any, Any, Path], list[Path]] | None = None
-    open_checkpoint: Callable[..., Any] | None = None
+    profile: Any = None
+    scores: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def file(self) -> Path:
+        """The stored file."""
+        return FILES / f"{self.kind}.wlm"
+
+    @property
+    def stored(self) -> Path:
+        """What the file decoded to when it was written."""
+        return FILES / f"{self.kind}.npz"
+
+    def compress(self, data: Any, **options: Any) -> Any:
+        """Fits a model within seconds."""
+        return getattr(wlm, self.name).compress(data, self.profile, **self.options, **options)
+
+    def evaluate(self, model: Any, data: Any) -> Any:
+        """Scores a model of that data."""
+        return getattr(wlm, self.name).evaluate(model, data, **self.scores)
+
+    def export(self, model: Any, folder: Path) -> list[Path]:
+        """Exports a model into a folder."""
+        return export(model, folder)
+
+    def open_checkpoint(self, data: Any, output: Path, resume: bool, **options: Any) -> Any:
+        """Opens a checkpoint of that fit."""
+        fit = import_module(f"wlm.{self.name}.fit")
+        return fit.open_checkpoint(output, data, self.profile, resume=resume, **options)
 
 
-def _lightmap() -> Subject:
-    profile = small_sets.tiny_profile(steps=40)
-
-    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
-        from wlm.lightmap.fit import open_checkpoint
-
-        return open_checkpoint(output, data, profile, resume=resume, **options)
-
-    return Subject(
-        "lightmap",
-        FILES / "lightmap.wlm",
-        lambda model: {"frame": model.decoder().frame(18.5)[::8, ::8]},
-        FILES / "lightmap.npz",
-        small_sets.moving_light,
-        lambda data, **options: wlm.lightmap.compress(data, profile, **options),
-        lambda model, data: wlm.lightmap.evaluate(model, data, metrics=("psnr", "seen")),
-        lambda model, data, folder: wlm.export.export(model, folder),
-        checkpoint,
-    )
+def _layers(model: Any) -> dict[str, np.ndarray]:
+    return {
+        f"{atlas}_{layer}": values[:24:2, :24:2]
+        for atlas, layers in model.decoder().frames(18.5).items()
+        for layer, values in layers.items()
+    }
 
 
-def _layers() -> Subject:
-    def decode(model: Any) -> dict[str, np.ndarray]:
-        return {
-            f"{atlas}_{layer}": values[:24:2, :24:2]
-            for atlas, layers in model.decoder().frames(18.5).items()
-            for layer, values in layers.items()
-        }
-
-    return Subject("lightmap", FILES / "lightmap-layers.wlm", decode, FILES / "lightmap-layers.npz")
+def _probes(model: Any) -> dict[str, np.ndarray]:
+    return {"values": model.decoder().decode_probes()}
 
 
-def _probe() -> Subject:
-    profile = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=60, hidden=16, latent=3)
-
-    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
-        from wlm.probe.fit import open_checkpoint
-
-        return open_checkpoint(output, data, profile, resume=resume, **options)
-
-    return Subject(
-        "probe",
-        FILES / "probe.wlm",
-        lambda model: {"values": model.decoder().decode_probes()},
-        FILES / "probe.npz",
-        lambda: probe_sets.synthetic(300, dead=5),
-        lambda data, **options: wlm.probe.compress(data, profile, **options),
-        lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.export.export(model, folder),
-        checkpoint,
-    )
-
-
-def _probe_pca() -> Subject:
-    return Subject(
-        "probe",
-        FILES / "probe-pca.wlm",
-        lambda model: {"values": model.decoder().decode_probes()},
-        FILES / "probe-pca.npz",
-        lambda: probe_sets.synthetic(300, dead=5),
-        lambda data, **options: wlm.probe.compress(data, "pca", positions=True, **options),
-        lambda model, data: wlm.probe.evaluate(model, data),
-        lambda model, data, folder: wlm.export.export(model, folder),
-    )
+def _smoke(model: Any) -> dict[str, np.ndarray]:
+    with np.load(FILES / "smoke.npz") as stored:
+        guide = stored["guide"]
+    decoder = model.decoder(height=guide.shape[1], width=guide.shape[2])
+    return {"guide": guide, "planes": decoder(torch.from_numpy(guide)).numpy()}
 
 
 def _atlas(kind: str) -> Subject:
     settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
-    profile = wlm.atlas.Profile(name="tiny", views=4, **settings)
-
-    def checkpoint(data: Any, output: Path, resume: bool, **options: Any) -> Any:
-        from wlm.atlas.fit import open_checkpoint
-
-        return open_checkpoint(output, data, profile, resume=resume, **options)
 
     def decode(model: Any) -> dict[str, np.ndarray]:
         with np.load(FILES / f"atlas-{kind}.npz") as stored:
             uv = stored["uv"]
         return {"uv": uv, "light": model.decoder().read(torch.from_numpy(uv)).numpy()}
 
-    return Subject(
-        "atlas",
-        FILES / f"atlas-{kind}.wlm",
-        decode,
-        FILES / f"atlas-{kind}.npz",
-        atlas_meshes.sheet,
-        lambda data, **options: wlm.atlas.compress(data, profile, **options),
-        lambda model, data: wlm.atlas.evaluate(model, data, views=2, resolution=32),
-        lambda model, data, folder: export(model, folder),
-        checkpoint,
-    )
+    profile, scores = wlm.atlas.Profile(name="tiny", views=4, **settings), {"views": 2, "resolution": 32}
+    return Subject("atlas", f"atlas-{kind}", decode, atlas_meshes.sheet, profile, scores)
 
 
-def _smoke() -> Subject:
-    def decode(model: Any) -> dict[str, np.ndarray]:
-        with np.load(FILES / "smoke.npz") as stored:
-            guide = stored["guide"]
-        decoder = model.decoder(height=guide.shape[1], width=guide.shape[2])
-        return {"guide": guide, "planes": decoder(torch.from_numpy(guide)).numpy()}
+def _room() -> Any:
+    return probe_sets.synthetic(300, dead=5)
 
-    return Subject("smoke", FILES / "smoke.wlm", decode, FILES / "smoke.npz")
 
+_GAUSSIANS = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "steps": 60, "hidden": 16, "latent": 3}
 
 SUBJECTS: dict[str, Callable[[], Subject]] = {
-    "lightmap": _lightmap,
-    "lightmap-layers": _layers,
-    "probe": _probe,
-    "probe-pca": _probe_pca,
+    "lightmap": lambda: Subject(
+        "lightmap",
+        "lightmap",
+        lambda model: {"frame": model.decoder().frame(18.5)[::8, ::8]},
+        small_sets.moving_light,
+        small_sets.tiny_profile(steps=40),
+        {"metrics": ("psnr", "seen")},
+    ),
+    "lightmap-layers": lambda: Subject("lightmap", "lightmap-layers", _layers),
+    "probe": lambda: Subject("probe", "probe", _probes, _room, wlm.probe.Profile(**_GAUSSIANS)),
+    "probe-pca": lambda: Subject("probe", "probe-pca", _probes, _room, "pca", options={"positions": True}),
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},
-    "smoke": _smoke,
+    "smoke": lambda: Subject("smoke", "smoke", _smoke),
 }
-"""By name; made when asked for, since importing a system takes time."""
+"""The subjects by name; each is made when asked for, since importing a system takes time."""

@@ -11,9 +11,25 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import torch
+from builders import atlas_models, smoke_samples, synthetic
+from builders.atlas_meshes import sheet
+from builders.layered_sets import random_layers
+from builders.probe_sets import synthetic as synthetic_probes
+from builders.small_sets import moving_light, tiny_profile
 
 import wlm
+from wlm.fluid.lattice import Lattice
+from wlm.fluid.obstacles import Sphere, Trajectory
+from wlm.fluid.solver import Solver
 from wlm.formats.checkpoint import Checkpoint
+from wlm.lightmap import trainer as lightmap_trainer
+from wlm.lightmap.fit import SheetFit
+from wlm.probe.gaussian import trainer as probe_trainer
+from wlm.probe.model import box_of
+from wlm.smoke.fit import train
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
 
 @dataclass(frozen=True)
@@ -42,50 +58,35 @@ def _written(write: Callable[[Path], Any]) -> bytes:
 
 
 def _lightmap() -> Kept:
-    from builders.synthetic import random_model
-
     ranges = {"0.kind": (2, 7), "times": (3, 24.5), "0.constant": (0, -1.0), "0.scale_static": (0, -0.5)}
     ranges |= {"0.affine": (0, -1.0)}
-    return Kept(_written(random_model(uvt_slices=1).save), wlm.load, {}, ranges)
+    return Kept(_written(synthetic.random_model(uvt_slices=1).save), wlm.load, {}, ranges)
 
 
 def _frames() -> Kept:
-    from builders.synthetic import random_model
-
     ranges = {"0.kind": (1, 7), "0.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
+    return Kept(_written(synthetic.random_model((4, 0), times=(0.0, 7.5)).save), wlm.load, {}, ranges)
 
 
 def _layers() -> Kept:
-    from builders.layered_sets import random_layers
-
     ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
 
 
 def _atlas(kind: str, colour: str) -> Kept:
-    from builders.atlas_meshes import sheet
-    from builders.atlas_models import random_model, save_plainly
-
     free = {"lut": "sizes" if kind == "cascade" else "", "mesh": "size"}
     free["uv"] = "size" if kind == "cascade" else "size missing"  # a plain model may keep the UVs of the mesh
     ranges = {"lut": (0, 65535)} if kind == "tiles" else {}
     ranges |= {"colour": (0, -1.0)} if colour == "half" else {}
-    content = _written(lambda path: save_plainly(random_model(sheet(), kind, colour), path))
+    content = _written(lambda path: atlas_models.save_plainly(atlas_models.random_model(sheet(), kind, colour), path))
     return Kept(content, wlm.load, free, ranges)
 
 
 def _smoke() -> Kept:
-    from builders.smoke_samples import random_model
-
-    return Kept(_written(random_model(levels=2).save), wlm.load, {}, {})
+    return Kept(_written(smoke_samples.random_model(levels=2).save), wlm.load, {}, {})
 
 
 def _samples() -> Any:
-    import torch
-
-    from wlm.smoke.network.pool import Pool
-
     random = torch.Generator().manual_seed(0)
     shapes = ((2, 2, 3, 16, 16), (2, 2, 8, 16, 16), (2, 2, 16, 16))
     return Pool(*(torch.rand(shape, generator=random).half() for shape in shapes), torch.arange(2))
@@ -93,14 +94,9 @@ def _samples() -> Any:
 
 def lightmap_fit() -> tuple[Any, Any]:
     """A fit of one dynamic tile, and a trainer of it after three steps."""
-    from builders.small_sets import moving_light, tiny_profile
-
-    from wlm.lightmap.fit import SheetFit
-    from wlm.lightmap.trainer import Trainer
-
     fit = SheetFit(moving_light(40, 24).light, tiny_profile())
     (batch,) = fit.batches(0)
-    trainer = Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
+    trainer = lightmap_trainer.Trainer(fit.model.profile, fit.model.axis, fit.job(batch).targets(), True, 0, "cpu")
     trainer.run(3)
     return fit, trainer
 
@@ -130,17 +126,11 @@ def _lightmap_finished() -> Kept:
 
 
 def _probe_running() -> Kept:
-    from builders.probe_sets import synthetic
-
-    from wlm.probe import Profile
-    from wlm.probe.gaussian.trainer import Trainer
-    from wlm.probe.model import box_of
-
-    probes = synthetic(60)
+    probes = synthetic_probes(60)
     box = box_of(probes.position)
-    profile = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
+    profile = wlm.probe.Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60)
     x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, probes.values, profile, 0, "cpu")
+    trainer = probe_trainer.Trainer(x, probes.values, profile, 0, "cpu")
     trainer.run(52)
     content = _written(lambda path: Checkpoint(path, "probe", {}, "0f").save_running(0, trainer.state()))
     ranges = {"control": (0, -1), "entered": ((), 2), "bounds": ((0, 0), 9.0)}
@@ -153,9 +143,6 @@ def _probe_running() -> Kept:
 
 
 def _training() -> Kept:
-    from wlm.smoke.fit import train
-    from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
-
     settings = TrainSettings(rounds=1, steps=4, batch=2, warmup=2, average=0.5)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
     pools = {"make_pool": lambda *a, **k: _samples(), "make_validation": lambda *a, **k: _samples()}
@@ -182,10 +169,6 @@ def _training() -> Kept:
 
 
 def _simulation() -> Kept:
-    from wlm.fluid.lattice import Lattice
-    from wlm.fluid.obstacles import Sphere, Trajectory
-    from wlm.fluid.solver import Solver
-
     ball = Sphere(Trajectory.of(np.array([[4.0, 4.0, 4.0]]), np.array([0.0])), 1.5)
     solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=1, obstacles=[ball])
     solver.step(2)

@@ -4,6 +4,8 @@ import os
 import signal
 from contextlib import contextmanager
 
+import numpy as np
+from PIL import Image
 from typer.testing import CliRunner
 
 import wlm.cli.console
@@ -28,6 +30,12 @@ def fails(*words):
     lines = call.stderr.splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: "), call.stderr
     return lines[0]
+
+
+def png(path):
+    """Reads a picture: uint8 [H, W, channels]."""
+    with Image.open(path) as image:
+        return np.asarray(image)
 
 
 def report_always(monkeypatch):

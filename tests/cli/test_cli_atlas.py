@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 import yaml
-from builders.atlas_meshes import charts, sheet, write_files
+from builders.atlas_meshes import sheet, write_files
+from builders.contract import FILES
 from builders.gltf_scene import Thing, box, write_scene
 from builders.running import call, fails
 from PIL import Image
@@ -13,7 +14,7 @@ from PIL import Image
 import wlm.atlas.codec
 import wlm.atlas.fit
 from wlm.atlas.data import load
-from wlm.atlas.evaluation import compare, evaluate, original
+from wlm.atlas.evaluation import evaluate
 from wlm.atlas.fit import compress
 from wlm.formats.exr import read_exr, write_exr
 
@@ -135,22 +136,6 @@ def test_evaluate(kind, inputs, request, tmp_path):
     assert (report["seam_ratio"] is None) == (kind == "tiles")
 
 
-def test_seams_are_the_borders_of_charts(tmp_path):
-    """A model with an error at the borders of the lightmap's charts alone."""
-    path, files = tmp_path / "a.wlm", write_files(tmp_path, charts(height=64, width=64))
-    call("compress", *files, "-o", path, *QUICK)
-    options = ["--views", 3, "--resolution", 256, "--json", tmp_path / "a.json"]
-    call("evaluate", path, *files, *options)
-    before = json.loads((tmp_path / "a.json").read_text())
-    assert before["seam_error"] / before["rest_error"] == pytest.approx(before["seam_ratio"])
-    assert wlm.load(path).method == "tiles"
-    # The decoded light is the original plus one amount: seams don't stand out.
-    mesh = load(*files)
-    reader = original(mesh)
-    score = compare(mesh, {"it": lambda points, state: reader(points, state) + 0.5}, views=3, resolution=256)["it"]
-    assert score.seam_ratio == pytest.approx(1.0, abs=0.05) and score.psnr < before["psnr"]
-
-
 def test_evaluate_refuses_other_inputs(inputs, tiles, tmp_path):
     mesh = load(*inputs).sheets[0]
     words = ["evaluate", tiles, inputs[0]]
@@ -215,15 +200,8 @@ def test_info(kind, request):
     text = call("info", path)
     assert f"{size:,}" in text and f"{model.compression_ratio:.2%}" in text and "48x40" in text
     assert ("those of the mesh" in text) is (kind == "tiles")
-
-
-def test_info_of_a_plain_model(inputs, tmp_path):
-    (tmp_path / "plain.yaml").write_text(yaml.safe_dump(CASCADE | {"lut_scale": 0.0, "threshold": 0.0}))
-    call("compress", *inputs, "-o", tmp_path / "a.wlm", "--profile", tmp_path / "plain.yaml")
-    text = call("info", tmp_path / "a.wlm")
-    assert re.search(r"│ lookup texture +│ +none │", text) and re.search(r"│ method +│ +plain │", text)
-    call("evaluate", tmp_path / "a.wlm", *inputs, "--views", 1, "--resolution", 32)
-    assert "gone.wlm" in fails("info", tmp_path / "gone.wlm")
+    plain = call("info", FILES / "atlas-plain.wlm")
+    assert re.search(r"│ lookup texture +│ +none │", plain) and re.search(r"│ method +│ +plain │", plain)
 
 
 def test_a_scene_is_one_command(tmp_path):

@@ -36,16 +36,6 @@ def test_compress_and_info_tell_every_sheet(made):
     assert facts["sheets"][3]["atlas"] == "Lightmap-1" and facts["sheets"][3]["height"] == 24
 
 
-def test_evaluate_scores_every_sheet(made):
-    folder, _ = made
-    report = folder / "report.json"
-    text = call("evaluate", folder / "a.wlm", folder / "scene", "--period", 24, "--json", report)
-    assert "Lightmap-0/dir A" in text
-    content = json.loads(report.read_text())
-    assert [sheet["encoding"] for sheet in content["sheets"]] == ["radiance", "unit", "unit"] * 2
-    assert content["psnr_by_layer"]["dir"] > 10 and content["sheets"][1]["flip"] is None
-
-
 def test_decode_writes_a_layer_with_its_channels(made, tmp_path):
     folder, _ = made
     decoder = wlm.load(folder / "a.wlm").decoder()

@@ -9,10 +9,9 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch
-from builders.running import call, fails
+from builders.running import call, fails, png
 from builders.smoke_axes import axis_faults
 from builders.smoke_plumes import SPHERE, plume, write_frames
-from PIL import Image
 
 from wlm.fluid.volume import load_volume, save_volume
 from wlm.formats.exr import read_planes
@@ -25,13 +24,6 @@ from wlm.view.smoke import picture
 
 LIGHT = LightSettings(toward=(1, 1, 1)).light()
 SMALL = ("--resolution", 20, "--step", 1)
-
-
-@pytest.fixture(scope="session")
-def volume(tmp_path_factory):
-    path = tmp_path_factory.mktemp("volume") / "plume.npz"
-    save_volume(path, plume(hot=True))
-    return path
 
 
 @pytest.fixture(scope="session")
@@ -50,11 +42,6 @@ def baked(frames, tmp_path_factory):
 def camera_of(volume, **settings):
     size = volume.voxel * np.array(volume.shape)
     return make_camera(CameraSettings(**{"resolution": 20} | settings), volume.origin, size)
-
-
-def png(path):
-    with Image.open(path) as image:
-        return np.asarray(image)
 
 
 @pytest.mark.parametrize(
@@ -188,32 +175,6 @@ def test_every_route_keeps_the_scene(tmp_path):
     words = ("--fit", "sphere", "--albedo", 0.8, "--step", 2, "--resolution", 20)
     call("smoke", "bake", folder, "-o", tmp_path / "sphere", *words)
     assert read_shaded(tmp_path / "sphere" / "six_0002.exr")[1] == kept.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
-
-
-def test_a_scenes_glow(tmp_path):
-    smoke = {"extinction": 8.0, "emission": 5.0, "glow": [[0, 0, 0, 0], [0.1, 1, 0.5, 0], [9, 1, 0.5, 0]]}
-    folder = write_frames(tmp_path / "a", smoke=smoke, lights=[], frames=1).path
-    save_volume(folder / "frame_0001.npz", plume(hot=True))
-    call("smoke", "bake", folder, "-o", tmp_path / "six", *SMALL)
-    call("smoke", "shade", tmp_path / "six", "-o", tmp_path / "s")
-    result = png(tmp_path / "s" / "shade_0001.png")
-    # sRGB of a half is 188.
-    assert result.reshape(-1, 3).max(0).tolist() == [255, 188, 0]
-
-
-def test_hard_volumes(tmp_path):
-    cases = {"empty": np.zeros((4, 5, 6)), "nan": np.full((3, 3, 3), np.nan), "one": np.ones((1, 1, 1))}
-    for name, density in cases.items():
-        path = tmp_path / f"{name}.npz"
-        np.savez(path, density=density)
-        # A camera along an axis.
-        call("smoke", "bake", path, "-o", tmp_path / f"{name}-bake.exr", "--camera", "toward=0,1,0", "--resolution", 5)
-        assert ("warning: " in call.stderr and "27 NaN" in call.stderr) == (name == "nan")
-        six = tmp_path / f"{name}-bake.exr"
-        call("smoke", "shade", six, "-o", tmp_path / f"{name}-shade.png", "--light", "0,-1,0")
-        call("smoke", "flipbook", six, "-o", tmp_path / f"{name}-flipbook.png")
-        picture = png(tmp_path / f"{name}-shade.png")
-        assert bool(picture.any()) == (name == "one")
 
 
 def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from builders.running import call, fails
-from builders.smoke_plumes import SPHERE, plume, write_frames
-from PIL import Image
+from builders.running import call, fails, png
+from builders.smoke_plumes import SPHERE, write_frames
 
-from wlm.fluid.volume import load_volume, save_volume
+from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_exr
 from wlm.smoke.camera import Camera
 from wlm.smoke.scene import CameraSettings, make_camera
@@ -15,18 +14,6 @@ from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.tracing import trace
 
 SMALL = ("--resolution", 16)
-
-
-@pytest.fixture(scope="session")
-def volume(tmp_path_factory):
-    path = tmp_path_factory.mktemp("lit") / "plume.npz"
-    save_volume(path, plume(hot=True))
-    return path
-
-
-def png(path):
-    with Image.open(path) as image:
-        return np.asarray(image)
 
 
 def camera_of(volume) -> Camera:

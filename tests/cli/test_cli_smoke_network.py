@@ -10,11 +10,10 @@ import pytest
 import torch
 import yaml
 from builders.running import call, fails
-from builders.smoke_plumes import plume, write_frames
+from builders.smoke_plumes import write_frames
 from builders.smoke_samples import file_content
 
 import wlm
-from wlm.fluid.volume import save_volume
 from wlm.smoke import codec
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.data import load_frames, read_six_way
@@ -59,12 +58,6 @@ def trained(tmp_path_factory):
 @pytest.fixture
 def network(trained):
     return trained[0] / "a.safetensors"
-
-
-@pytest.fixture
-def volume(tmp_path):
-    save_volume(tmp_path / "plume.npz", plume(hot=True))
-    return tmp_path / "plume.npz"
 
 
 def test_train(trained):

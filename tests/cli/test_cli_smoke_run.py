@@ -6,9 +6,8 @@ import sys
 import numpy as np
 import pytest
 import yaml
-from builders.running import call, fails
+from builders.running import call, fails, png
 from builders.smoke_plumes import SCENE, SPHERE
-from PIL import Image
 
 from wlm.formats.film import film
 from wlm.smoke.codec import shipped
@@ -24,11 +23,6 @@ def scene(tmp_path):
     changed = {"smoke": HOT, "inlets": [inlet], "obstacles": [SPHERE], "camera": camera, "background": [0, 0.1, 0]}
     path.write_text(yaml.safe_dump(SCENE | changed))
     return path
-
-
-def png(path):
-    with Image.open(path) as image:
-        return np.asarray(image).astype(int)
 
 
 def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):

@@ -1,4 +1,4 @@
-"""The lattice: limits, states, moving bodies, and published and exact flows; tests of minutes on a CPU are marked slow."""
+"""The lattice: limits, states, moving bodies, and published flows; tests of minutes on a CPU are marked slow."""
 
 import itertools
 

@@ -56,23 +56,6 @@ def test_a_refusing_system_leaves_nothing_behind(target, monkeypatch, call, numb
     _assert_untouched(target)
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_full_disk_in_the_middle(target, monkeypatch):
-    whole_write = os.write
-    calls = []
-    with open("/dev/full", "wb", buffering=0) as full, monkeypatch.context() as patch:
-
-        def second_fails(handle, data):
-            calls.append(len(data))
-            return whole_write(handle if len(calls) == 1 else full.fileno(), data)
-
-        patch.setattr(os, "write", second_fails)
-        with pytest.raises(WlmError, match="No space left on device"):
-            atomic_write(target, [b"a" * 1000, b"b" * 1000])
-    assert calls == [1000, 1000]
-    _assert_untouched(target)
-
-
 def test_a_limit_on_the_file_size_leaves_nothing_behind(target):
     pytest.importorskip("resource")
     code = (

@@ -61,36 +61,6 @@ def test_unpacking_gives_back_what_was_packed():
     assert np.array_equal(pack_mode6(*unpack_mode6(blocks)), blocks)
 
 
-def test_a_high_anchor_swaps_the_endpoints():
-    endpoints = np.array([[[10, 20, 30, 40], [201, 211, 221, 231]]], np.uint8)
-    indices = np.array([[8, *range(15)]], np.uint8)
-    found_endpoints, found_indices = unpack_mode6(pack_mode6(endpoints, indices))
-    assert np.array_equal(found_endpoints, endpoints[:, ::-1])
-    assert np.array_equal(found_indices, 15 - indices)
-
-
-def test_a_block_worked_out_by_hand():
-    endpoints = np.zeros((2, 4), np.uint8)
-    endpoints[1] = 255
-    block = pack_mode6(endpoints, np.arange(16, dtype=np.uint8))
-    # Endpoint 1's four fields, at 14, 28, 42 and 56, its P bit at 64; indices 1 to 15 at 68, 72 and on.
-    expected = 1 << 6 | sum(0x7F << at for at in (14, 28, 42, 56)) | 1 << 64
-    expected |= sum(i << (65 + 4 * i - 1) for i in range(1, 16))
-    assert int.from_bytes(block.tobytes(), "little") == expected
-    first_channel = decode_mode6(block)[:, 0].tolist()
-    assert first_channel == [(255 * int(w) + 32) >> 6 for w in WEIGHTS]
-    assert first_channel[0] == 0 and first_channel[15] == 255
-
-
-def test_the_texels_of_an_image_are_where_they_belong():
-    blocks = _random_blocks(2, 3)
-    image = decode_image(blocks)
-    texels = decode_mode6(blocks)
-    assert image.shape == (8, 12, 4)
-    for y, x in np.ndindex(8, 12):
-        assert np.array_equal(image[y, x], texels[y // 4, x // 4, 4 * (y % 4) + x % 4])
-
-
 def test_a_view_and_no_blocks_at_all_work():
     blocks = _random_blocks(6, 4)
     assert np.array_equal(decode_mode6(blocks[::2, ::-1]), decode_mode6(blocks)[::2, ::-1])

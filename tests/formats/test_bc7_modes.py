@@ -9,7 +9,7 @@ import texture2ddecoder
 from builders.synthetic import any_blocks
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import blocks_image, decode_image
+from wlm.formats.bc7 import blocks_image
 from wlm.formats.bc7_modes import RESERVED, block_modes, decode_blocks, encode_image
 
 ROWS, COLUMNS = 64, 96
@@ -35,12 +35,6 @@ def test_every_partition_is_read(mode):
     blocks[..., 0], blocks[..., 1] = low & 255, low >> 8
     expected = imagecodecs.bcn_decode(blocks.tobytes(), 7, shape=(4 * count, 256, 4))
     assert np.array_equal(blocks_image(decode_blocks(blocks)), expected)
-
-
-def test_mode_6_is_the_other_modules():
-    blocks = any_blocks(8, 8)
-    blocks[..., 0] = blocks[..., 0] & 0x80 | 0x40
-    assert np.array_equal(blocks_image(decode_blocks(blocks)), decode_image(blocks))
 
 
 def test_what_is_of_no_mode_is_black():

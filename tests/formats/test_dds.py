@@ -53,51 +53,43 @@ def test_the_header_of_a_picture(tmp_path):
     assert [_field(data, at) for at in (FORMAT, DIMENSION, MISC, ARRAY, ALPHA)] == [99, 3, 0, 1, 0]
 
 
-def test_the_header_of_mips(tmp_path):
+TEXELS = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
+
+
+@pytest.mark.parametrize(
+    ("texels", "options", "fields"),
+    [
+        (
+            TEXELS,
+            {"width": 5, "height": 3, "fmt": "R9G9B9E5_SHAREDEXP", "mips": 2},
+            {FLAGS: 0x2100F, PITCH: 20, MIPS: 3, CAPS: 0x401008, FORMAT: 67},
+        ),
+        (
+            _blocks(2 * 3 * 5),
+            {"width": 8, "height": 12, "depth": 5},
+            {FLAGS: 0x881007, PITCH: 96, DEPTH: 5, CAPS: 0x1008, CAPS2: 0x200000, DIMENSION: 4},
+        ),
+        # A volume of one slice.
+        (_blocks(2), {"width": 8, "height": 4, "volume": True}, {FLAGS: 0x881007, DEPTH: 1, DIMENSION: 4}),
+        # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
+        (
+            bytes(range(30)),
+            {"width": 3, "height": 5, "fmt": "R8G8_UNORM"},
+            {FLAGS: 0x100F, PITCH: 6, FORMAT: 49, DIMENSION: 3},
+        ),
+        # DDSCAPS_COMPLEX, and the size of an array.
+        (
+            _blocks(6),
+            {"width": 8, "height": 4, "layers": 3},
+            {CAPS: 0x1008, CAPS2: 0, DEPTH: 0, DIMENSION: 3, ARRAY: 3},
+        ),
+    ],
+)
+def test_the_header_of_other_textures(tmp_path, texels, options, fields):
     path = tmp_path / "a.dds"
-    texels = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
-    write_dds(path, texels, width=5, height=3, fmt="R9G9B9E5_SHAREDEXP", mips=2)
+    write_dds(path, texels, **options)
     data = path.read_bytes()
-    assert [_field(data, at) for at in (FLAGS, PITCH, MIPS, CAPS, FORMAT)] == [0x2100F, 20, 3, 0x401008, 67]
-    assert data[148:] == texels
-
-
-def test_the_header_of_a_volume(tmp_path):
-    path = tmp_path / "a.dds"
-    write_dds(path, _blocks(2 * 3 * 5), width=8, height=12, depth=5)
-    data = path.read_bytes()
-    assert [_field(data, at) for at in (FLAGS, PITCH, DEPTH)] == [0x881007, 96, 5]
-    assert [_field(data, at) for at in (CAPS, CAPS2, DIMENSION)] == [0x1008, 0x200000, 4]
-    assert data[148:] == _blocks(30)
-
-
-def test_a_volume_of_one_slice(tmp_path):
-    path = tmp_path / "a.dds"
-    write_dds(path, _blocks(2), width=8, height=4, volume=True)
-    data = path.read_bytes()
-    assert [_field(data, at) for at in (FLAGS, DEPTH, DIMENSION)] == [0x881007, 1, 4]
-    assert data[148:] == _blocks(2)
-
-
-def test_two_bytes_a_texel(tmp_path):
-    path = tmp_path / "a.dds"
-    texels = bytes(range(2 * 3 * 5))
-    write_dds(path, texels, width=3, height=5, fmt="R8G8_UNORM")
-    data = path.read_bytes()
-    # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
-    assert [_field(data, at) for at in (FLAGS, PITCH, FORMAT, DIMENSION)] == [0x100F, 6, 49, 3]
-    assert data[148:] == texels
-    with pytest.raises(ValueError, match="expected 32 bytes, got 30"):
-        write_dds(path, texels, width=4, height=4, fmt="R8G8_UNORM")
-
-
-def test_an_array(tmp_path):
-    path = tmp_path / "a.dds"
-    write_dds(path, _blocks(6), width=8, height=4, layers=3)
-    data = path.read_bytes()
-    # DDSCAPS_COMPLEX, and arraySize behind the dimension and the flags.
-    assert [_field(data, at) for at in (CAPS, CAPS2, DEPTH, DIMENSION, DIMENSION + 8)] == [0x1008, 0, 0, 3, 3]
-    assert data[148:] == _blocks(6)
+    assert {at: _field(data, at) for at in fields} == fields and data[148:] == texels
 
 
 @pytest.mark.parametrize("fmt", DXGI_FORMATS)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.gltf_maker import GltfMaker
 
 from wlm.errors import WlmError
 from wlm.formats.gltf import GltfDocument, components, document_from_arrays, read_gltf
@@ -22,41 +23,25 @@ COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [1, 2, 3], [4, 5, 6]]
 GATHER = np.array([2, 0, 1, 3, 1, 2])
 CORNERS = np.array([[1, 2, 0], [5, 4, 3]])
 NEW_UV = np.arange(12).reshape(6, 2) / 16
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 
 
 def _document(folder: Path) -> GltfDocument:
     """A file with most of what glTF has: attributes of several encodings, morphs, a skin, an animation, an image."""
-    content: dict = {"asset": {"version": "2.0", "generator": "test"}, "bufferViews": [], "accessors": []}
-    blob = bytearray()
-
-    def view(data: bytes, **extra: object) -> int:
-        nonlocal blob
-        blob += bytes(-len(blob) % 4)
-        content["bufferViews"].append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data), **extra})
-        blob += data
-        return len(content["bufferViews"]) - 1
-
-    def add(array: np.ndarray, kind: str, component: int, **extra: object) -> int:
-        number = view(array.tobytes(), **({"byteStride": 4} if array.dtype == np.uint8 else {}))
-        content["accessors"].append(
-            {"bufferView": number, "componentType": component, "count": len(array), "type": kind, **extra}
-        )
-        return len(content["accessors"]) - 1
-
-    view(b"\x89PNG, say")
-    padded = np.pad(COLOURS, ((0, 0), (0, 1)))
+    maker = GltfMaker()
+    content, add = maker.content, maker.add
+    content["asset"]["generator"] = "test"
+    maker.view(b"\x89PNG, say")
     primitive = {
         "attributes": {
-            "POSITION": add(POINTS, "VEC3", 5126, min=[0, 0, 0], max=[9, 9, 9]),
-            "NORMAL": add(POINTS[::-1].copy(), "VEC3", 5126),
-            "COLOR_0": add(padded, "VEC3", 5121, normalized=True),
-            "TEXCOORD_0": add(PLACES, "VEC2", 5126),
-            "_WEIGHT": add(np.arange(5, dtype=np.float32), "SCALAR", 5126),
+            "POSITION": add(POINTS, min=[0, 0, 0], max=[9, 9, 9]),
+            "NORMAL": add(POINTS[::-1].copy()),
+            "COLOR_0": add(COLOURS, normalized=True),
+            "TEXCOORD_0": add(PLACES),
+            "_WEIGHT": add(np.arange(5, dtype=np.float32)),
         },
-        "targets": [{"POSITION": add(POINTS * 2, "VEC3", 5126, min=[0, 0, 0], max=[18, 18, 18])}],
-        "indices": add(TRIANGLES.reshape(-1), "SCALAR", 5123),
+        "targets": [{"POSITION": add(POINTS * 2, min=[0, 0, 0], max=[18, 18, 18])}],
+        "indices": add(TRIANGLES.reshape(-1)),
         "material": 0,
         "extras": {"keep": [1, {"me": None}]},
         "extensions": {"CESIUM_primitive_outline": {"indices": 6}, "KHR_materials_variants": {"mappings": []}},
@@ -69,25 +54,23 @@ def _document(folder: Path) -> GltfDocument:
         "meshes": [{"primitives": [dots, primitive], "weights": [0.5], "name": "mêsh"}],
         "materials": [{"alphaMode": "BLEND", "extensions": {"KHR_materials_unlit": {}}}],
         "images": [{"bufferView": 0, "mimeType": "image/png"}, {"uri": "a%20b.png"}, {"uri": "gone.jpg"}],
-        "skins": [
-            {"joints": [2], "inverseBindMatrices": add(np.eye(4, dtype=np.float32).reshape(1, 16), "MAT4", 5126)}
-        ],
+        "skins": [{"joints": [2], "inverseBindMatrices": add(np.eye(4, dtype=np.float32).reshape(1, 16))}],
         "animations": [
             {
                 "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}}],
                 "samplers": [
                     {
-                        "input": add(np.array([0, 1], np.float32), "SCALAR", 5126, min=[0], max=[1]),
-                        "output": add(np.ones((2, 3), np.float32), "VEC3", 5126),
+                        "input": add(np.array([0, 1], np.float32), min=[0], max=[1]),
+                        "output": add(np.ones((2, 3), np.float32)),
                     }
                 ],
             }
         ],
         "cameras": [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}],
         "extensionsUsed": ["KHR_materials_unlit", "KHR_materials_variants"],
-        "buffers": [{"byteLength": len(blob), "uri": "a.bin"}],
+        "buffers": [{"byteLength": len(maker.blob), "uri": "a.bin"}],
     }
-    (folder / "a.bin").write_bytes(blob)
+    (folder / "a.bin").write_bytes(maker.blob)
     (folder / "a b.png").write_bytes(b"\x89PNG\r\n\x1a\n a picture")
     (folder / "in.gltf").write_text(json.dumps(content))
     return read_gltf(folder / "in.gltf")[0]

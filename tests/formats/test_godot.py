@@ -178,25 +178,6 @@ def test_a_file_cut_short_anywhere_is_one_line(tmp_path):
         assert "cut short or damaged" in message(tmp_path, data[:end])
 
 
-def test_any_damaged_byte_is_read_or_is_one_line(tmp_path):
-    writer = Writer()
-    data = bytearray(writer.file(bake(writer, *probes(2))))
-    rng = np.random.default_rng(5)
-    path = tmp_path / "a.lmbake"
-    failed = 0
-    for at in range(0, len(data), 5):
-        damaged = data.copy()
-        damaged[at] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            position, sh = read_lmbake(path)
-            assert sh.shape == (len(position), 9, 3)
-        except WlmError as error:
-            failed += 1
-            assert "\n" not in str(error)
-    assert failed > len(data) // 50
-
-
 def test_lengths_are_not_believed(tmp_path):
     writer = Writer()
     points, sh = probes(2)

@@ -17,6 +17,7 @@ import zlib
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from PIL import Image
@@ -33,15 +34,18 @@ from wlm.formats.exr import read_exr, write_exr
 from wlm.formats.folder import read_index, staged, write_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_lmbake
+from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import read_mesh
 from wlm.formats.reading import named_file, read_file
 from wlm.lightmap.model import Profile
 from wlm.probe import load as load_probes
 from wlm.probe import load_positions
+from wlm.smoke.flipbook.book import read_flipbook
 from wlm.smoke.scene import load_scene
 
 FILES = Path(__file__).resolve().parents[1] / "files" / "hostile"
+CORPUS = Path(__file__).resolve().parents[1] / "fuzz" / "corpus"
 MOST = 400 << 20  # bytes that a refusal may take at its height
 TRIANGLE = struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1)  # positions, then UVs
 PNG = b"\x89PNG\r\n\x1a\n" + b"secret" * 20
@@ -94,6 +98,10 @@ def write(path: Path, content: object) -> Path:
         (load_volume, ".npz"),
         (load_volume, ".nvdb"),
         (load_volume, ".vdb"),
+        (read_light, ".hdr"),
+        (read_light, ".ktx2"),
+        (read_light, ".dds"),
+        (lambda path: read_flipbook((path, path), "unity", rows=2, columns=2), ".tga"),
         (lambda path: read_mask(path, "a.exr", (4, 4)), ".png"),
     ],
 )
@@ -382,32 +390,6 @@ def test_a_mask_is_a_png_whatever_else_its_name_hides(tmp_path, kind):
     assert "cannot read the mask: expected a PNG" in refused(read_mask, tmp_path / "a.png", "a.exr", (4, 4))
 
 
-def test_any_damaged_chunk_of_a_mask_is_read_or_is_one_line(tmp_path):
-    path = tmp_path / "a.png"
-    Image.fromarray(np.arange(64, dtype=np.uint8).reshape(8, 8)).convert("P").save(path)
-    whole = bytearray(path.read_bytes())
-    generator = np.random.default_rng(0)
-    refusals = 0
-    for _ in range(400):
-        damaged = whole.copy()
-        damaged[generator.integers(8, len(whole))] = generator.integers(256)
-        # Chunks with sums that are right, so that damage reaches what is in them.
-        at = 8
-        while at + 12 <= len(damaged):
-            end = at + 8 + struct.unpack_from(">I", damaged, at)[0]
-            if end + 4 > len(damaged):
-                break
-            struct.pack_into(">I", damaged, end, zlib.crc32(damaged[at + 4 : end]))
-            at = end + 4
-        path.write_bytes(damaged)
-        try:
-            read_mask(path, "a.exr", (8, 8))
-        except WlmError as error:
-            refusals += 1
-            assert "\n" not in str(error)
-    assert 20 < refusals < 400
-
-
 def test_pictures_that_claim_more_than_they_hold(tmp_path):
     assert "expected at most 268435456 texels" in refused(read_exr, FILES / "b44-wide.exr")
     write_exr(tmp_path / "a.exr", np.ones((4, 4, 3), np.float32))
@@ -425,6 +407,37 @@ def test_pictures_that_claim_more_than_they_hold(tmp_path):
         write(tmp_path / "b.exr", content[:at] + window + content[at + 16 :])
         with little_memory():
             assert expected in refused(read_exr, tmp_path / "b.exr")
+
+
+def test_textures_that_claim_more_than_they_hold(tmp_path):
+    """The stated size, the unpacked texels or the file itself would take far more memory than there is."""
+
+    def sparse(head: bytes, size: int = 1 << 40) -> Path:
+        path = write(tmp_path / "a", bytes(head))
+        os.truncate(path, size)
+        return path
+
+    def ktx2(side: int, texels: bytes, stored: int | None = None) -> Path:
+        content = bytearray((CORPUS / "packed-zstd.ktx2").read_bytes())
+        packed = imagecodecs.zstd_encode(texels)
+        struct.pack_into("<2I", content, 20, side, side)
+        struct.pack_into("<3Q", content, 80, len(content), stored or len(packed), 4 * side * side)
+        return sparse(content + packed, len(content) + (stored or len(packed)))
+
+    dds = bytearray((CORPUS / "shared.dds").read_bytes())
+    struct.pack_into("<2I", dds, 12, 1 << 16, 1 << 16)
+    wide = b"#?RADIANCE\n\n-Y 16384 +X 16384\n" + b"abcd\1\1\1\x7f\1\1\1\x7f" * 16384
+    for make in (
+        lambda: ktx2(16384, b"\0" * 16),
+        lambda: ktx2(64, bytes(64 << 20)),
+        lambda: ktx2(4096, b"", 1 << 40),
+        lambda: write(tmp_path / "a", wide),
+        lambda: sparse(b"#?RADIANCE\n"),
+        lambda: sparse(dds),
+    ):
+        path = make()
+        with little_memory():
+            assert refused(read_light, path).startswith(f"{path}: ")
 
 
 def test_alpha_that_is_no_number_is_told_and_not_valid(tmp_path):

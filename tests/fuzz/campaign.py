@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
-from pathlib import Path
 from threading import local
 from typing import Any, Self
 
@@ -61,14 +60,6 @@ class Worker:
             for outcome in self._job({"reader": reader, "first": first, "count": end - first}, first, end):
                 yield outcome
                 first = outcome.index + 1
-
-    def read(self, reader: str, path: Path) -> Outcome:
-        """Reads a file that is there, in its place.
-
-        Raises:
-            RuntimeError: As `run`.
-        """
-        return next(iter(self._job({"reader": reader, "path": str(path)}, 0, 1)))
 
     def _job(self, job: dict[str, Any], first: int, end: int) -> Iterator[Outcome]:
         """The outcomes of a job, the last of which may be that of a case that ended the process."""

@@ -10,7 +10,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from random import Random
 from typing import Any
 
@@ -81,11 +81,6 @@ def vary_artifact(draw: Random, data: bytes) -> bytes:
                     parts[name] = vary_array(draw, parts[name])
         return vary_json(draw, settings) if kind <= 4 else settings
 
-    return edit_artifact(data, change)
-
-
-def edit_artifact(data: bytes, change: Callable[[Any, dict[str, np.ndarray]], Any]) -> bytes:
-    """An artifact with other settings, which `change` returns, and the parts as `change` leaves them; signed."""
     header, body = _open_artifact(data)
     metadata = header.pop("__metadata__")
     parts = {}
@@ -127,15 +122,6 @@ def vary_compact(draw: Random, data: bytes) -> bytes:
         else:
             frame = zstd.compress(corrupt(draw, zstandard.ZstdDecompressor().decompress(frame)))
         body = len(header).to_bytes(2, "little") + header + frame
-    return data[:4] + compact_digest(data[:4], body) + body
-
-
-def edit_compact(data: bytes, change: Callable[[Any, bytes], tuple[Any, bytes]]) -> bytes:
-    """A probe file with the header and the unpacked parts that `change` makes of its own; signed."""
-    end = 10 + int.from_bytes(data[8:10], "little")
-    settings, parts = change(json.loads(data[10:end]), zstandard.ZstdDecompressor().decompress(data[end:]))
-    header = json.dumps(settings, separators=(",", ":")).encode()
-    body = len(header).to_bytes(2, "little") + header + zstd.compress(parts)
     return data[:4] + compact_digest(data[:4], body) + body
 
 

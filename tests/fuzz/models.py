@@ -4,6 +4,7 @@ import functools
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -11,12 +12,19 @@ from unittest.mock import patch
 import numpy as np
 import torch
 import warp as wp
+from builders.probe_sets import synthetic
+from builders.small_sets import moving_light, tiny_profile
 
 import wlm
 from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
+from wlm.smoke.fit import train
 from wlm.smoke.march.motion import read_velocity, write_velocity
+from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
+from wlm.smoke.scene import Scene
+from wlm.smoke.simulation import make_solver
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
 
@@ -107,16 +115,6 @@ def _bytes_of(make: Any) -> bytes:
         return (Path(folder) / "x.partial").read_bytes()
 
 
-def _stop(progress: Any) -> None:
-    raise KeyboardInterrupt
-
-
-def _interrupted(fit: Any) -> None:
-    """Runs a fit until its first report, after which it stops with a checkpoint."""
-    with patch.object(Meter, "due", lambda self, done: True), suppress(KeyboardInterrupt):
-        fit(_stop)
-
-
 def _again(model: Any, path: Path) -> None:
     """What a fit makes of an accepted checkpoint must be a file that is accepted."""
     again = path.with_name("again.wlm")
@@ -131,67 +129,50 @@ def _again(model: Any, path: Path) -> None:
 
 
 @functools.cache
-def _lightmap_fit() -> tuple[Any, Any]:
-    from builders.small_sets import moving_light, tiny_profile
-
-    return moving_light(hours=(0.0, 11.0)), tiny_profile(steps=10)
+def _fits() -> dict[str, tuple[Any, Any]]:
+    """The input and the profile of a short fit, by system."""
+    probes = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=10, hidden=16, latent=3)
+    return {
+        "lightmap": (moving_light(hours=(0.0, 11.0)), tiny_profile(steps=10)),
+        "probe": (synthetic(60), probes),
+    }
 
 
 @functools.cache
-def _lightmap_states() -> Sequence[bytes]:
-    """Of a running batch, and of a finished one."""
-    lightmaps, profile = _lightmap_fit()
+def _states(module: Any, system: str) -> Sequence[bytes]:
+    """The checkpoint of a running fit and, of lightmaps, that of a finished one."""
+    data, profile = _fits()[system]
+
+    def write(output: Path, **options: Any) -> None:
+        checkpoint = module.open_checkpoint(output, data, profile)
+        module.compress(data, profile, checkpoint=checkpoint, **options)
+
+    def stop(progress: Any) -> None:
+        raise KeyboardInterrupt
 
     def running(output: Path) -> None:
-        checkpoint = lightmap_fit.open_checkpoint(output, lightmaps, profile)
-        _interrupted(lambda stop: lightmap_fit.compress(lightmaps, profile, progress=stop, checkpoint=checkpoint))
+        with patch.object(Meter, "due", lambda self, done: True), suppress(KeyboardInterrupt):
+            write(output, progress=stop)
 
-    def finished(output: Path) -> None:
-        checkpoint = lightmap_fit.open_checkpoint(output, lightmaps, profile)
-        lightmap_fit.compress(lightmaps, profile, checkpoint=checkpoint)
-
-    return _bytes_of(running), _bytes_of(finished)
+    return tuple(_bytes_of(make) for make in (running, *[write] * (system == "lightmap")))
 
 
-def _lightmap_checkpoint(path: Path) -> None:
-    lightmaps, profile = _lightmap_fit()
-    checkpoint = lightmap_fit.open_checkpoint(path.with_suffix(""), lightmaps, profile, resume=True)
+def _resume(module: Any, system: str, path: Path) -> None:
+    """Continues a fit to its end."""
+    data, profile = _fits()[system]
+    checkpoint = module.open_checkpoint(path.with_suffix(""), data, profile, resume=True)
     check_digest(path)
     with _diverging():
-        _again(lightmap_fit.compress(lightmaps, profile, checkpoint=checkpoint), path)
+        _again(module.compress(data, profile, checkpoint=checkpoint), path)
 
 
-@functools.cache
-def _probe_fit() -> tuple[Any, Any]:
-    from builders.probe_sets import synthetic
-
-    return synthetic(60), wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=10, hidden=16, latent=3)
-
-
-@functools.cache
-def _probe_states() -> Sequence[bytes]:
-    probes, profile = _probe_fit()
-
-    def running(output: Path) -> None:
-        checkpoint = probe_fit.open_checkpoint(output, probes, profile)
-        _interrupted(lambda stop: probe_fit.compress(probes, profile, progress=stop, checkpoint=checkpoint))
-
-    return (_bytes_of(running),)
-
-
-def _probe_checkpoint(path: Path) -> None:
-    probes, profile = _probe_fit()
-    checkpoint = probe_fit.open_checkpoint(path.with_suffix(""), probes, profile, resume=True)
-    check_digest(path)
-    with _diverging():
-        _again(probe_fit.compress(probes, profile, checkpoint=checkpoint), path)
+def _checkpoints(module: Any, system: str, cost: int) -> Reader:
+    seeds, read = partial(_states, module, system), partial(_resume, module, system)
+    return Reader(f"{system}-checkpoint", "a.partial", seeds, vary_artifact, read, cost=cost)
 
 
 @functools.cache
 def _solver() -> Any:
-    from wlm.smoke.scene import Scene
-    from wlm.smoke.simulation import make_solver
-
     scene = {"name": "small", "grid": {"cells": [4, 6, 4], "cell": 0.25}, "frames": 1, "rate": 10.0}
     inlet = {"face": "-y", "velocity": [0, 1, 0], "radius": 0.3}
     return make_solver(Scene.model_validate(scene | {"inlets": [inlet]}))
@@ -224,9 +205,6 @@ def _smoke_checkpoint(path: Path) -> None:
 
 @functools.cache
 def _training() -> tuple[Any, Any]:
-    from wlm.smoke.network.pool import Pool
-    from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
-
     settings = TrainSettings(rounds=2, steps=1, batch=2, warmup=1)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
     guides, targets = torch.linspace(0, 1, 2 * 3 * 256), torch.linspace(1, 0, 2 * 8 * 256)
@@ -236,8 +214,6 @@ def _training() -> tuple[Any, Any]:
 
 
 def _train(output: Path, **options: Any) -> Any:
-    from wlm.smoke.fit import train
-
     profile, pool = _training()
     pools = {"make_pool": lambda *a, **k: pool, "make_validation": lambda *a, **k: pool}
     return train(profile, output, **pools, **options)
@@ -271,33 +247,17 @@ class _diverging:
         return isinstance(error, WlmError) and "diverged" in str(error)
 
 
+_LIGHTMAPS = ("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm")
+_ATLASES = ("tiles", "mixed", "cascade", "bc6h", "plain", "shared", "separate")
 READERS = (
-    Reader(
-        "lightmap",
-        "a.wlm",
-        stored("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm"),
-        vary_artifact,
-        _lightmap,
-    ),
-    Reader(
-        "probe",
-        "a.wlm",
-        stored("probe.wlm", "probe-pca.wlm"),
-        vary_compact,
-        _probe,
-    ),
-    Reader(
-        "atlas",
-        "a.wlm",
-        stored(*(f"atlas-{kind}.wlm" for kind in ("tiles", "mixed", "cascade", "bc6h", "plain", "shared", "separate"))),
-        vary_artifact,
-        _atlas,
-    ),
+    Reader("lightmap", "a.wlm", stored(*_LIGHTMAPS), vary_artifact, _lightmap),
+    Reader("probe", "a.wlm", stored("probe.wlm", "probe-pca.wlm"), vary_compact, _probe),
+    Reader("atlas", "a.wlm", stored(*(f"atlas-{kind}.wlm" for kind in _ATLASES)), vary_artifact, _atlas),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     Reader("smoke-velocity", "a.npz", _velocities, vary_npz, _velocity),
-    Reader("lightmap-checkpoint", "a.partial", _lightmap_states, vary_artifact, _lightmap_checkpoint, cost=8),
-    Reader("probe-checkpoint", "a.partial", _probe_states, vary_artifact, _probe_checkpoint, cost=4),
+    _checkpoints(lightmap_fit, "lightmap", cost=8),
+    _checkpoints(probe_fit, "probe", cost=4),
     Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),
     Reader("smoke-network-checkpoint", "a.partial", _training_states, vary_artifact, _network_checkpoint, cost=8),
 )

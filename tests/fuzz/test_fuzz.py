@@ -69,12 +69,6 @@ def test_a_case_that_waits_is_ended():
         assert [outcome.kind for outcome in worker.run("wait", 0, 1)] == ["time"]
 
 
-def test_a_file_that_is_there_is_read_in_its_place(faulty, tmp_path):
-    (tmp_path / "x").write_bytes(b"bad")
-    outcome = faulty.read("refused", tmp_path / "x")
-    assert outcome.kind == "refused" and outcome.detail.startswith(f"{tmp_path / 'x'}: ")
-
-
 def test_a_reader_that_refuses_its_own_good_file_is_an_error(faulty):
     with pytest.raises(RuntimeError, match="KeyError: 'nothing'"):
         next(faulty.run("nothing", 0, 1))

@@ -2,9 +2,9 @@
 
     python -m tests.fuzz.worker MODULE SECONDS WAIT MEMORY
 
-It takes jobs as lines of JSON: `{"reader": NAME, "first": INDEX, "count": N}`, or `{"reader": NAME, "path": FILE}` for
-a file that is there. It answers `"ready"` once the reader's good files were accepted, so that kernels are compiled and
-packages imported before anything is timed, and then `[index, outcome, detail]` for each case.
+It takes jobs as lines of JSON: `{"reader": NAME, "first": INDEX, "count": N}`. It answers `"ready"` once the reader has
+accepted its good files, so that kernels are compiled and packages imported before anything is timed, and then
+`[index, outcome, detail]` for each case.
 """
 
 import importlib
@@ -169,9 +169,6 @@ def _serve(bench: _Bench, job: dict, answers: TextIO) -> None:
     try:
         bench.prepare(job["reader"])
         answer("ready")
-        if "path" in job:
-            answer([0, *judge(bench.readers[job["reader"]], Path(job["path"]), bench.limits)])
-            return
         for index in range(job["first"], job["first"] + job["count"]):
             answer([index, *bench.run(job["reader"], index)])
     except Exception:

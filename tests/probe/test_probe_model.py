@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, whole_model, with_content
+from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, whole_model
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -44,13 +44,6 @@ def test_codes_in_between_are_those_of_the_equation():
     np.testing.assert_allclose(rows[:, LATENT], expected, rtol=0, atol=1e-6)
     expected = low[CENTRE] + content.code[:, CENTRE] * (high - low)[CENTRE] / 65535.0
     np.testing.assert_allclose(rows[:, CENTRE], expected, rtol=0, atol=1e-6)
-
-
-def test_a_channel_of_one_value_is_that_value():
-    model = random_model()
-    bounds = model.content.bounds.copy()
-    bounds[:, 12] = 0.1
-    np.testing.assert_array_equal(with_content(model, bounds=bounds).content.rows()[:, 12], np.float32(0.1))
 
 
 def test_positions_are_normalised_and_moved_into_the_box():

@@ -13,9 +13,8 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Finds the texels whose square intersects some triangle's inside, however little, bool [height, width]. UVs are
-    float64 [V, 2] in [0, 1]; each triangle has an area. One that ends exactly at a texel's side doesn't touch the
-    texel."""
+    """Finds the texels whose square intersects some triangle's inside, bool [height, width]. UVs are float64 [V, 2] in
+    [0, 1]; each triangle has an area. One that ends exactly at a texel's side doesn't touch the texel."""
     change = np.zeros((height, width + 1), np.int32)
     for corner, row in _rows(uv, triangle, height, width, centres=False):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)

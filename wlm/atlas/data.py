@@ -522,7 +522,8 @@ def _checked_light(
     height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):
         warnings.append(f"{names[0]}: {width} x {height}, as a cube's six faces: is it a reflection probe?")
-    texels = _uv_area(uv, triangle) * height * width
+    ab, ac = uv[triangle[:, 1]] - uv[triangle[:, 0]], uv[triangle[:, 2]] - uv[triangle[:, 0]]
+    texels = 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()) * height * width
     if texels < 1.0:
         warnings.append(
             f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in TEXCOORD_{uv_set}: are "
@@ -581,12 +582,6 @@ def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     else:
         twice_area = np.linalg.norm(np.cross(ab, ac), axis=1)
     return twice_area > 2 * _FLAT
-
-
-def _uv_area(uv: np.ndarray, triangle: np.ndarray) -> float:
-    """Sums the triangles' areas in UV."""
-    ab, ac = uv[triangle[:, 1]] - uv[triangle[:, 0]], uv[triangle[:, 2]] - uv[triangle[:, 0]]
-    return 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum())
 
 
 def _count(number: int, singular: str, plural: str | None = None) -> str:

@@ -276,10 +276,10 @@ def _thickened(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def _dilated(corner: np.ndarray) -> np.ndarray:
-    """Computes outlines of triangles [N, 3, 2], each dilated by one texel along both axes: [N, 7, 2].
+    """Computes outlines [N, 7, 2] of triangles [N, 3, 2], dilated by one texel along both axes: the reach of bilinear
+    reads.
 
-    A bilinear read uses the texels whose centres are less than one texel away along both axes. These are in the
-    Minkowski sum of the triangle and a square, whose edges are those of both, by direction.
+    Each is the Minkowski sum of the triangle and a square, whose edges are those of both, by direction.
     """
     flip = _signed_area(corner) < 0
     ring = np.where(flip[:, None, None], corner[:, ::-1], corner)

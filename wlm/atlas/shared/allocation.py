@@ -117,7 +117,8 @@ def _worth(
     """Removes mixtures, the least useful first, until each saves more error than its factors' bits would elsewhere.
     Returns `error`, with a value above all others where a tile's mixture is left out."""
     tiles = np.arange(error.shape[1])
-    ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in _two(error, cost, bits)]
+    both = [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]
+    ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in both]
     gain = (ends[1][0] - ends[0][0]) / max(ends[0][1] - ends[1][1], 1.0)  # error that one bit saves
     if len(number) == 1 or not gain > 0.0:
         return error
@@ -139,13 +140,9 @@ def _worth(
     return np.where(np.isinf(least)[of], never, error)
 
 
-def _two(error: np.ndarray, cost: np.ndarray, bits: float) -> list[np.ndarray]:
-    return [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]
-
-
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages, which all have one size.
-    Returns first texels, int64 [T, 2]; pages, int64 [T]; rows and columns of a page.
+    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages of one size: first texels,
+    int64 [T, 2]; pages, int64 [T]; rows and columns of a page.
 
     Raises:
         WlmError: All pages together are too small.
