@@ -8,7 +8,6 @@ from pathlib import Path
 import imagecodecs
 
 from wlm.formats.dds import DXGI_FORMATS
-from wlm.formats.ktx2 import VK_FORMATS
 
 
 @dataclass(frozen=True)
@@ -27,15 +26,6 @@ def open_dds(path: Path) -> Texture:
     height, width = struct.unpack_from("<2I", content, 12)
     (number,) = struct.unpack_from("<I", content, 128)
     return Texture(width, height, _name(DXGI_FORMATS, number), content[148:])
-
-
-def open_ktx2(path: Path) -> Texture:
-    """A KTX2 file of one level."""
-    content = path.read_bytes()
-    number, _, width, height = struct.unpack_from("<4I", content, 12)
-    start, length = struct.unpack_from("<2Q", content, 80)
-    assert start + length == len(content)
-    return Texture(width, height, _name(VK_FORMATS, number), content[start:])
 
 
 def _name(formats: dict[str, int], number: int) -> str:

@@ -51,12 +51,6 @@ def test_compress_writes_one_file_and_prints_one_table(inputs, tmp_path):
     assert "fit: weights" in call.stderr and os.listdir(tmp_path) == ["a.wlm"]
 
 
-def test_the_command_is_the_library(inputs, tiles, tmp_path):
-    """Also byte for byte: one seed gives one file."""
-    assert compress(load(*inputs), views=2).save(tmp_path / "a.wlm")
-    assert (tmp_path / "a.wlm").read_bytes() == tiles.read_bytes()
-
-
 def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     mask = np.zeros((40, 48), np.uint8)
     mask[:30] = 255
