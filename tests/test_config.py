@@ -72,13 +72,6 @@ def test_a_wrong_file_is_one_line(tmp_path, text, words):
         assert word in line
 
 
-def test_a_missing_file_or_a_folder_is_one_line(tmp_path):
-    with pytest.raises(WlmError, match="no.yaml: cannot read the settings: No such file"):
-        load_settings(Settings, tmp_path / "no.yaml")
-    with pytest.raises(WlmError, match="expected a file, found a folder"):
-        load_settings(Settings, tmp_path)
-
-
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """A checkout's layout with two profiles, and no installed ones."""

@@ -1,4 +1,4 @@
-"""What holds for every system alike: the front door, files, damage, progress, resume, export."""
+"""Facts that hold for every system: the front door, files, damage, progress, resume, export."""
 
 import dataclasses
 import json

@@ -164,7 +164,7 @@ def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):
 
 
 def test_a_tensor_is_wrapped_before_anything_has_started_warp():
-    """In a process of its own, whose first call of Warp this is."""
+    """A new process makes its first call of Warp here."""
     program = "import torch; from wlm.interop import to_warp; print(to_warp(torch.arange(3.0)).numpy().sum())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0 and done.stdout.split()[-1] == "3.0"

@@ -180,7 +180,7 @@ def test_tables_in_place_of_lists(path):
 
 
 def test_a_few_bytes_that_claim_a_large_lightmap(path):
-    """Of empty tiles alone; the largest that is read takes no memory for them either."""
+    """The file has only empty tiles, and the largest accepted one takes no memory for them."""
     kept = written(path, "lightmap")
     parts = {name: GONE for name in read_artifact(path).tensors if name not in ("0.kind", "times")}
     rewrite(path, _sized(32768, 32768), parts | {"0.kind": np.zeros(65536, np.uint8)})

@@ -1,4 +1,4 @@
-"""What a bake reads: scene files, surfaces, where texels and probes are, where the sun is; none of it needs Mitsuba."""
+"""The inputs of a bake: scene files, surfaces, places of texels and probes, and the sun. Mitsuba is not needed."""
 
 import io
 import json

@@ -28,7 +28,7 @@ def soft(place: np.ndarray) -> np.ndarray:
 
 
 def constant(*colour: float) -> Light:
-    """One colour."""
+    """Makes a lightmap of one colour."""
     return lambda place: np.broadcast_to(np.array(colour), (*place.shape[:-1], 3))
 
 
@@ -60,7 +60,7 @@ def charts(light: Light = soft, height: int = 48, width: int = 64, name: str = "
 
 
 def triangle(light: Light = soft, height: int = 16, width: int = 16, name: str = "triangle") -> LightmappedScene:
-    """One triangle, in a corner of its lightmap."""
+    """Makes a triangle in a corner of its lightmap."""
     corner = np.array([[0.1, 0.1], [0.7, 0.15], [0.2, 0.6]])
     position = np.insert(corner, 2, 0.0, axis=1)
     return from_arrays(position, np.array([[0, 1, 2]]), corner, image(light, height, width), name=name)

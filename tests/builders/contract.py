@@ -18,7 +18,7 @@ FILES = Path(__file__).resolve().parents[1] / "files"
 
 @dataclass(frozen=True)
 class Subject:
-    """One system.
+    """A system under the tests of the contract.
 
     Attributes:
         name: Name of its package.
@@ -45,7 +45,7 @@ class Subject:
 
     @property
     def stored(self) -> Path:
-        """What the file decoded to when it was written."""
+        """The path of the arrays that the file decoded to when it was written."""
         return FILES / f"{self.kind}.npz"
 
     def compress(self, data: Any, **options: Any) -> Any:

@@ -93,7 +93,7 @@ def pixels_of(file):
 
 
 def node_gives(code, inputs, size, place, bound, folder, numbers=None, channels=3):
-    """What a Custom node gives, float32 [*size, channels].
+    """Computes the output of a Custom node, float32 [*size, channels].
 
     Args:
         code, inputs: Of `Script.customs`.

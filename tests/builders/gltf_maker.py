@@ -1,4 +1,4 @@
-"""glTF files in the making: bytes, views and accessors."""
+"""Assembles glTF files from bytes, views and accessors."""
 
 import json
 import struct

@@ -44,7 +44,7 @@ class Writer:
         return self.u32(30, len(values)) + b"".join(values)
 
     def of_every_kind(self):
-        """One value of each type that there is, containers last."""
+        """Writes a value of each type, containers last."""
         plain = [
             self.u32(1),
             self.u32(2, 1),

@@ -192,4 +192,4 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "simulation": _simulation,
     }.items()
 }
-"""By name; made when first asked for."""
+"""The files by name; each is made when first asked for."""

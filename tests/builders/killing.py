@@ -42,7 +42,7 @@ class Command:
 
 @dataclass
 class Counts:
-    """What came of a command's kills.
+    """Counts of the kills of one command.
 
     Attributes:
         kills: By the signal's name.
@@ -111,7 +111,7 @@ def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tup
 
 
 class _Run:
-    """One process of a command.
+    """A process that runs a command.
 
     Attributes:
         start: When it was started.
@@ -141,7 +141,7 @@ class _Run:
 
     def _works(self) -> bool:
         if self.command.partial is None:
-            # Of an export: files in the making.
+            # An export has begun when it writes temporary files.
             return any(name.startswith(".wlm-") for name in os.listdir(self.output.parent))
         return any(line.split(":")[0] in _WORKS for line in self.errors().splitlines())
 

@@ -8,7 +8,7 @@ _DIFFUSED = 18  # among the features
 
 
 def input_alone() -> OrdersModel:
-    """One that hands on what it is given: single scattering and diffusion."""
+    """Makes a mix that returns its input: single scattering and diffusion."""
     model = load_orders()
     weights = torch.zeros(model.weights.shape)
     weights[:, 0, _DIFFUSED] = 1.0

@@ -13,7 +13,7 @@ import numpy as np
 from wlm.formats.artifact import read_artifact, write_artifact
 
 GONE = object()
-"""In place of a value: the file is to be without it."""
+"""Marks a value that is removed from the file."""
 
 WEIRD = {
     "none": None,

@@ -60,7 +60,7 @@ def scene_folder(folder, uv_set=1, states=STATES, **settings):
 
 
 def expected_picture(model, size, state):
-    """What the squares show from the front, [size, size, 3], row 0 on top, and where no border of tiles is near."""
+    """Returns the squares seen from the front, [size, size, 3], and a mask of the pixels far from tile borders."""
     decoder = Decoder(model)
     picture, inside = np.zeros((size, size, 3)), np.zeros((size, size), bool)
     y, x = 1 - (np.mgrid[:size, :size][0] + 0.5) / size * 2, (np.mgrid[:size, :size][1] + 0.5) / size * 2 - 1

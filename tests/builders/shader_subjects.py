@@ -1,4 +1,4 @@
-"""What a test of a shader runs, and what it should show."""
+"""The inputs and the expected pictures of the shader tests."""
 
 from dataclasses import dataclass
 

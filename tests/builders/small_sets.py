@@ -31,7 +31,7 @@ def moving_light(height=128, width=128, hours=HOURS, period=24.0, mask=None, see
 
 
 def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet:
-    """One pattern whose brightness alone changes with the hour."""
+    """Makes a pattern whose brightness alone changes with the hour."""
     pattern = np.random.default_rng(1).uniform(0.1, 1.0, (height, width, 3))
     frames = np.stack([pattern * (1.0 + hour) for hour in hours])
     return from_arrays(frames, hours, period=period, name="static")

@@ -14,7 +14,7 @@ from wlm.smoke.shading import Light, Ramp
 
 FIRE = Ramp((0.0, 0.4, 1.0), ((0.0, 0.0, 0.0), (0.9, 0.2, 0.0), (1.0, 0.8, 0.4)))
 TOWARD, IRRADIANCE, SKY = (0.48, -0.6, 0.64), (3.0, 2.0, 1.0), (0.2, 0.3, 0.4)
-"""One light in the billboard's axes, and the sky's radiance."""
+"""A light's direction and irradiance in the billboard's axes, and the radiance of the sky."""
 
 
 def random_frames(count: int = 5, size: tuple[int, int] = (12, 16), *, hot: bool = True, seed: int = 0) -> list[SixWay]:
@@ -40,9 +40,9 @@ def random_book(frames: list[SixWay], *, moving: bool = False, ramp: Ramp | None
 
 
 SCALE = 255.0 / 2.0 / 64.0 / 8.0
-"""Of the motion, so that 64 steps of 255 are an eighth of a frame."""
+"""Scale of the motion: 64 steps of 255 are an eighth of a frame."""
 MOVED = (0.125, -0.125)
-"""To the right and down, in shares of a frame."""
+"""The constant motion to the right and down, as a fraction of a frame."""
 
 
 def shown(frames: list[SixWay], book: Book, time: float) -> np.ndarray:

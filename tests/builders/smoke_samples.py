@@ -22,7 +22,7 @@ from wlm.smoke.scene import CameraSettings, make_camera
 from wlm_kernels.smoke.settings import March
 
 STEP = 3.0
-"""Of the guiding maps, in voxels."""
+"""Step of the march of the guiding maps, in voxels."""
 
 
 def view_of(volume: DensityVolume, degrees: float = 0.0, resolution: int = 32) -> Camera:

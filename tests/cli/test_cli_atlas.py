@@ -51,12 +51,6 @@ def test_compress_writes_one_file_and_prints_one_table(inputs, tmp_path):
     assert "fit: weights" in call.stderr and os.listdir(tmp_path) == ["a.wlm"]
 
 
-def test_the_command_is_the_library(inputs, tiles, tmp_path):
-    """Also byte for byte: one seed gives one file."""
-    assert compress(load(*inputs), views=2).save(tmp_path / "a.wlm")
-    assert (tmp_path / "a.wlm").read_bytes() == tiles.read_bytes()
-
-
 def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     mask = np.zeros((40, 48), np.uint8)
     mask[:30] = 255
@@ -103,23 +97,6 @@ def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch):
     monkeypatch.setattr(wlm.atlas, "compress", interrupted)
     call("compress", *inputs, "-o", tmp_path / "a.wlm", code=130)
     assert os.listdir(tmp_path) == []
-
-
-def test_a_mesh_of_another_format(inputs, tmp_path):
-    (mesh,) = load(*inputs).sheets
-    lines = ["v {} {} {}".format(*place) for place in mesh.position]
-    # v of an .obj goes up.
-    lines += [f"vt {u} {1 - v}" for u, v in mesh.uv]
-    lines += ["f " + " ".join(f"{i}/{i}" for i in corner) for corner in mesh.triangle + 1]
-    (tmp_path / "mesh.obj").write_text("\n".join(lines))
-    words = tmp_path / "mesh.obj", inputs[1]
-    call("compress", *words, "-o", tmp_path / "a.wlm", *QUICK)
-    call("decode", tmp_path / "a.wlm", "-o", tmp_path / "a.exr")
-    decoded, _ = read_exr(tmp_path / "a.exr")
-    (written,) = wlm.load(tmp_path / "a.wlm").scene.sheets
-    np.testing.assert_allclose(written.uv[written.triangle], mesh.uv[mesh.triangle], atol=1e-6)
-    assert np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
-    call("evaluate", tmp_path / "a.wlm", *words, "--views", 1, "--resolution", 32)
 
 
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])

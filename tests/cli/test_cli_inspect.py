@@ -92,7 +92,7 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
 
 
 def test_all_folders_that_are_written_are_known():
-    """Else their textures would be taken for lightmaps that can be compressed."""
+    """Textures of an unknown export would be taken for lightmaps that can be compressed."""
     package = Path(wlm.__file__).parent
     texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
     formats = {name for text in texts for name in re.findall(r'^[A-Z][A-Z_]+ = "(wlm-[^"]+)"$', text, re.MULTILINE)}

@@ -183,22 +183,17 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     for text, line in (
         ("toward=1,0", "--camera toward: expected three numbers"),
         ("toward=0,0,0", "--camera toward: expected a direction of some length"),
-        ("toward=0,inf,0", "--camera toward: expected finite numbers"),
-        ("extent=-1", "--camera extent: expected greater than 0"),
         ("distance=0", "--camera distance: expected greater than 0"),
-        ("turn=left", "--camera turn: expected a number"),
         ("resolution=8", "--camera: expected NAME=VALUE with a name of toward"),
     ):
         assert line in fails(*made, "--camera", text)
     for text, line in (
         ("extinction=0", "extinction: expected a number above 0"),
-        ("extinction=x", "--volume extinction: expected a number"),
         ("up=w", "--volume up: expected one of x, y, z, got 'w'"),
         ("up", "--volume: expected NAME=VALUE"),
     ):
         assert line in fails(*made, "--volume", text)
     assert "--step" in fails(*made, "--step", 0)
-    assert "device 'tpu'" in fails(*made, "--device", "tpu")
     for words, line in (
         (("--fit", "cube"), "--fit"),
         (("--albedo", 0.9), "--albedo"),
@@ -211,12 +206,8 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     line = fails("smoke", "bake", frames, "-o", out, "--volume", "up=z")
     assert "expected no up for the frames of a scene" in line
     shaded = ("smoke", "shade", baked / "six_0001.exr", "-o", tmp_path / "a.png")
-    assert "--light: expected three numbers" in fails(*shaded, "--light", "up")
-    assert "--light: toward: expected a direction" in fails(*shaded, "--light", "0,0,0")
     assert "--light: irradiance.0: expected greater than or equal to 0" in fails(*shaded, "--light", "0,0,1:-1")
     assert "--rule" in fails(*shaded, "--rule", "cubed")
-    assert "--white: expected a number above 0" in fails(*shaded, "--white", 0)
-    assert "--background: expected three numbers" in fails(*shaded, "--background", "black")
     for smoke in (volume, frames, tmp_path):
         assert "with wlm smoke bake or predict" in fails("smoke", "shade", smoke, "-o", tmp_path / "x")
     assert os.listdir(tmp_path) == []

@@ -97,13 +97,8 @@ def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     text = call(*words, "--resume", "--minutes", 0)
     assert "out of time at step 4" in call.stderr and "4 of 8" in text
     assert "it was made with seed 3, not 4" in fails(*words[:-1], 4, "--resume")
-    partial = tmp_path / "a.safetensors.partial"
-    checkpoint = partial.read_bytes()
-    partial.write_bytes(checkpoint[:-9] + b"?" + checkpoint[-8:])
-    assert "a.safetensors.partial: the artifact is damaged" in fails(*words, "--resume")
-    partial.write_bytes(checkpoint)
     call(*words, "--resume")
-    assert not partial.exists()
+    assert not (tmp_path / "a.safetensors.partial").exists()
     assert file_content(tmp_path / "a.safetensors") == file_content(folder / "a.safetensors")
 
 
@@ -196,12 +191,9 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     assert "--coarse: expected no --network" in fails(*predict, "--coarse", "--network", network)
     assert "gone.safetensors: cannot read" in fails(*predict, "--network", tmp_path / "gone.safetensors")
     assert "expected an artifact" in fails(*predict, "--network", volume)
-    assert "device 'tpu'" in fails(*predict, "--network", network, "--device", "tpu")
     assert "ends in .exr" in fails("smoke", "predict", volume, "-o", tmp_path / "a.png", "--network", network)
     train = ("smoke", "train", trained[0] / "tiny.yaml", "-o")
     assert "ends in .safetensors" in fails(*train, tmp_path / "a.wlm")
-    assert "does not exist" in fails(*train, tmp_path / "no" / "a.safetensors")
-    assert "device 'tpu'" in fails(*train, tmp_path / "a.safetensors", "--device", "tpu")
     assert "profile '7' of smoke-network" in fails("smoke", "train", "7", "-o", tmp_path / "a.safetensors")
     assert "ends in .json" in fails("evaluate", network, "--json", tmp_path / "a.txt")
     assert "ends in .onnx" in fails("smoke", "export-onnx", network, "-o", tmp_path / "a.txt")
@@ -211,4 +203,4 @@ def test_wrong_words_are_one_line(trained, network, volume, tmp_path):
     other = tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump(PROFILE | {"dataset": {}}))
     assert "dataset.guide: expected six" in fails("smoke", "train", other, "-o", tmp_path / "a.safetensors")
-    assert sorted(os.listdir(tmp_path)) == ["bare.safetensors", "other.yaml", "plume.npz"]
+    assert sorted(os.listdir(tmp_path)) == ["bare.safetensors", "other.yaml"]

@@ -100,13 +100,6 @@ def test_the_safetensors_library_reads_it(artifact):
     assert json.loads(settings.translate(swap)) == SETTINGS
 
 
-def test_the_digest_follows_its_documented_rule(artifact):
-    whole = artifact.read_bytes()
-    stated = _split(whole)[0]["__metadata__"]["wlm"].split(" ")[3].encode()
-    zeroed = whole.replace(stated, b"0" * 32, 1)
-    assert hashlib.blake2b(zeroed, digest_size=16).hexdigest().encode() == stated
-
-
 def test_the_same_arguments_give_the_same_bytes(tmp_path, artifact):
     again = tmp_path / "b.wlm"
     size = write_artifact(again, "lightmap", SETTINGS, dict(reversed(_tensors().items())), SOURCE)

@@ -47,7 +47,7 @@ def test_the_encoder_says_what_its_blocks_hold_and_is_better_than_another(device
     theirs = decode_bc6h(data).astype(np.float32)
 
     def decibels(found: np.ndarray) -> float:
-        """Of each block's error relative to its brightest."""
+        """Returns the PSNR of errors relative to the brightest value of each block."""
         return float(-10 * np.log10(np.mean(np.square((found - light) / light.max((1, 2), keepdims=True)))))
 
     assert decibels(decoded) > decibels(theirs) + 1.0

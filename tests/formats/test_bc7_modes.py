@@ -26,7 +26,7 @@ def test_two_other_decoders_agree_bit_for_bit():
 
 @pytest.mark.parametrize("mode", [0, 1, 2, 3, 7])
 def test_every_partition_is_read(mode):
-    """Their numbers are the bits above the mode's."""
+    """The number of a partition is in the bits above those of the mode."""
     rng, count = np.random.default_rng(mode), 16 if mode == 0 else 64
     blocks = rng.integers(0, 256, (count, 64, 16), np.uint8)
     number = np.arange(count, dtype=np.uint16)[:, None] << mode + 1

@@ -11,7 +11,7 @@ def strip(*values: float) -> np.ndarray:
 
 
 def named(count: int) -> bytes:
-    """As many blocks whose bytes all are the block's number."""
+    """Makes blocks whose bytes are all equal to the block's number."""
     return bytes(i for i in range(count) for _ in range(16))
 
 

@@ -9,7 +9,6 @@ from builders.checks import error_of
 from builders.godot_bakes import Writer, bake, colours, probes, with_users
 
 from wlm.atlas.listing import read_listing
-from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.godot import read_lmbake, read_users
 from wlm.inspection import inspect
@@ -148,9 +147,6 @@ def test_what_is_no_lightmap_bake_of_godot_4(tmp_path):
         assert f"format 4 to 6, found Godot {version[0]}.{version[1]}, format {version[2]}" in found
     data = writer.file(properties)
     assert "byte order" in message(tmp_path, data[:4] + b"\2" + data[5:])
-    for path in (tmp_path / "missing.lmbake", tmp_path):
-        with pytest.raises(WlmError, match="cannot read"):
-            read_lmbake(path)
 
 
 def test_bakes_without_probes_or_with_too_few_colours(tmp_path):

@@ -220,7 +220,7 @@ def test_scenes(tmp_path, changes, expected):
 
 
 def tree(**changes: object) -> dict:
-    """One triangle with UVs in a data URI, and changes to the tree's lists."""
+    """Makes a triangle with UVs in a data URI, with changes to the lists of the document."""
     uri = "data:;base64," + base64.b64encode(TRIANGLE).decode()
     return {
         "asset": {"version": "2.0"},

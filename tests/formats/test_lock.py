@@ -1,4 +1,4 @@
-"""Locks on outputs, and what killed processes leave in the making."""
+"""Locks on outputs, and temporary files of killed processes."""
 
 import fcntl
 import os

@@ -104,7 +104,7 @@ def test_zip_files_that_lie(tmp_path, read, name):
 
 
 def bomb(path: Path, arrays: dict[str, tuple[tuple[int, ...], int]]) -> Path:
-    """Zeros: as many as `shape` says, of which only so many bytes are there; none is inflated to find out."""
+    """Writes zeros whose header states `shape`, although the member has fewer bytes."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, (shape, there) in arrays.items():
             with file.open(f"{name}.npy", "w") as member:

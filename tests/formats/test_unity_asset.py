@@ -84,7 +84,7 @@ def test_others_are_refused(unity, objects, said):
 def test_no_room_is_made_for_what_a_file_claims(unity):
     kind, tree, content, order = probes(PLACES, SH)
     many = struct.pack("<i", 2**31 - 1)
-    # So many bytes of a name; so many arrays of none, each of which takes four bytes.
+    # A name of that many bytes; then that many empty arrays, each of which takes four bytes.
     for damaged in (many + content[4:], content[:12] + many + bytes(1 << 23)):
         path = unity((kind, tree, damaged, order))
         tracemalloc.start()

@@ -31,8 +31,6 @@ def main() -> int:
     parser.add_argument("index", nargs="?", type=int, help="its index")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the case there instead of reading it")
     parser.add_argument("--cases", type=int, metavar="N", help="cases a reader")
-    parser.add_argument("--first", type=int, default=0, metavar="INDEX", help="index of each reader's first case")
-    parser.add_argument("--readers", nargs="+", metavar="READER", help="these readers alone")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), metavar="N", help="processes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts there")
     parser.add_argument("--corpus", action="store_true", help="make the corpus again")
@@ -43,12 +41,11 @@ def main() -> int:
         import_module("tests.fuzz.corpus").write_corpus(Path(__file__).parent / "corpus")
         return 0
     readers = import_module("tests.fuzz.readers").READERS
-    unknown = {*(words.readers or ()), *filter(None, [words.reader])} - readers.keys()
-    if unknown or (words.cases is None and words.index is None):
+    if words.cases is None and (words.index is None or words.reader not in readers):
         parser.error(f"expected a reader and an index, or --cases; readers are {', '.join(readers)}")
     if words.cases is None:
         return _one(readers[words.reader], words.index, words.write)
-    counts = {name: max(words.cases // readers[name].cost, 1) for name in words.readers or readers}
+    counts = {name: max(words.cases // readers[name].cost, 1) for name in readers}
     return _many(counts, words)
 
 
@@ -84,14 +81,14 @@ def _many(counts: dict[str, int], words: argparse.Namespace) -> int:
             print(f"    {each['count']} x {each['kind']}, first {each['index']}: {line}", flush=True)
 
     begin = time.perf_counter()
-    tallies = campaign(counts, words.workers, first=words.first, done=show)
+    tallies = campaign(counts, words.workers, done=show)
     seconds = time.perf_counter() - begin
     rows = {name: tally.to_json() for name, tally in tallies.items()}
     sums = {key: sum(row[key] for row in rows.values()) for key in ("cases", "refused", "accepted", "failed")}
     print(_ROW.format(f"all, in {seconds:.0f} s", *sums.values()))
     if words.json is not None:
         kinds = {kind: sum(tally.counts[kind] for tally in tallies.values()) for kind in FAILURES}
-        result = {"first": words.first, "seconds": round(seconds, 1)} | sums | {"kinds": kinds, "readers": rows}
+        result = {"seconds": round(seconds, 1)} | sums | {"kinds": kinds, "readers": rows}
         words.json.parent.mkdir(parents=True, exist_ok=True)
         words.json.write_text(json.dumps(result, indent=1) + "\n")
     return 1 if sums["failed"] else 0

@@ -130,7 +130,7 @@ class Worker:
 
 @dataclass
 class Tally:
-    """What came of a reader's cases.
+    """The outcomes of a reader's cases.
 
     Attributes:
         counts: By outcome.
@@ -168,7 +168,6 @@ def campaign(
     counts: dict[str, int],
     workers: int,
     limits: Limits | None = None,
-    first: int = 0,
     done: Callable[[str, Tally], None] | None = None,
 ) -> dict[str, Tally]:
     """Runs cases of several readers.
@@ -177,7 +176,6 @@ def campaign(
         counts: Cases by reader.
         workers: Processes.
         limits: Of a case.
-        first: Index of the first case of each reader.
         done: Called with each reader whose cases are all run.
 
     Returns:
@@ -196,8 +194,7 @@ def campaign(
         try:
             futures = {
                 reader: [
-                    pool.submit(job, reader, first + begin, min(_CHUNK, cases - begin))
-                    for begin in range(0, cases, _CHUNK)
+                    pool.submit(job, reader, begin, min(_CHUNK, cases - begin)) for begin in range(0, cases, _CHUNK)
                 ]
                 for reader, cases in counts.items()
             }

@@ -77,4 +77,4 @@ READERS = {
         "crash": lambda path: os.abort(),
     }.items()
 }
-"""By name."""
+"""The readers by name."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Limits:
-    """What a case may take.
+    """The limits of a case.
 
     Attributes:
         seconds: Of the processor; the process is killed by SIGPROF when they are over. Other programs don't shorten

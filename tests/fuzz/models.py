@@ -116,7 +116,7 @@ def _bytes_of(make: Any) -> bytes:
 
 
 def _again(model: Any, path: Path) -> None:
-    """What a fit makes of an accepted checkpoint must be a file that is accepted."""
+    """Fails where the model that a fit makes of an accepted checkpoint cannot be saved and loaded."""
     again = path.with_name("again.wlm")
     try:
         model.save(again)

@@ -1,4 +1,4 @@
-"""What one reader of files is fuzzed with, and what all tables of readers share."""
+"""The description of a fuzzed file reader, and functions that all tables of readers share."""
 
 import functools
 import hashlib
@@ -19,7 +19,7 @@ _FILES = Path(__file__).resolve().parents[1] / "files"
 
 @dataclass(frozen=True)
 class Reader:
-    """One way into the package for a file.
+    """A function of the package that reads a file.
 
     Attributes:
         name: Of the reader; with a case's index it determines the case.

@@ -141,8 +141,16 @@ def _lit(path: Path) -> None:
     assert sheet.triangle.max() < len(sheet.position), "a corner beyond the vertices"
 
 
-def _light() -> Mapping[str, bytes]:
-    return {"light.exr": corpus("light.exr")()[0], "image.png": corpus("mask-grey.png")()[0]}
+def _obj_lines(draw: Random, data: bytes) -> bytes:
+    return vary_text(draw, data.decode(), ("f", "v"))
+
+
+def _beside(names: Mapping[str, str]) -> Callable[[], Mapping[str, bytes]]:
+    """Makes the files beside a case's: their names, and which of the corpus they are."""
+    return lambda: {name: corpus(source)()[0] for name, source in names.items()}
+
+
+_light = _beside({"light.exr": "light.exr", "image.png": "mask-grey.png"})
 
 
 # Probes and volumes.
@@ -173,7 +181,7 @@ def _grids() -> Sequence[bytes]:
 
 @functools.cache
 def _vdbs() -> Sequence[bytes]:
-    """One packed by zlib, and one of several grids by Blosc, of OpenVDB's own."""
+    """Makes a grid packed by zlib, and reads a file of several grids packed by Blosc that OpenVDB wrote."""
     random = np.random.default_rng(0)
     values = (random.random((16, 8, 24)) * (random.random((16, 8, 24)) < 0.5)).astype(np.float32)
     nodes = tree(values, values > 0, ZIP | ACTIVE_MASK)
@@ -187,6 +195,10 @@ def _grid_fields(data: bytes) -> list[tuple[int, int]]:
     headers = [(at, width) for width in (4, 8) for at in range(0, 1100 - width, 4)]
     words = np.frombuffer(data, "<u8", (len(data) - 1) // 8, 1)
     return headers + [(1 + 8 * int(at), 8) for at in np.flatnonzero(words)]
+
+
+def _grid(draw: Random, data: bytes) -> bytes:
+    return vary_numbers(draw, data, _grid_fields(data))
 
 
 def _godot(draw: Random, data: bytes) -> bytes:
@@ -332,40 +344,30 @@ def _settings(name: str, model: Callable[[], type], files: str, check: Callable[
 
 
 def _scene_figures(scene: Scene) -> None:
-    """What follows from an accepted scene's numbers is of use too."""
+    """Fails where numbers derived from an accepted scene are not usable."""
     check_finite(fastest=scene.fastest, step=scene.step)
     assert scene.steps >= 1, f"accepted with {scene.steps} steps a frame"
 
+
+_KTX2 = ("packed-zstd.ktx2", "bc6h-zlib.ktx2", "half-mips.ktx2", "astc.ktx2")
+_SET = {"a.exr": "light.exr", "b.exr": "zip.exr", "c.png": "mask-rgba.png", "mask.png": "mask-grey.png"}
+_FRAME = {"frame_0001.npz": "volume.npz"}
 
 _ALL = (
     *models.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
-    Reader(
-        "ktx2",
-        "a.ktx2",
-        corpus("packed-zstd.ktx2", "bc6h-zlib.ktx2", "half-mips.ktx2", "astc.ktx2"),
-        vary_ktx2,
-        _light_file,
-    ),
+    Reader("ktx2", "a.ktx2", corpus(*_KTX2), vary_ktx2, _light_file),
     Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
-    Reader(
-        "exr-six-way",
-        "a.exr",
-        corpus("six-way.exr"),
-        lambda draw, data: vary_exr(draw, data, "wlm"),
-        _six_way,
-    ),
+    Reader("exr-six-way", "a.exr", corpus("six-way.exr"), functools.partial(vary_exr, note="wlm"), _six_way),
     Reader("png-mask", "mask.png", corpus("mask-grey.png", "mask-palette.png", "mask-rgba.png"), vary_png, _mask),
     Reader("png-flipbook", "a.png", corpus("flipbook.png"), vary_png, _flipbook),
     Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
     Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
     Reader("gltf-bake", "a.gltf", corpus("mesh.gltf"), vary_gltf, _surfaces, _light, cost=2),
-    Reader(
-        "obj", "a.obj", corpus("mesh.obj"), lambda draw, data: vary_text(draw, data.decode(), ("f", "v")), _obj, _light
-    ),
+    Reader("obj", "a.obj", corpus("mesh.obj"), _obj_lines, _obj, _light),
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
@@ -373,55 +375,11 @@ _ALL = (
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
     Reader("volume-npz", "a.npz", corpus("volume.npz", "volume-bricks.npz"), vary_npz, _volume),
-    Reader(
-        "volume-nvdb",
-        "a.nvdb",
-        _grids,
-        lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
-        _volume,
-        cost=2,
-    ),
-    Reader(
-        "volume-vdb",
-        "a.vdb",
-        _vdbs,
-        lambda draw, data: vary_numbers(draw, data, _grid_fields(data)),
-        _volume,
-        cost=2,
-    ),
-    Reader(
-        "lightmap-layers-set",
-        "set.json",
-        _layers,
-        _json,
-        _lightmap_set,
-        lambda: {
-            "a.exr": corpus("light.exr")()[0],
-            "b.exr": corpus("zip.exr")()[0],
-            "c.png": corpus("mask-rgba.png")()[0],
-            "mask.png": corpus("mask-grey.png")()[0],
-        },
-    ),
-    Reader(
-        "lightmap-set",
-        "set.json",
-        corpus("set.json"),
-        _set,
-        _lightmap_set,
-        lambda: {
-            "a.exr": corpus("light.exr")()[0],
-            "b.exr": corpus("zip.exr")()[0],
-            "mask.png": corpus("mask-grey.png")()[0],
-        },
-    ),
-    Reader(
-        "smoke-frames",
-        "scene.json",
-        corpus("scene.json"),
-        _json,
-        _frames,
-        lambda: {"frame_0001.npz": corpus("volume.npz")()[0]},
-    ),
+    Reader("volume-nvdb", "a.nvdb", _grids, _grid, _volume, cost=2),
+    Reader("volume-vdb", "a.vdb", _vdbs, _grid, _volume, cost=2),
+    Reader("lightmap-layers-set", "set.json", _layers, _json, _lightmap_set, _beside(_SET)),
+    Reader("lightmap-set", "set.json", corpus("set.json"), _set, _lightmap_set, _beside(_SET)),
+    Reader("smoke-frames", "scene.json", corpus("scene.json"), _json, _frames, _beside(_FRAME)),
     Reader("bench-rows", "a.json", corpus("rows.json"), _json, read_json),
     _settings("yaml-lightmap", lambda: wlm.lightmap.Profile, "lightmap-*"),
     _settings("yaml-probe", lambda: wlm.probe.Profile, "probe-*"),
@@ -432,4 +390,4 @@ _ALL = (
 )
 
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
-"""By name."""
+"""The readers by name."""

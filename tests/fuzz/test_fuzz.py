@@ -77,7 +77,7 @@ def test_a_reader_that_refuses_its_own_good_file_is_an_error(faulty):
 @pytest.mark.slow
 def test_counts_of_several_workers():
     seen = []
-    tallies = campaign({"obj": 30, "yaml-atlas": 20}, 2, first=1000, done=lambda name, tally: seen.append(name))
+    tallies = campaign({"obj": 30, "yaml-atlas": 20}, 2, done=lambda name, tally: seen.append(name))
     assert seen == ["obj", "yaml-atlas"]
     rows = {name: tally.to_json() for name, tally in tallies.items()}
     assert [rows[name]["cases"] for name in seen] == [30, 20]

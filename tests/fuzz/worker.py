@@ -34,7 +34,7 @@ _MOST_MESSAGE = 2000  # characters
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """The outcome of a case.
 
     Attributes:
         index: Of the case.
@@ -79,7 +79,7 @@ def judge(reader: Reader, path: Path, limits: Limits) -> tuple[str, str]:
 
 
 def _fault(message: str, folder: Path) -> str:
-    """What is wrong with a message to users; empty if it is one plain line that names the file."""
+    """Returns the fault of an error message; empty if it is one plain line that names the file."""
     bad = {char for char in message if unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp")}
     if bad:
         return f"control characters {sorted(map(ascii, bad))}"

@@ -1,1 +1,1 @@
-"""What the kernels must compute, in float64 torch: plain, slow, and written from the formulas alone."""
+"""References of the kernels in float64 torch: plain, slow, and written from the formulas alone."""

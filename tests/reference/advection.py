@@ -56,7 +56,7 @@ class Domain:
         return any((p[a] < 0 and e[0] == 1) or (p[a] > n[a] and e[1] == 1) for a, e in enumerate(self.ends))
 
     def velocity(self, p: np.ndarray) -> np.ndarray:
-        """Of the air at a point, fine cells a step."""
+        """Returns the velocity of the air at a point, in fine cells per step."""
         coarse = np.array(self.solid.shape)
         at = self.into_domain(p) / self.refinement
         return self.refinement * sum(w * self.u[c] for c, w in self.corners(at, coarse))

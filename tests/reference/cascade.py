@@ -22,12 +22,12 @@ def sample(colour: torch.Tensor, lut: torch.Tensor | None, uv: torch.Tensor) -> 
 
 
 def image_loss(difference: torch.Tensor, weight: float) -> torch.Tensor:
-    """Of [H, W, 3] without NaN."""
+    """Sums the differences [H, W, 3] and, with a weight, those of neighbours."""
     across, down = difference.diff(dim=1), difference.diff(dim=0)
     return difference.abs().sum() + weight * (across.abs().sum() + down.abs().sum())
 
 
 def pair_loss(difference: torch.Tensor, weight: float) -> torch.Tensor:
-    """Of [2 N, 3] without NaN."""
+    """Sums the differences [2 N, 3] and, with a weight, those of pairs."""
     one, two = difference.chunk(2)
     return difference.abs().sum() + weight * (one - two).abs().sum()

@@ -20,7 +20,7 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def barycentrics(size: int) -> np.ndarray:
-    """Of a patch's samples in the order in which they are stored, [N, 3]."""
+    """Returns the barycentric coordinates of a patch's samples in their stored order, [N, 3]."""
     return np.array([(i, j, size - 1 - i - j) for j in range(size) for i in range(size - j)]) / (size - 1)
 
 

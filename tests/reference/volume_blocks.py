@@ -21,7 +21,7 @@ def around(place: np.ndarray, size: float) -> list[tuple[int, ...]]:
 
 
 def blocks(position: np.ndarray, size: float) -> set[tuple[int, ...]]:
-    """Those that have a tenth of the light at some probe."""
+    """Selects the blocks that have a tenth of the light at some probe."""
     return {
         block
         for place in position
@@ -37,7 +37,7 @@ def near(position: np.ndarray, block: tuple[int, ...], size: float) -> np.ndarra
 
 
 def weights(position: np.ndarray, block: tuple[int, ...], size: float) -> np.ndarray:
-    """Of probes [M, 3], whose sum is 1: ordinary kriging with Lagrange's multiplier, as one system."""
+    """Returns the weights of probes [M, 3], whose sum is 1, by ordinary kriging with a Lagrange multiplier."""
     x = position / size - np.array(block) - 0.5
 
     def smooth(a: np.ndarray, b: np.ndarray) -> float:

@@ -111,7 +111,7 @@ def test_an_obstacle_before_and_behind_smoke(device):
     torch.testing.assert_close(behind[seen], lit + 0.25 * ball[seen])
     empty = lit + 0.25 * torch.tensor(background, device=device)
     torch.testing.assert_close(behind[~seen], empty.expand(int((~seen).sum()), 3))
-    # It stands in the light of the smoke behind it, but for the pixels where it is seen anyway.
+    # The obstacle shadows the smoke behind it, except at the pixels where the obstacle itself is seen.
     side = Light((1.0, 0.0, 0.0), (4 * math.pi,) * 3)
     surface = float(np.dot(np.subtract(camera.position, 0), camera.toward))
     level = torch.full_like(six.transparency, surface)
@@ -168,8 +168,7 @@ def test_a_contact_sheet(tmp_path):
 
 @pytest.mark.parametrize("orders", ["single", "all"])
 def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
-    """With fire in its colours and a point light; then with an obstacle, combined by hand: it shadows the directional
-    light, not the point light."""
+    """The smoke has fire and a point light; then an obstacle shadows the directional light but not the point light."""
     volume = replace(plume(hot=True, device=device), emission=8.0)
     camera = make_camera(CameraSettings(resolution=20), volume.origin, volume.size)
     lights = [Light((1.0, 1.0, 1.0), (9.0, 4.0, 2.0)), PointLight((0.4, 0.6, 0.6), (1.0, 2.0, 3.0))]

@@ -66,7 +66,7 @@ def changed(window, before: np.ndarray) -> bool:
 
 
 def label(window, name: str) -> str:
-    """What is written beside a slider."""
+    """Returns the text beside a slider."""
     return window._widgets[name][1].GetInput()
 
 
@@ -293,7 +293,7 @@ def test_a_ball_is_bright_on_the_side_of_its_light(up, above, tmp_path, show):
 
 @pytest.mark.parametrize(("up", "axes"), [("y", np.eye(3)), ("z", np.eye(3)[[0, 2, 1]])])
 def test_balls_are_where_their_probes_are(up, axes, tmp_path, show):
-    """Of four white, red, green and blue probes: the green one is above, the others to the sides and nearer."""
+    """Four probes are white, red, green and blue: the green one is above, the others to the sides and nearer."""
     colours = np.array([[1, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
     values = np.zeros((4, 9, 3))
     values[:, 0] = colours * np.sqrt(4 * np.pi)
