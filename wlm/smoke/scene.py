@@ -431,12 +431,7 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
 def make_camera(
     settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
 ) -> Camera:
-    """Places a camera in front of a box.
-
-    Args:
-        settings: The camera.
-        origin, size: Corner and edges of the box in the world, [3].
-    """
+    """Places a camera in front of a box in the world, of the corner `origin` [3] and the edges `size` [3]."""
     values = settings.model_dump()
     return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 

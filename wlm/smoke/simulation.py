@@ -29,11 +29,7 @@ _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene.
-
-    Args:
-        scene: The scene.
-        device: Result of `wlm.interop.check_device`.
+    """Builds the solver of a scene on a device, a result of `wlm.interop.check_device`.
 
     Raises:
         WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
