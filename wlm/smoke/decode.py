@@ -90,23 +90,10 @@ class Decoder:
 
 
 class _Adapters:
-    """G NAFBlocks in one batch on an image of H x W pixels and c channels.
-
-    A block also adds a constant per channel to all pixels: the second norm's kernel includes the constants of the first
-    correction; the caller must add all of them, `shift`, to the outputs.
-
-    Attributes:
-        shift: [G, c], the constants of each block.
-    """
+    """G NAFBlocks in one batch on an image with c channels; the caller must add the constants `shift` [G, c]."""
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
-        """Merges the layers of the blocks and allocates buffers.
-
-        Args:
-            blocks: The G blocks.
-            height, width: H and W.
-            device, dtype: Device and type of the computation.
-        """
+        """Merges the layers of the blocks and allocates buffers."""
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
         self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)

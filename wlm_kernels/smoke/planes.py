@@ -150,7 +150,7 @@ def decode(planes: wp.array, out: wp.array) -> None:
 
 @dataclass(frozen=True)
 class PlaneKernels:
-    """The kernels of a number type T, each with its launch size. The guide is T [C, H, W], at the end opacity and depth.
+    """The kernels of a number type T, each with its launch size. The guide is T [C, H, W]; opacity and depth are last.
 
     Attributes:
         lanes: L, threads of `near` that share a block.
