@@ -152,7 +152,7 @@ class DatasetSettings(BaseModel):
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 
     def look(self, shape: Sequence[int], seed: int = 0) -> March:
-        """Returns the settings of a guiding map's march through a grid of X, Y, Z voxels, with a seed for its jitter."""
+        """Returns the settings of a guiding map's march through X, Y, Z voxels, with a seed for its jitter."""
         longest = max(shape)
         spacing = None if self.guide_spacing is None else self.guide_spacing * longest
         threshold = self.surface / longest
