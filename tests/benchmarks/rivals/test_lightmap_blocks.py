@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from builders.lightmaps import smooth_light
 
+from benchmarks.rivals import lightmap_blocks
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
 from wlm.errors import WlmError
-from wlm.formats import hdr_blocks
 from wlm.metrics import psnr
 
 BLOCKS = {name: method.encode for name, method in RIVALS.items() if method.alone}
@@ -48,12 +48,12 @@ def test_ldr_is_not_stopped_at_the_presets_decibels():
     """Smooth light in 12x12 blocks: with astcenc's own limit the search ends early."""
     image, mask = smooth_light(), np.ones((120, 120), bool)
     free = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
-    config = astc_encoder.ASTCConfig(astc_encoder.ASTCProfile.LDR, 12, 12, 1, hdr_blocks.ASTC_THOROUGH)
-    hdr_blocks._astc.cache_clear()
+    config = astc_encoder.ASTCConfig(astc_encoder.ASTCProfile.LDR, 12, 12, 1, lightmap_blocks._ASTC_THOROUGH)
+    lightmap_blocks._astc_codec.cache_clear()
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(hdr_blocks, "_NO_LIMIT_DB", config.tune_db_limit)
+        patched.setattr(lightmap_blocks, "_NO_LIMIT_DB", config.tune_db_limit)
         stopped = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
-    hdr_blocks._astc.cache_clear()
+    lightmap_blocks._astc_codec.cache_clear()
     assert stopped < free - 1.0, (stopped, config.tune_db_limit)
 
 

@@ -6,10 +6,9 @@ from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
-from benchmarks.rivals.lightmap_video import encode_av1
+from benchmarks.rivals.lightmap_video import encode_av1, fill_smoothly
 from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
-from wlm.texels import fill_smoothly
 
 # One of each kind; the rest differ in a number.
 KINDS = ("pca-bc4-4", "pca-0.04", "av1-85")
