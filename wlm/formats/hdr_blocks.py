@@ -89,7 +89,7 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
-    """Returns the codec of the HDR profile for a setting, one for equal settings.
+    """Returns the ASTC codec of the HDR profile with the given settings; equal settings share one codec.
 
     Args:
         block: One of `ASTC_BLOCKS`.

@@ -1,4 +1,4 @@
-"""The page of a compressed lightmap on its mesh."""
+"""The HTML page that shows a compressed lightmap on its mesh."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "
 def atlas_page(
     paths: Sequence[Path], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
-    """Makes the page of a model with one lightmap.
+    """Makes the HTML page of a model with one lightmap.
 
     Args:
         paths: The model's file.
