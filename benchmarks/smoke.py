@@ -546,7 +546,7 @@ def weight_rows(bench: SmokeBench) -> Iterator[Row]:
     six = bake(volume, camera, step=_WEIGHT_STEP, estimate=False)
     six = SixWay(six.lightmaps, None, camera=camera)
     lights = [tuple(map(float, toward)) for toward in _directions(_LIGHTS)]
-    march = March(_WEIGHT_STEP, jitter=0.0)
+    march = March(_WEIGHT_STEP, spacing=_WEIGHT_STEP / 2, jitter=0.0)
     exact = list(light_smoke(volume, camera, [Light(toward) for toward in lights], march).planes)
     for rule in RULES:
         weighted = [six.shade([Light(toward)], rule=rule)[..., 0] for toward in lights]
