@@ -1,6 +1,6 @@
-"""Tiles of a lightmap: cutting, assembling and classifying them.
+"""Cuts lightmaps into tiles, classifies the tiles, and assembles maps from them.
 
-A tile is the unit of streaming and of fitting, with a model of its own (neural-dynamic-gi, sections 3.5 and 9).
+Each tile is fitted, stored and streamed on its own (neural-dynamic-gi, sections 3.5 and 9).
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ _HALF_MANTISSA_BITS = 10
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The tiles of a map, row-major. The last row and column reach past the map's end if its size is not a multiple of
-    128.
+    """The grid of 128 x 128 tiles that covers a map, numbered row by row; tiles may reach past the map's edges.
 
     Attributes:
         height: Height of the map in texels.
@@ -51,8 +50,8 @@ class TileGrid:
         """Makes the grid of a map.
 
         Args:
-            height: In texels, at least 1.
-            width: In texels, at least 1.
+            height: Height of the map in texels, at least 1.
+            width: Width of the map in texels, at least 1.
 
         Raises:
             WlmError: A size is below 1 or larger than `wlm.texels.check_size` allows.
@@ -84,7 +83,7 @@ class TileGrid:
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """N tiles in the form in which they are fitted.
+    """N tiles as gamma-space colours, padded to 128 x 128 texels.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
@@ -101,7 +100,7 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class TileCut:
-    """N tiles as views of the lightmaps that they are cut from.
+    """N tiles as array views into their lightmaps, without a copy.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
@@ -114,7 +113,7 @@ class TileCut:
     mask: list[np.ndarray]
 
     def encoded(self, gamma: float) -> TileData:
-        """Returns the tiles in the form in which they are fitted, N * T * 192 KiB."""
+        """Converts the tiles to padded gamma-space colours, which take N * T * 192 KiB."""
         colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
 
         def encode(i: int) -> None:
@@ -152,8 +151,8 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
     Args:
         lightmaps: The sheet, frames `[T, H, W, 3]`.
-        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on dark values; above 0.
-        tiles: Numbers of the tiles, in the order of the result; None for all. They take N * T * 192 KiB of memory.
+        gamma: Above 0; colours become `x ** (1 / gamma)`, which gives dark values more precision.
+        tiles: Numbers of the tiles, in the order of the result; None for all. N tiles take N * T * 192 KiB of memory.
 
     Returns:
         The N tiles.
@@ -166,7 +165,7 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
 
 def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
-    """Cuts tiles out of a sheet without a copy.
+    """Cuts tiles out of a sheet as array views, without a copy.
 
     Args:
         lightmaps: The sheet, frames `[T, H, W, 3]`.
@@ -210,7 +209,7 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Computes the pattern of each tile whose product with the means approximates a tile that only changes in strength.
+    """Computes each tile's mean pattern, whose product with the means fits a tile that only changes in brightness.
 
     It is the sum of the colours over time divided by the sum of the means, so that a nearly black time hardly counts
     and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a colour per time and a
@@ -231,30 +230,30 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
-    """Finds the smallest model that represents each tile within an error budget.
+    """Finds for each tile the simplest `TileKind` that represents it within an error budget.
 
     In linear space, over the valid texels:
 
     - `EMPTY`: the tile has no valid texel.
-    - `CONSTANT`: at every time no channel spans more than one step of half float at its least value.
+    - `CONSTANT`: at every time, the greatest value of each channel is at most one step of half float above the least.
     - `STATIC`: `means * static_pattern` has a PSNR of at least the budget at every time, relative to the range of the
       tile at that time (neural-dynamic-gi, section 10.2), or no channel of any texel is off by more than a step of half
       float.
     - `DYNAMIC`: all other tiles.
 
-    For values that are not light, `peak` replaces the range, and a tile is also constant if at every time the means of
-    its channels have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the error that this allows:
-    sources of 8 bits are never exactly flat.
+    For values that are not light, `peak` replaces the range. Such a tile is also constant if, at every time, its
+    channel means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that
+    PSNR, because 8-bit sources are never exactly flat.
 
     Args:
         tiles: From `split`.
         gamma: The gamma given to `split`.
-        static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only tiles within a step
-            of half float.
+        static_budget_db: The lowest PSNR in decibels that makes a tile static; if infinite, only tiles that are exact
+            to a step of half float are static.
         peak: See `wlm.lightmap.profile.Profile.peak`.
 
     Returns:
-        `TileKind` of each tile, `[N]` int64.
+        The `TileKind` of each tile, `[N]` int64.
 
     """
     means = channel_means(tiles.colour, tiles.mask)
@@ -273,7 +272,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
 
 
 def check_index(index: np.ndarray, grid: TileGrid) -> None:
-    """Checks numbers of tiles, `[N]`.
+    """Checks that numbers of tiles, `[N]`, are in the grid and distinct.
 
     Raises:
         WlmError: There is no number, a number is outside the grid, or a number is given twice.
@@ -294,7 +293,7 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
         image: `[H, W, C]`, written.
         tiles: `[N, 128, 128, C]`. Texels past the map's end are dropped.
         index: `[N]`, number of each tile in the grid.
-        grid: The map's.
+        grid: The grid of the map.
     """
     for tile, number in zip(tiles, index, strict=True):
         part = image[grid.window(number)]
@@ -302,7 +301,7 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
 
 
 def _whole(valid: np.ndarray) -> np.ndarray:
-    """Returns the valid texels of a tile [h, w] as [128, 128]."""
+    """Pads the mask [h, w] of a tile at the map's end to [128, 128] with false."""
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask
@@ -325,7 +324,7 @@ def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
 
 
 def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
-    """Returns whether the means of the channels are near all texels at every time, see `classify`."""
+    """Returns whether all texels are close to the channel means at every time, see `classify`."""
     linear = colour[:, valid].astype(np.float64) ** gamma
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
