@@ -64,7 +64,7 @@ def free_memory(device: wp.Device) -> int:
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024
-    raise WlmError("/proc/meminfo: MemAvailable: expected it, found none")
+    raise WlmError("/proc/meminfo: expected an entry MemAvailable, found none")
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:

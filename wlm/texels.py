@@ -144,7 +144,7 @@ def _nearest(mask: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Computes `_nearest` by threads on overlapping strips; None if a nearest texel may lie outside the overlap."""
+    """Computes `_nearest` in threads, on overlapping strips of rows; None if the overlap may be too small."""
     height, width = mask.shape
     rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
 

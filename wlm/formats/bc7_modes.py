@@ -198,7 +198,7 @@ def _number(bits: np.ndarray) -> np.ndarray:
 
 
 def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.ndarray:
-    """Returns weights of endpoint 1, [n, 16], from indices of `count` bits that start at bit `at`; anchors [n, 2]."""
+    """Returns the weights of endpoint 1, [n, 16], from the blocks' indices of `count` bits from bit `at` on."""
     texel = np.arange(16)
     short = (texel == 0) | (texel == anchors[:, :1]) | (texel == anchors[:, 1:])
     start = at + count * texel - (np.cumsum(short, axis=1) - short)
@@ -210,7 +210,7 @@ def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.nd
 
 
 def _swapped(texels: np.ndarray, channel: int) -> np.ndarray:
-    """Swaps alpha with another channel."""
+    """Returns RGBA texels with alpha and one other channel swapped."""
     order = list(range(4))
     order[channel], order[3] = 3, channel
     return texels[..., order]

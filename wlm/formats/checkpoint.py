@@ -49,7 +49,7 @@ class Pace:
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Measures a save; the next interval starts at its end."""
+        """Measures the time of a save, done in the block; the next interval starts at its end."""
         begin = time.monotonic()
         yield
         self._last = time.monotonic()
@@ -112,7 +112,7 @@ class Checkpoint:
             self.resumed = True
 
     def finished(self, number: int, table: Mapping[str, Part]) -> dict[str, np.ndarray] | None:
-        """Returns the stored parts of a finished batch, or None if it is not finished.
+        """Returns the stored parts of a finished batch, checked against `table`, or None if it is not finished.
 
         Raises:
             WlmError: The parts do not match the table.

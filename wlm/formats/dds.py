@@ -109,12 +109,12 @@ def write_dds(
         path: The file to write; its folder must exist.
         blocks: 16 bytes per block, ceil(width / 4) * ceil(height / 4) blocks per slice, slice by slice; for a format
             without blocks the texels, row by row.
-        width: Texels, 1 to 16384.
-        height: Texels, 1 to 16384.
+        width: Width in texels, 1 to 16384.
+        height: Height in texels, 1 to 16384.
         depth: Slices, 1 to 2048.
         fmt: A key of `DXGI_FORMATS`.
         volume: Whether the texture is a volume, which shaders sample as 3D; None: if `depth` is above 1.
-        mips: Levels after the first of a 2D texture, each of half the size rounded down; they follow in `blocks`.
+        mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `blocks`.
         layers: Number of layers of an array of 2D textures, 1 to 2048, layer by layer in `blocks`; 0: no array.
 
     Raises:

@@ -78,7 +78,7 @@ class GltfDocument:
         content: The JSON tree; it must not be changed.
         buffers: The bytes of each buffer.
         trust: Whether the file may name files outside its folder and exceed the limits for its size.
-        most: Limit of drawn corners and vertices, and of the elements of an accessor without data.
+        most: Largest allowed number of drawn corners and vertices, and of elements of an accessor without data.
     """
 
     path: str

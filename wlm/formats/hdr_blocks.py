@@ -114,7 +114,7 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
-    """Returns the codec of a setting, one for equal settings.
+    """Returns the ASTC codec with the given settings; equal settings share one codec.
 
     Args:
         block: One of `ASTC_BLOCKS`.

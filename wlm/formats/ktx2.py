@@ -90,11 +90,11 @@ def write_ktx2(
         path: The file to write; its folder must exist.
         data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
             blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
-        width: Texels, 1 to 16384.
-        height: Texels, 1 to 16384.
+        width: Width in texels, 1 to 16384.
+        height: Height in texels, 1 to 16384.
         fmt: A key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
-        mips: Levels after the first of a 2D texture, each of half the size rounded down; they follow in `data`.
+        mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `data`.
 
     Returns:
         The number of bytes written.
@@ -292,7 +292,7 @@ def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
-    """Returns whether columns go right and rows go down, the defaults, and checks the order of the channels."""
+    """Returns whether columns go right and whether rows go down, and checks the order of the channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
     while at < len(data):

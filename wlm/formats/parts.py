@@ -20,7 +20,7 @@ class Part:
 
     Attributes:
         dtype: NumPy type, or the allowed types.
-        shape: Sizes; None for any size. A part with a size of 0 is left out of the file.
+        shape: Length of each axis; None allows any length. A part without elements is left out of the file.
         optional: Whether the file may lack the part, which is then empty along its first axis.
         least, most: Bounds of the numbers, or None. NaN violates any bound.
         finite: Whether floats must be finite.

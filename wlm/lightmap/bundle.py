@@ -134,15 +134,8 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
     """Computes the tables that the shader reads, one for each given hour.
 
-    The first four floats of a table are the two slices of F_uvt around the hour, the interpolation weight of the second
-    one, and the number of tile columns. The next four are the two rows of F_ut and F_vt, the weight, and 0. A record of
-    `record_fours` groups of four floats follows for each tile. Its code is 0 for constant tiles, 1 and 2 for tiles with
-    networks, 3 for tiles stored as frames:
-
-        0    code, index of its image in the textures, first row of its network, weight of the second frame
-        1    code 0: its colour; 1 and 2: shift scale; 3: the least colour, and the layer of the first frame
-        2    code 1 and 2: spread scale; 3: the greatest colour
-        3    code 1 and 2: bias of the first layer plus the encoded time's part; 3: as in 1 and 2, the second frame
+    `_ABOUT["hours"]` above describes the content of a table. The fourth number is the number of tile columns of the
+    grid.
 
     Args:
         model: The sheet.

@@ -27,11 +27,7 @@ class Gaps:
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Gaps:
-        """Finds the texels to fill: invalid ones within `wlm.texels.REACH` of a valid one.
-
-        Args:
-            mask: bool [H, W], true where a texel is valid.
-        """
+        """Finds the texels to fill: invalid ones within `wlm.texels.REACH` of a valid one of a mask [H, W]."""
         return cls(*near_gaps(mask))
 
     def fill(self, image: np.ndarray) -> None:

@@ -168,9 +168,7 @@ class TimeAxis:
         return tau % 1.0 if self.periodic else tau
 
     def reads(self, t: float) -> list[tuple[float, float]]:
-        """Returns the one or two times at which the network is evaluated for time t, each with its weight in the
-        radiance.
-        """
+        """Returns the one or two times at which a network is evaluated for time t, with weights of their radiance."""
         before, after, share = self.neighbours(t)
         if self.interpolation == "network":
             return [(t, 1.0)]

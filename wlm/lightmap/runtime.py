@@ -75,7 +75,15 @@ class RuntimeDecoder:
 class _MapDecoder(RuntimeDecoder):
     """Base class of the decoders of static or dynamic tiles."""
 
-    def __init__(self, model: SheetModel, device: str, gelu: str | None, kind: TileKind, shared: bool) -> None:
+    def __init__(
+        self,
+        model: SheetModel,
+        device: str = "cpu",
+        gelu: str | None = None,
+        kind: TileKind = TileKind.DYNAMIC,
+        shared: bool = False,
+    ) -> None:
+        """Uploads the tiles of one kind, STATIC or DYNAMIC; for other arguments and errors see `StripDecoder`."""
         device, self.gelu = interop.check_device(device), gelu_of(model, gelu)
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
@@ -169,17 +177,6 @@ class MatrixDecoder(_ScratchDecoder):
 
 class ExactDecoder(_MapDecoder):
     """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations."""
-
-    def __init__(
-        self,
-        model: SheetModel,
-        device: str = "cpu",
-        gelu: str | None = None,
-        kind: TileKind = TileKind.DYNAMIC,
-        shared: bool = False,
-    ) -> None:
-        """Uploads the tiles of one kind, STATIC or DYNAMIC; for other arguments and errors see `StripDecoder`."""
-        super().__init__(model, device, gelu, kind, shared)
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
         self._tiles.launch(state, self._rows, 1 + self.shared, out)

@@ -129,7 +129,7 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
 
 
 def _halved(weight: np.ndarray) -> np.ndarray:
-    """Returns the sums of blocks of 2x2 texels [h, w]; at the end of an odd side, the last block covers three texels."""
+    """Returns the sums of blocks of 2x2 texels [h, w]; at an odd side, the last covers three."""
     for axis in (0, 1):
         starts = np.arange(max(weight.shape[axis] // 2, 1)) * 2
         weight = np.add.reduceat(weight, starts, axis)

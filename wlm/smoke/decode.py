@@ -90,23 +90,10 @@ class Decoder:
 
 
 class _Adapters:
-    """G NAFBlocks in one batch on an image of H x W pixels and c channels.
-
-    Constants that a block adds to all pixels are separate: the norm's kernel adds those of the first correction, the
-    caller adds `shift`.
-
-    Attributes:
-        shift: [G, c], must be added to the outputs.
-    """
+    """G NAFBlocks in one batch on an image of H x W pixels with c channels; `shift` [G, c] is added by the caller."""
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
-        """Folds the weights and allocates buffers.
-
-        Args:
-            blocks: The G blocks.
-            height, width: H and W.
-            device, dtype: Device and type of the computation.
-        """
+        """Folds the weights and allocates buffers."""
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
         self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)

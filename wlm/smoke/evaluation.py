@@ -1,13 +1,6 @@
 """Scores of lightmaps of a network, and of other methods on the same samples.
 
-All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5). Special cases:
-
-=====================================  =====================================================
-an exact prediction                    120 dB, as everywhere (`wlm.metrics`)
-no visible smoke                       the flicker is NaN
-a target that does not change          the ratio of flickers is NaN
-no samples, or planes of another size  error
-=====================================  =====================================================
+All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5).
 """
 
 import copy

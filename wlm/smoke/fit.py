@@ -2,19 +2,7 @@
 
 A training has rounds. Each round simulates a pool of samples, from sequences that no other round uses, and trains on
 it. A step depends only on the seed, the round and the number of the step. A training that was stopped and resumed
-therefore gives the same weights and curves, to the bit on one device, as one that was not. Special cases:
-
-===============================================  ========================================================
-NaN or infinity in a pool                        error that names the round, the tensor and the first sample
-a step whose gradient is not finite              skipped and counted; error if a tenth of a round's steps are
-3 dB below the untrained network                 error at the end of the round; the best network so far is kept
-an empty pool, or one of another size            error
-out of time, or stopped                          a checkpoint is written first
-stopped before the first step                    a checkpoint of step 0 replaces any older checkpoint
-resumed beside a network that is not the         the network of the next validation is saved
-checkpoint's best
-resumed after the end                            error
-===============================================  ========================================================
+therefore gives the same weights and curves, to the bit on one device, as one that was not.
 """
 
 import csv

@@ -1,18 +1,7 @@
 """Settings of a scene to simulate and render, a YAML file: box, air, smoke, inlets, obstacles, camera, lights.
 
 Lengths are in metres, times in seconds, directions in the world, with +y up by default. A class is named `...Settings`
-if the object that is made from it has the plain name. Special cases:
-
-=======================================  =============================================================
-a cell not of 1e-9 to 1e9 metres         error
-more than 1,000,000 steps a frame        error that says what asks for them
-a path whose times do not increase       error
-no inlet, no source                      valid: the box stays empty
-an obstacle over an inlet                valid: no inflow through the covered part
-a camera or a light along an axis        valid, also along the vertical
-an obstacle or an inlet too fast for     error in the simulation, which names the obstacle or the inlet
-the time step
-=======================================  =============================================================
+if the object that is made from it has the plain name.
 """
 
 from __future__ import annotations
@@ -442,12 +431,7 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
 def make_camera(
     settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
 ) -> Camera:
-    """Places a camera in front of a box.
-
-    Args:
-        settings: The camera.
-        origin, size: Corner and edges of the box in the world, [3].
-    """
+    """Places a camera in front of a box in the world, of the corner `origin` [3] and the edges `size` [3]."""
     values = settings.model_dump()
     return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 

@@ -56,7 +56,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes DDS files."""
+    """Writes the textures as DDS files and returns their entries for the index."""
     ending, entries = ".bytes" if engine == "unity" else None, {}
     for name, texture in bundle.textures.items():
         if texture.fmt not in DXGI_FORMATS:
@@ -72,7 +72,7 @@ def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]
 
 
 def _write_pictures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes EXR files, the layers of an array one below the other; whole numbers are exact in floats."""
+    """Writes the textures as EXR files of floats, with the layers of an array one below the other."""
     entries = {}
     for name, texture in bundle.textures.items():
         pixels = stacked(decode_texture(texture)).astype(np.float32)

@@ -36,7 +36,7 @@ ivec2 wlm_lightmap_place(int i, float hour)
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of one sheet of light for an engine into an existing folder.
+    """Writes the kit of a lightmap over time for an engine into an existing folder.
 
     Returns:
         Entries of the index: shader, textures and buffers.
@@ -134,5 +134,5 @@ def _as_colours(pixels: np.ndarray) -> np.ndarray:
 
 
 def _rows(table: np.ndarray) -> np.ndarray:
-    """RGBA floats [N, 4] as a picture [rows, 1024, 4]; the last row is padded with zeros."""
+    """Reshapes RGBA floats [N, 4] to a picture [rows, 1024, 4]; the last row is padded with zeros."""
     return np.pad(table, ((0, -len(table) % _ROW), (0, 0))).reshape(-1, _ROW, 4)

@@ -27,7 +27,7 @@ _NO_MIPS = "The shader reads no mips of the textures; `--mips 3` of the export m
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of a flip book; its textures become PNGs.
+    """Writes the kit of a flip book, with its textures as PNGs.
 
     Args:
         bundle: The bundle of a flip book in the layout "unity".
@@ -55,7 +55,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def _facts(bundle: Bundle) -> dict[str, str]:
-    """Returns the parts of the READMEs that describe the flip book."""
+    """Returns the texts that describe the flip book in a README, by the names of their marks in the template."""
     book = bundle.document
     width, height = book["frame_size"]
     cells = f"{book['rows']} x {book['columns']} cells of {width} x {height} pixels, padded by {book['padding']}"

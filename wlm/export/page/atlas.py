@@ -1,4 +1,4 @@
-"""The page of a compressed lightmap on its mesh."""
+"""The HTML page that shows a compressed lightmap on its mesh."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "
 def atlas_page(
     paths: Sequence[Path], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
-    """Makes the page of a model with one lightmap.
+    """Makes the HTML page of a model with one lightmap.
 
     Args:
         paths: The model's file.
@@ -98,5 +98,5 @@ def atlas_page(
 
 
 def _all_texels(model: AtlasModel) -> np.ndarray:
-    """The texels of T_p, of "mixed" those of both its textures, float32 [1, N, 3]."""
+    """Returns the stored texels, with those of the block texture for "mixed", float32 [1, N, 3]."""
     return np.concatenate([model.texels.reshape(1, -1, 3), model.block_texels.reshape(1, -1, 3)], 1).astype(np.float32)

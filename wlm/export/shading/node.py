@@ -30,7 +30,7 @@ def custom_node(
         text: GLSL of this package; its uniforms are inputs of the node, too.
         function: Name of the function whose value the node returns.
         arguments: HLSL of the function's arguments, in terms of the node's other inputs.
-        layers: By name of a texture array: rows of a layer, and number of layers.
+        layers: For each texture array, by name: the height of a layer in texels, and the number of layers.
 
     Returns:
         The code, and the names of the textures and uniforms that must be inputs of the node.
@@ -65,7 +65,7 @@ class _NodeWriter(HlslWriter):
         return "".join(lines), [each for each in inputs if each != self.linear]
 
     def _drop_all_but(self, function: str) -> None:
-        """Removes the head comment and, with their comments, the functions that this one does not call."""
+        """Removes the comment at the top, and all functions that `function` does not call, with their comments."""
         needed, found = set(), {function}
         while found - needed:
             needed |= found
@@ -87,7 +87,7 @@ class _NodeWriter(HlslWriter):
         self.functions = self.shader.functions
 
     def used(self, name: str) -> list[str]:
-        """Names of the bound variables that a function reads, directly or through others; the sampler if it filters."""
+        """Returns the names of textures and uniforms that a function and its callees read, and of the used sampler."""
         if name not in self.uses:
             nodes = list(_nodes(self.functions[name].body))
             names = {each.text for each in nodes if each.kind == "name"}
@@ -166,5 +166,5 @@ def _nodes(body: tuple[Statement, ...]) -> Iterator[Node]:
 
 
 def _textures(body: tuple[Statement, ...], calls: set[str]) -> list[str]:
-    """Names of the textures that calls of these functions read."""
+    """Returns the names of the textures that are passed to the functions in `calls`."""
     return [each.parts[0].text for each in _nodes(body) if each.kind == "call" and each.text in calls]

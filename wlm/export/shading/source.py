@@ -1,4 +1,4 @@
-"""Lexer and preprocessor of our GLSL; `wlm.export.shading.tree` parses its words."""
+"""Lexer and preprocessor of our GLSL; `wlm.export.shading.tree` parses the tokens."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,8 +17,8 @@ class Word:
     Attributes:
         kind: `comment`, `number`, `name` or `mark` (an operator or bracket).
         text: Text as written.
-        alone: Whether it is the first token of its line.
-        blank: Whether a blank line precedes it.
+        alone: Whether the token is the first on its line.
+        blank: Whether a blank line precedes the token.
     """
 
     kind: str

@@ -144,12 +144,12 @@ class Writer(ABC):
         return node.text
 
     def inside(self, node: Node) -> str:
-        """Text of an operand of an operator that binds more strongly, in brackets if needed."""
+        """Returns the text of an operand, in brackets if its own operator binds less strongly than the outer one."""
         text = self.write(node)
         return f"({text})" if node.kind in ("binary", "choice", "assign", "unary", "step") else text
 
     def side(self, mark: str, node: Node, right: bool = False) -> str:
-        """Text of an operand of a binary operator, in brackets if it needs them or is hard to read without."""
+        """Returns the text of a binary operator's operand, in brackets where required or easier to read."""
         if node.kind != "binary":
             return f"({self.write(node)})" if node.kind in ("choice", "assign") else self.write(node)
         inner = node.text

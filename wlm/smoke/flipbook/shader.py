@@ -181,9 +181,6 @@ def billboard_shader(book: Book) -> str:
     """Writes the shader of a flip book on a billboard.
 
     Its textures are `wlm_smoke_first_map`, `wlm_smoke_second_map` and, with motion, `wlm_smoke_motion_map`.
-
-    Args:
-        book: The flip book.
     """
     textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
     text = _READ.format(

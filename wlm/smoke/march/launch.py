@@ -49,14 +49,7 @@ class VolumeGraph(Generic[_Made]):
     """
 
     def __init__(self, work: Callable[[DensityVolume], _Made], device: str, warmup: int = 2) -> None:
-        """Prepares the function.
-
-        Args:
-            work: Function that does not wait for the device, such as `bake_coarse`, `transport.light_smoke` and
-                `transport.scatter` with directional lights.
-            device: Result of `wlm.interop.check_device`.
-            warmup: Calls before the capture, in which kernels are loaded.
-        """
+        """Prepares a function that does not wait for the device; it is called `warmup` times before the capture."""
         self._work = work
         self._device = device
         self._volume: DensityVolume | None = None

@@ -6,13 +6,7 @@ frames, each with its guiding map and its lightmaps, and the motion between them
 shape it but are not rendered (section 5).
 
 Lengths are shares of the box, so that a smaller grid gives the same images. A trained network's guiding maps must be
-made with its own `DatasetSettings.look`. Special cases:
-
-=======================================  =============================================================
-an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn instead
-`ATTEMPTS` such scenes in a row          error
-a frame with almost no smoke             only a small random share of these is used
-=======================================  =============================================================
+made with its own `DatasetSettings.look`.
 """
 
 import os

@@ -152,12 +152,7 @@ class DatasetSettings(BaseModel):
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 
     def look(self, shape: Sequence[int], seed: int = 0) -> March:
-        """Returns the march of a guiding map through a grid.
-
-        Args:
-            shape: Voxels along x, y, z.
-            seed: Seed of the jitter.
-        """
+        """Returns the march of a guiding map through a grid of X, Y, Z voxels; `seed` is that of the jitter."""
         longest = max(shape)
         spacing = None if self.guide_spacing is None else self.guide_spacing * longest
         threshold = self.surface / longest

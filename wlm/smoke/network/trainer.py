@@ -244,15 +244,7 @@ def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) ->
 
 
 def _corners(pool: Pool, samples: np.ndarray, draws: np.ndarray, image: np.ndarray, crop: int) -> np.ndarray:
-    """Returns corners int [..., 2] of crops that contain a block with smoke, drawn uniformly.
-
-    Args:
-        pool: All samples.
-        samples: int [...], indices of the pool.
-        draws: [..., 3], uniform in [0, 1): the block, and its place in the crop.
-        image: Rows and columns of a sample.
-        crop: Edge of a crop, pixels.
-    """
+    """Returns corners int [..., 2] of crops around a random block with smoke; `draws` [..., 3] are in [0, 1)."""
     blocks = []
     for targets in pool.targets:
         opacity = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()

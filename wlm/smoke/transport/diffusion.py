@@ -40,13 +40,7 @@ class Spreading:
     """Diffusion of several lights, whose sources are added during a march."""
 
     def __init__(self, scene: Marching, volume: DensityVolume, lights: Sequence[AnyLight]) -> None:
-        """Begins without light.
-
-        Args:
-            scene: A march through the smoke.
-            volume: The smoke.
-            lights: Any number of lights.
-        """
+        """Begins without light; there may be any number of lights."""
         self._scene, self._volume, self._lights = scene, volume, tuple(lights)
         self._coarse = CoarseSmoke(volume)
         self._source = torch.zeros(len(lights), *self._coarse.extinction.shape, device=volume.device)
@@ -109,12 +103,7 @@ class CoarseSmoke:
     """
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
-        """Averages the smoke; to be called inside `wlm.interop.stream`.
-
-        Args:
-            volume: The smoke.
-            cells: Cells along the longest edge.
-        """
+        """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
         self.medium = medium_of(volume)
         longest = max(volume.shape)
         self._counts = [max(1, round(cells * n / longest)) for n in volume.shape]

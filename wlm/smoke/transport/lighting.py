@@ -113,10 +113,6 @@ def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
     """Returns a march with an error of about 0.5%: in steps of a voxel or of a tenth of optical depth in the densest
     smoke, but at least a quarter of a voxel.
-
-    Args:
-        volume: The smoke.
-        g: Mean cosine of the Henyey-Greenstein phase function.
     """
     densest = float(volume.density.max()) * volume.extinction * volume.voxel
     return March(step=min(max(_CLOSE / max(densest, 1e-30), _FINEST), 1.0), jitter=0.0, g=g)
@@ -194,13 +190,7 @@ def light_in(
     lights: Sequence[AnyLight],
     visit: Callable[[int, Depths], None] | None = None,
 ) -> LitSmoke:
-    """Runs `light_smoke` in a prepared march.
-
-    Args:
-        scene: The march.
-        volume, camera, lights: As for `light_smoke`.
-        visit: Called with the index of each light and its depths, which are not kept.
-    """
+    """Runs `light_smoke` in a prepared march; `visit` is called with the index of each light and its depths."""
     planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     for n, light in enumerate(lights):
         place, _, radius = in_voxels(light, volume)
