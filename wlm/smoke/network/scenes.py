@@ -39,7 +39,7 @@ class Tilted(ObstacleSettings):
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
-    """Returns the random generator for a part of a sequence; validation and training have different ones."""
+    """Returns the random generator that the numbers identify; validation and training have different ones."""
     return np.random.default_rng([int(validation), *numbers])
 
 
