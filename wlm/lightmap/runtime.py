@@ -59,7 +59,7 @@ class RuntimeDecoder:
         raise NotImplementedError
 
     def decode(self) -> None:
-        """Decodes all tiles into `out`. It only launches kernels and allocates nothing, so a CUDA graph can capture it."""
+        """Decodes all tiles into `out`. It only launches kernels, so that a CUDA graph can capture it."""
         raise NotImplementedError
 
     def numpy(self) -> np.ndarray:

@@ -163,7 +163,7 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
 
 def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
-    """Cuts the tiles with numbers `index` `[N]` out of a sheet as views, without a copy; raises as `check_index` does."""
+    """Cuts tiles with the numbers `index` out of a sheet, as views without a copy. Raises as `check_index` does."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     check_index(index, grid)
     windows = [grid.window(tile) for tile in index]

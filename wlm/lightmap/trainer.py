@@ -335,7 +335,7 @@ class Trainer:
         return self.loss.cpu().numpy()
 
     def psnr(self) -> float:
-        """Returns the mean PSNR in dB, over tiles and times, of the samples since the last call; NaN without `track`."""
+        """Returns the mean PSNR in dB over tiles and times, for samples since the last call; NaN without `track`."""
         with interop.stream(self.device):
             sums = self._tracked.sum(0).cpu()
             self._tracked.zero_()

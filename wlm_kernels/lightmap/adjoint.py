@@ -94,7 +94,7 @@ def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: f
 #endif
 """)
 def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
-    """Adds v, two channels for each of two texels, to rows `early` and `late` by weight; all warp lanes must call it."""
+    """Adds v, two channels for each of two texels, to rows `early` and `late` by weight; all warp lanes call it."""
 
 
 @wp.func
@@ -104,7 +104,7 @@ def _spread_none(g: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns `add` of one number, the type of sums, `add_endpoints` of a block, and the function that prepares its g."""
+    """Returns `add` of a number, the type of sums, `add_endpoints` of a block, and what prepares its g."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 

@@ -46,7 +46,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """Returns v clamped to [0, 1], or if quantised rounded to a byte / 255; `scatter_plane` takes the derivative as 1."""
+    """Returns v clamped to [0, 1], or if quantised rounded to a byte / 255; `scatter_plane` has derivative 1."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c

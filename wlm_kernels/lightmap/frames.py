@@ -50,7 +50,7 @@ def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
 def share_of(
     low: wp.uint64, high: wp.uint64, tables: Tables, at: int, count: int, texel: int, first: int, second: int
 ) -> int:
-    """Returns the weight of a texel's second endpoint, in 64ths, from indices of `count` bits that begin at bit `at`."""
+    """Returns the weight of a texel's endpoint 1, in 64ths, from indices of `count` bits that begin at bit `at`."""
     start = at + count * texel
     width = count
     if texel > 0:
@@ -161,7 +161,7 @@ def power(colour: wp.vec3, exponent: float) -> wp.vec3:
 
 @wp.func
 def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
-    """Interpolates a texel's linear radiance between two frames; `share` weights the later (neural-dynamic-gi, eq. 2)."""
+    """Interpolates a texel's linear radiance between two frames; `share` weights the later."""
     light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
     if share > 0.0:
         other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)

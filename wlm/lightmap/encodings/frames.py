@@ -79,7 +79,7 @@ def choose_frames(
 
 
 def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns the 4x4 blocks of a tile that filtered reads can touch: within `REACH` of a mask [H, W], bool [32, 32]."""
+    """Returns the blocks of a tile that filtered reads touch: within `REACH` of a mask [H, W], bool [32, 32]."""
     y, x = TileGrid.of(*mask.shape).origin(number)
     near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
     part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
