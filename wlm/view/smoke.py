@@ -165,9 +165,7 @@ class Drawing:
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Returns the light of fire, vec3 [H, W]: emitted, plus scattered by smoke (`thrown`) in the fire's mean
-        colour.
-        """
+        """Returns the light of fire, vec3 [H, W]: emitted, plus scattered by smoke in the fire's mean colour."""
         if emission is None:
             return None
         ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))
