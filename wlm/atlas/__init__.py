@@ -1,4 +1,6 @@
-"""Lightmaps of a scene as a small colour texture, read through a lookup texture (lightmap-uv-clustering-cascade)."""
+"""Compresses a scene's lightmaps to a small colour texture that is read through a lookup texture
+(lightmap-uv-clustering-cascade).
+"""
 
 from wlm._facade import facade
 

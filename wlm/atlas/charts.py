@@ -6,7 +6,8 @@ from scipy.sparse.csgraph import connected_components
 
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Numbers the corners, int32 [F, 3] from 0, so that those with equal position [V, 3] and UV [V, 2] have one number.
+    """Numbers the corners of the triangles, int32 [F, 3] from 0. Corners with equal position [V, 3] and UV [V, 2] get
+    the same number.
 
     A file splits vertices where any attribute differs, a normal for example; a lightmap has no seam there.
     """
@@ -17,10 +18,10 @@ def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.nda
 
 
 def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-    """Numbers the charts of triangles with `welded` corners [F, 3], int32 [F], in the order of their first triangles;
-    -1 where a triangle isn't active.
+    """Numbers the charts, int32 [F] from 0, in the order of their first triangles; -1 for a triangle that isn't active.
+    `corner`, int [F, 3], comes from `welded`.
 
-    Triangles that share an edge are in one chart, but not triangles that share only a corner.
+    Triangles that share an edge are in one chart; sharing only a corner does not join them.
     """
     corner = np.asarray(corner)
     count = len(corner)
