@@ -1,6 +1,5 @@
-"""Compresses a scene's lightmaps to a small colour texture that is read through a lookup texture
-(lightmap-uv-clustering-cascade).
-"""
+"""Compresses a scene's lightmaps to a small texture that is read through a lookup texture
+(lightmap-uv-clustering-cascade)."""
 
 from wlm._facade import facade
 

@@ -81,9 +81,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_texels(model: AtlasModel) -> np.ndarray:
-    """Makes the texture `sheets`, uint16 [rows, 2, 4]. Each row has two texels: the width and height in texels and the
-    x and y of its first entry in the lookup texture; then tiles in x and y, the row of the next smaller level, and 0.
-    """
+    """Makes the texture `sheets`, uint16 [rows, 2, 4]. A row's first texel has the width and height and the x and y of
+    its first entry in the lookup texture; the second has the tiles in x and y, the next smaller level's row, and 0."""
     table = model.table()
     texels = np.zeros((len(table), 2, 4), "<u2")
     texels[:, 0] = table[:, [1, 0, 3, 2]]

@@ -80,8 +80,8 @@ class _Header(Header):
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns the settings, the parts and the source hash of a model's file. Times are left out, so that one seed gives
-    one file.
+    """Returns the settings, the parts and the source hash of a model's file, without times, so that one seed gives one
+    file.
 
     Raises:
         ValueError: The model stores no triangles, or its UVs are not rounded to 16 bits.

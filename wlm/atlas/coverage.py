@@ -14,8 +14,7 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Finds the texels whose square intersects some triangle's inside, bool [height, width]. UVs are float64 [V, 2] in
-    [0, 1]; each triangle has an area. A triangle that ends exactly at a texel's side doesn't touch that texel.
-    """
+    [0, 1]; each triangle has an area. A triangle that ends exactly at a texel's side doesn't touch that texel."""
     change = np.zeros((height, width + 1), np.int32)
     for corner, row in _rows(uv, triangle, height, width, centres=False):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -38,8 +37,7 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Counts for every texel the triangles that contain its centre, int32 [height, width]. A centre on an edge that two
-    triangles share counts for exactly one of them.
-    """
+    triangles share counts for exactly one of them."""
     return covered_on(uv, triangle, height, width, "cpu").numpy()
 
 
@@ -57,9 +55,8 @@ def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, de
 def _centre_spans(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields arrays of rows and of spans, int64 [N] each: the texels first <= column < stop have their centre in a
-    triangle.
-    """
+    """Yields rows and their spans, int64 [N] each: the texels first <= column < stop have their centre in a
+    triangle."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -110,7 +107,7 @@ def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
-    """Adds spans first <= column < stop to `change`, the differences of counts along each row: 1 at first, -1 at stop."""
+    """Adds spans first <= column < stop to `change`, the differences of counts along a row: +1 at first, -1 at stop."""
     flat, stride = change.reshape(-1), change.shape[1]
     np.add.at(flat, row * stride + first, 1)
     np.subtract.at(flat, row * stride + stop, 1)

@@ -1,8 +1,7 @@
 """Reads triangles with lightmap UVs and their lightmaps from files or arrays, and checks and repairs them.
 
 A scene has sheets. A sheet is one layout of charts with a lightmap for each state (an hour, a directional layer, a
-shadow mask); it lights the triangles of one or more objects. One mesh with one lightmap is a scene of one sheet and one
-state.
+shadow mask); it lights one or more objects. One mesh with one lightmap is a scene of one sheet and one state.
 
 Input that contradicts itself is refused with one line; a flaw that can be repaired is repaired, with one line of
 `warnings` for each kind and its count. Both are listed in docs/atlas.md, "Hard cases". Texels outside of charts are
@@ -105,8 +104,8 @@ class Triangles:
         position: float64 [V, 3].
         triangle: int32 [F, 3].
         uv: float64 [V, 2]; 0 for triangles without a lightmap.
-        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide what
-            is behind them.
+        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide
+            others.
     """
 
     position: np.ndarray
@@ -195,11 +194,9 @@ def load(
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes that of the list, else 1, where engines and viewers
             look for them, if any primitive has it, else 0. Formats other than glTF have only 0.
         node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
-        encoding: If there is one lightmap, the encoding of a PNG's bytes, one of `wlm.formats.channels.ENCODINGS`; None
-            if the file is no PNG.
+        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None: no PNG.
         flip: If there is one lightmap, whether its top row is at v = 1 of glTF.
-        trust: Whether files may refer to files outside their folder and expand to much more data than their size
-            (`wlm.formats.limits`).
+        trust: Whether files may name files outside their folder, and expand to huge data (`wlm.formats.limits`).
 
     Raises:
         WlmError: One line that names the file and the field: the input contradicts itself, or a file is missing or
@@ -294,8 +291,7 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
     """Joins several scenes into one that has all their sheets.
 
     Args:
-        scenes: At least one, in the same space and with equally many states; the states' names are taken from the
-            first.
+        scenes: At least one, in the same space and with equally many states. The first names the states.
         name: The name of the new scene.
 
     Raises:
@@ -477,8 +473,7 @@ def _checked(
     warnings: Sequence[str] = (),
 ) -> Sheet:
     """Checks and repairs the triangles and lightmaps [M, H, W, 3] of a sheet. If there are no lightmaps (M = 0), the
-    mask is required. `names` are the files of the lightmaps and the mask, for messages.
-    """
+    mask is required. `names` are the files of the lightmaps and the mask, for messages."""
     warnings, parts, vertices, triangles = list(warnings), [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)

@@ -51,8 +51,7 @@ class Decoder:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """Returns the factors of C components of shared tiles in a state, float32 [C, 3]; a state such as 0.5 is
-        interpolated between two states.
+        """Returns the factors of shared tiles in a state, float32 [C, 3]; a state such as 0.5 is interpolated.
 
         Raises:
             ValueError: The state is below 0 or above the last.
@@ -77,11 +76,13 @@ class Decoder:
             uv: float32 [N, 2] on the decoder's device: the model's new UVs if it has any, else the UVs of the sheets.
             sheet: The sheet's number from 0, int [N], or one for all points.
             state: 0 to the number of states - 1; fractions lie between two states.
-            lod: float32 [N], base-2 logarithm of lightmap texels per pixel, for a model with mips; None: full
-                resolution.
+            lod: float32 [N], base-2 logarithm of texels per pixel, for a model with mips; None: full resolution.
 
         Returns:
-            float32 [N, 3]. Raises: ValueError: No such state, or the model has no mips.
+            float32 [N, 3], light.
+
+        Raises:
+            ValueError: No such state, or the model has no mips.
         """
         if lod is not None and not self.model.mips:
             raise ValueError("lod: expected a model with mips")
@@ -97,8 +98,7 @@ class Decoder:
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
         """Writes light at N UVs, vec2 [N], to `out`, float32 [N, 3], for a model with one lightmap; N is at least 1. On
-        CUDA the work is queued, not awaited.
-        """
+        CUDA the work is queued, not awaited."""
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
@@ -117,9 +117,8 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], from a model whose tiles are shared by lightmaps or stored separately for
-        each.
-        """
+        """Returns light, float32 [N, 3], from tiles that all lightmaps share or from separate tiles for each
+        lightmap."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -163,8 +162,7 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the K texels of a sheet's mask as `lightmap` does: float32 [K, 3], row by row, on the decoder's
-        device.
+        """Decodes the K texels of a sheet's mask as `lightmap` does: float32 [K, 3] on the device, row by row.
 
         Raises:
             WlmError: The sheet's size differs from that in the model.

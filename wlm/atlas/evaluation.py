@@ -3,8 +3,7 @@
 The scene is rendered from cameras around it (`wlm.ops.views`) and, where viewers can stand in it, from as many cameras
 inside it (`wlm.ops.indoors`). A pixel is the lightmap's linear RGB at its surface point, without any shading. The
 reference is the original lightmap read bilinearly, clamped, its gaps filled from the nearest texel of a chart. Only
-covered pixels count; a view without any is left out. A view is measured in every state, and results are means over
-states and views.
+covered pixels count; a view without any is left out. Results are means over all states and views.
 
 The peak of every PSNR and the range of SSIM are one number for each state: the maximum minus the minimum of the
 reference over the covered pixels of all views. (The paper doesn't name its peak; one per view would change with the
@@ -14,8 +13,7 @@ Errors are also measured as displayed on a screen: light is exposed so that near
 are below white (`wlm.texels.exposure`), clipped to [0, 1] and encoded as sRGB. The peak of this PSNR is 1.
 
 A result without a meaning is NaN, null in JSON: PSNR and SSIM if the reference has a single value, to within a
-millionth, or nothing is covered; and errors at seams if no view shows a border. An exact decoder has a PSNR of 120 dB
-(`PSNR_CAP_DB`).
+millionth, or nothing is covered; and seams if no view shows a border. An exact decoder has 120 dB (`PSNR_CAP_DB`).
 """
 
 import math
@@ -83,8 +81,7 @@ class Score(system.Report):
         name: The scene's name.
         views: Number of views that show a sheet.
         pixels: Number of covered pixels in all views.
-        peak: Range of the reference in the covered pixels, used for PSNR and SSIM (see the module); mean over the
-            states.
+        peak: Range of the reference in the covered pixels, for PSNR and SSIM; mean over the states.
         peaks: The range for each state.
         brightest: Maximum of the reference in the covered pixels, in any state.
         psnr: dB, the mean over states and views.
@@ -160,8 +157,7 @@ def evaluate(
 ) -> Report:
     """Compares a model with the original lightmaps of the scene; options are those of `compare`.
 
-    Errors at seams are taken along the borders of charts: of the new UVs, or of the original UVs if the mesh keeps
-    them.
+    Errors at seams are taken along the borders of charts: of the new UVs, or of the old UVs if the mesh keeps them.
 
     Raises:
         WlmError: There is no such device, or the model was made from another scene.
@@ -206,8 +202,8 @@ def compare(
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
         labels: Functions that number charts or tiles, by names of decoders: seams lie where the number changes. For
-            decoders not named, seams are the borders of the lightmaps' charts. An outline in front of another surface
-            is no seam.
+            other decoders, seams are the borders of the lightmaps' charts. Outlines in front of other surfaces are no
+            seams.
         progress: Called with the number of views done.
 
     Returns:
@@ -262,9 +258,8 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes the function for `labels` of `compare` that numbers the charts of a model's own UVs; points must be on the
-    device.
-    """
+    """Makes a function for `labels` of `compare` that numbers the charts of a model's own UVs, for points on the
+    device."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -324,9 +319,7 @@ def _peaks(
     device: str,
 ) -> tuple[list[float], float]:
     """Returns the range of the reference over all views for each state (see the module), and the reference's maximum.
-
-    Rendering each view twice is cheaper than storing all views.
-    """
+    Rendering each view twice is cheaper than storing all views."""
     states = range(len(scene.states))
     low, high = [math.inf] * len(states), [-math.inf] * len(states)
     count = torch.zeros((len(states), _BINS), dtype=torch.float64)
@@ -370,9 +363,7 @@ def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
 
 @dataclass
 class _Tally:
-    """Collects the errors of a decoder: sums, and for each view and state the MSE, the SSIM, and as displayed on a
-    screen the MSE and FLIP.
-    """
+    """Collects the errors of a decoder by view and state: MSE, SSIM, and as displayed on a screen the MSE and FLIP."""
 
     states: int
     rows: list[tuple[float, ...]] = field(default_factory=list)
@@ -432,7 +423,7 @@ def _mean(values: Sequence[float]) -> float:
 def _texel_errors(
     scene: LightmappedScene, reference: _Reference, decoders: Mapping[str, Sampler], device: str
 ) -> dict[str, list[float]]:
-    """Returns mean squared errors, by decoder and state, over the mask's texels whose centre is in an active triangle."""
+    """Returns mean squared errors, by decoder and state, over mask texels whose centre is in an active triangle."""
     sums, total, first = {name: [0.0] * len(scene.states) for name in decoders}, 0, 0
     for number, sheet in enumerate(scene.sheets):
         height, width = sheet.mask.shape
@@ -453,10 +444,9 @@ def _texel_errors(
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each pixel.
-    A border lies between triangles with different labels that touch in space: their `place`, int [F, 3], has an equal
-    number.
-    """
+    """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each
+    pixel. A border lies between triangles with different labels that share a corner in space: a number of `place`,
+    int [F, 3]."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1
@@ -476,9 +466,8 @@ class _View:
     """One view's pictures of the original lightmaps, to be compared with those of decoders."""
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
-        """Makes the pictures of the original's light [N, 3] at the covered pixels [h, w]. FLIP is computed only if
-        `flip` is true.
-        """
+        """Makes pictures of the original's light [N, 3] at the covered pixels [h, w]; `flip`: whether to compute
+        FLIP."""
         whole = hit.cpu().numpy()
         # SSIM reads half a window around a covered pixel.
         rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
@@ -489,17 +478,14 @@ class _View:
         self._light, self._screen = self._pictures(target)
 
     def errors(self, light: torch.Tensor) -> tuple[float, float, float]:
-        """Returns a decoder's SSIM, NaN without a peak; the mean squared error as displayed on a screen; and FLIP, or
-        NaN.
-        """
+        """Returns a decoder's SSIM, NaN without a peak; the MSE as displayed on a screen; and FLIP, or NaN."""
         picture, screen = self._pictures(light)
         similarity = ssim(self._light, picture, self._hit, self._peak) if self._peak > 0.0 else math.nan
         return similarity, *picture_error(self._screen, screen, self._hit, self._flip)
 
     def _pictures(self, light: torch.Tensor) -> np.ndarray:
-        """Returns pictures of light [N, 3], linear and as displayed on a screen, float64 [2, h, w, 3]; uncovered pixels
-        are black.
-        """
+        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; uncovered pixels are
+        black."""
         values = light.cpu().numpy().astype(np.float64)
         pictures = np.zeros((2, *self._hit.shape, 3))
         pictures[:, self._hit] = values, to_srgb(values * self._exposure)

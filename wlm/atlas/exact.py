@@ -13,8 +13,8 @@ def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, sta
     Args:
         model: The model.
         uv: [N, 2], finite: the model's new UVs if it has any, else the UVs of the sheets; clamped to [0, 1].
-        sheet: int [N], or one number for all points: a sheet or a mip level, as the row of `AtlasModel.table` for the
-            first state.
+        sheet: int [N], or one number for all points: a sheet or mip level, a row of `AtlasModel.table` for the first
+            state.
         state: The number of the state.
 
     Returns:
@@ -29,9 +29,8 @@ def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, sta
 
 
 def _tiles(model: AtlasModel, uv: np.ndarray, row: np.ndarray, state: int) -> np.ndarray:
-    """Returns light from tiles, [N, 3]: a sum of components times factors, at least 0. A tile of one lightmap has one
-    component with factor 1.
-    """
+    """Returns light from tiles, [N, 3]: components times factors, at least 0. One lightmap has one component, factor
+    1."""
     factor = model.factor[state] if len(model.factor) else np.array([[0.0] * 3, [1.0] * 3])
     table = model.table()[row].astype(np.int64)
     size, origin, tiles = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1]
@@ -68,9 +67,8 @@ def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def _between(
     texels: np.ndarray, page: np.ndarray, first: np.ndarray, last: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to the texels
-    first to last.
-    """
+    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to
+    first..last."""
     low = np.clip(np.floor(place).astype(np.int64), first, last)
     high = np.minimum(low + 1, last)
     share = (place - low)[:, :, None]

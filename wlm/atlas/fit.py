@@ -71,9 +71,8 @@ def compress(
         settings: Settings that replace the profile's, by name: `budget=0.1`.
 
     Returns:
-        The model. For one lightmap it is "plain", a smaller lightmap of as many bits, if that has no larger error than
-        the method. Its report has lines under "lost light" if texels lost more than half of their light and PSNR
-        doesn't show it.
+        The model. For one lightmap it is "plain", a smaller lightmap of as many bits, if that has no larger error. Its
+        report has lines under "lost light" if texels lost more than half of their light and PSNR doesn't show it.
 
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
@@ -141,7 +140,7 @@ def open_checkpoint(
 
 
 def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
-    """Compresses one lightmap by the method `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
+    """Compresses one lightmap by `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)
     if method == "tiles":
@@ -174,10 +173,8 @@ def with_fallback(
     scene: LightmappedScene, grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
 ) -> AtlasModel:
     """Returns the model, or a plain smaller lightmap if one of at most as many bits has no larger weighted error.
-
     `weight`, float64 [2 H, 2 W], has the weights of cells, quarters of texels. Without a model the smaller lightmap has
-    as many bits as the budget allows, but at least one texel or block.
-    """
+    as many bits as the budget allows, but at least one texel or block."""
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
     bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits
@@ -209,10 +206,7 @@ def with_fallback(
 
 def _cell_centres(grid: FineGrid, weight: torch.Tensor) -> Iterator[tuple[Points, torch.Tensor]]:
     """Yields, some rows at a time, the centres of those quarters of texels (cells) that are in a triangle, and their
-    weights.
-
-    If all triangles are so small that none contains a centre, the cells with a weight are used instead.
-    """
+    weights. If all triangles are so small that none contains a centre, the cells with a weight are used instead."""
     any_held = bool((grid.triangle[0] >= 0).any())
     rows = max(1, _CELLS_AT_ONCE // grid.width)
     pieces = (values.split(rows) for values in (*grid.triangle, weight))

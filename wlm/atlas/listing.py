@@ -3,7 +3,7 @@
 docs/atlas.md shows the JSON file. A sheet is one layout of charts and has a file for each state; its other fields are
 arguments of `wlm.atlas.load`. An object is a node, named by its name, its mesh's name or its number; it reads the sheet
 at UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits (`matching`).
-`convention` states how the rectangles are written: v runs down in glTF and Godot, and up in Unity, whose glTF exporters
+`convention` states how the rectangles are written: v runs down in glTF and Godot, up in Unity, whose glTF exporters
 write 1 - v.
 
 Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stack of slices or of directional layers has
@@ -100,9 +100,8 @@ class Listing:
 
 
 def is_listing(path: str | os.PathLike[str] | None) -> bool:
-    """Tests whether a path is a list of lightmaps and not one lightmap. None, for the materials' own lightmaps, is a
-    list.
-    """
+    """Tests whether a path is a list of lightmaps and not one lightmap. None, for the materials' lightmaps, is a
+    list."""
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 
@@ -206,9 +205,8 @@ def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFile
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
-    """Converts the rectangle of an object from an engine's convention to ours. Other input is returned unchanged and
-    fails later checks.
-    """
+    """Converts an object's rectangle from an engine's convention to ours; other input is kept and fails later
+    checks."""
     if not isinstance(entry, dict):
         return entry
     entry = dict(entry)

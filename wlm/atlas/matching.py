@@ -33,8 +33,7 @@ _FRINGE, _REACH = 4.0, 5  # limit over the brightest chart texel nearby, and the
 def choose_mesh(
     where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
 ) -> tuple[list[GltfPrimitive], list[str]]:
-    """Chooses the primitives of a scene for which a lightmap was baked. Also returns lines of text that say what was
-    left out.
+    """Chooses the primitives for which a lightmap was baked. Also returns lines of text that say what was left out.
 
     Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts the lightmap is
     smoothest is chosen; a mesh that several nodes draw counts once.
@@ -98,8 +97,7 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
     """Returns the mean difference, in octaves, between neighbouring texels of one chart (`chart_map`); infinity if
     there are no such texels. NaN and infinity count as differences. A large lightmap is sampled in evenly spread bands
-    of rows with `_LOOKED_AT` texels in all.
-    """
+    of rows with `_LOOKED_AT` texels in all."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
@@ -138,13 +136,10 @@ def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
 
 def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:
     """Replaces stray texels of a lightmap, float32 [H, W, 3], by the nearest valid texel, in place. Returns the number
-    of texels in specks.
-
-    A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4 times as bright as the
-    brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values in gutters. All other
-    texels are stray if they form a speck: less than 3 texels wide, and brighter than 16 times the 99.5th percentile of
-    all such texels.
-    """
+    of texels in specks. A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4
+    times as bright as the brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values
+    in gutters. All other texels are stray if they form a speck: less than 3 texels wide, and brighter than 16 times the
+    99.5th percentile of all such texels."""
     brightest = lightmap.max(axis=2)
     finite = np.isfinite(lightmap).all(axis=2)
     inside = mask & covered

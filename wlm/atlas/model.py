@@ -226,17 +226,14 @@ class AtlasModel(Model):
         colour: Format of T_p, as in `Profile`; "plain" is never "mixed".
         states: Names of the states.
         sheets: The places of the sheets.
-        texels: half [pages, Hp, Wp, 3], T_p, finite, not negative, exactly as the stored texture decodes. For "mixed"
-            the texture in RGB9E5.
+        texels: half [pages, Hp, Wp, 3], T_p as decoded, finite, not negative. For "mixed" the texture in RGB9E5.
         lut: uint16 [Hc, Wc, 2 or 4], T_c: `pack_entries` for "tiles", coordinates in units of 1 / `LUT_STEPS` for
             "cascade", `pack_tiles` or their first two numbers for "shared"; [0, 0, 2] for "plain".
-        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" the blocks of its second texture; [0, 0,
-            16] for none.
+        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; [0, 0, 16] for none.
         block_texels: half [pages, Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 0, 3] for none.
         factor: float32 [M, C, 3], finite, of any sign, for "shared": the constant of each mixture, then the factors of
             its components; else [0, 0, 3].
-        levels: For "shared" with mips, the smaller levels of all sheets: first a quarter of a sheet's sides, then half
-            of that and so on.
+        levels: For "shared" with mips, the smaller levels of all sheets: a quarter of a sheet's sides, then halves.
         later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
         uv: float32 [F, 3, 2] in [0, 1], `snapped`, the corners' new UVs; [0, 3, 2] if the mesh keeps its UVs.
         stored: The scene's triangles and masks; None for a model without a file.
@@ -271,9 +268,8 @@ class AtlasModel(Model):
 
     @property
     def stride(self) -> int:
-        """The number of rows of `table` from a sheet in one state to the same sheet in the next state; 0 if all states
-        use one row.
-        """
+        """The number of rows of `table` from a sheet in one state to the same sheet in the next; 0: all states use one
+        row."""
         return len(self.sheets) + len(self.levels) if self.later else 0
 
     @property
@@ -283,9 +279,7 @@ class AtlasModel(Model):
 
     @property
     def first_block_code(self) -> int:
-        """The smallest size code with which an entry of the lookup texture T_c names blocks, see the function
-        `first_block_code`.
-        """
+        """The result of the function `first_block_code` for the entries of the lookup texture T_c."""
         return first_block_code(self.colour)
 
     @property
@@ -323,10 +317,8 @@ class AtlasModel(Model):
 
     def table(self) -> np.ndarray:
         """Makes the table of sheets for kernels and shaders, int32 [rows, 7]: rows and columns of texels, the first row
-        and column in T_c, rows and columns of tiles, and the row number of the next smaller level.
-
-        Sheets come first, then mip levels; with separate tiles the sheets and levels are repeated for each state.
-        """
+        and column in T_c, rows and columns of tiles, and the row number of the next smaller level. Sheets come first,
+        then mip levels; with separate tiles the sheets and levels are repeated for each state."""
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
 
@@ -360,17 +352,14 @@ def snapped(uv: np.ndarray) -> np.ndarray:
 
 
 def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
-    """Returns the rows and columns of the grid of tiles over a lightmap.
-
-    The borders of tiles lie on texel centres; the last tiles may reach beyond the lightmap.
-    """
+    """Returns the rows and columns of the grid of tiles over a lightmap. The borders of tiles lie on texel centres; the
+    last tiles may reach beyond the lightmap."""
     return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
 
 
 def first_block_code(colour: str) -> int:
-    """Returns the smallest size code with which an entry of the lookup texture names blocks and not texels; `NO_BLOCKS`
-    if none does.
-    """
+    """Returns the smallest size code with which an entry of the lookup texture names blocks; `NO_BLOCKS` if none
+    does."""
     return {"mixed": FIRST_BLOCK_CODE, "bc6h": 0, "astc": 0}.get(colour, NO_BLOCKS)
 
 
@@ -380,8 +369,7 @@ def pack_entries(
     """Encodes entries of the lookup texture T_c for the method "tiles".
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`; below four times `MOST_SIZE` for
-            blocks.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, or 4 `MOST_SIZE` for blocks.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
         blocks: bool [...], true for entries that name blocks, whose first texel and size are multiples of 4. Sizes of
             other entries are at most `code`.
@@ -407,8 +395,7 @@ def pack_entries(
 
 def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decodes the result of `pack_entries`. Returns first texels and sizes, int64 [..., 2] each, and whether entries
-    name blocks, bool [..., 2], equal along both axes in a valid file.
-    """
+    name blocks, bool [..., 2], equal along both axes in a valid file."""
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
@@ -431,8 +418,7 @@ def pack_tiles(
         component: int [...], number of the mixture's constant among the factors, below 65,536.
         count: int [...], number of components, 0 to 255; 0: the tile is black.
         page: int [...], number of the page of T_p, below `MOST_PAGES`.
-        coarse: int [...], number of coarse components, stored as one block each, 0 to `MOST_COARSE`; 0 for tiles that
-            aren't stored in blocks.
+        coarse: int [...], number of coarse components, one block each, 0 to `MOST_COARSE`; 0 for tiles in texels.
 
     Returns:
         uint16 [..., 4].
@@ -444,8 +430,7 @@ def pack_tiles(
 
 def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
     """Decodes the result of `pack_tiles`, or of `pack_entries` as tiles with one component. Returns the arguments of
-    `pack_tiles` in their order: int64, except `blocks`, which is bool [...].
-    """
+    `pack_tiles` in their order: int64, except `blocks`, which is bool [...]."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
@@ -458,15 +443,13 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
     """Returns the place of a coarse component of a tile, int [..., 2], in texels from the tile's first texel. Coarse
-    components are stacked in columns to the right of the tile's `whole` other components, each of the given size.
-    """
+    components are stacked in columns to the right of the tile's `whole` other components, each of the given size."""
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
 
 
 def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
-    """Returns the texels along x and y that all components of a tile take together, int [..., 2]; arguments as for
-    `pack_tiles`.
-    """
+    """Returns the texels along x and y that all components of a tile take, int [..., 2]; arguments as in
+    `pack_tiles`."""
     columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

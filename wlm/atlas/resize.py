@@ -16,8 +16,7 @@ _PULL = 1e-4
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
     """Returns the largest rows and columns, with the aspect ratio of height and width and at most as large, whose whole
-    blocks fit a budget of bits at `bits` per texel; None if not even one block fits.
-    """
+    blocks fit a budget of bits at `bits` per texel; None if not even one block fits."""
     longest = max(height, width)
     for side in range(longest, 0, -1):
         rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
@@ -30,11 +29,8 @@ def resized(
     filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
 ) -> torch.Tensor:
     """Returns a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504]. `filled` is the
-    lightmap without gaps.
-
-    The filter "box" averages the lightmap over the new texels' squares; "fit" minimises the squared error at the texels
-    of the mask. At its own size the lightmap is returned unchanged.
-    """
+    lightmap without gaps. The filter "box" averages the lightmap over the new texels' squares; "fit" minimises the
+    squared error at the texels of the mask. At its own size the lightmap is returned unchanged."""
     light = torch.from_numpy(filled).to(device).double()
     if (height, width) == mask.shape:
         return light
@@ -60,9 +56,8 @@ def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
 
 
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """Returns the image [h, w, 3] with the least squared error at the mask's texels, by conjugate gradients from
-    `start`, [h, w, 3].
-    """
+    """Minimises the squared error at the mask's texels by conjugate gradients from `start`; returns an image [h, w,
+    3]."""
     rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
     turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
 
@@ -88,9 +83,7 @@ def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:
-    """Makes the matrix [new, old] for a bilinear read of `old` texels at the centres of `new` texels, clamped at the
-    edges.
-    """
+    """Makes the matrix [new, old] for a bilinear read of `old` texels at the centres of `new` texels, clamped."""
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place).astype(np.int64)
     column = np.clip(np.stack([first, first + 1]), 0, old - 1)

@@ -27,7 +27,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Runs the code of a `with` block as a stage; on CUDA the time includes the kernels that the stage has queued."""
+        """Runs the code of a `with` block as a stage; on CUDA the time includes the kernels that it has queued."""
         meter = Meter(self.progress, name, 0)
         meter.report(0)
         yield
@@ -38,11 +38,8 @@ class Stages:
 
 @contextmanager
 def one_thread(device: str) -> Iterator[None]:
-    """Limits torch to one thread on the CPU.
-
-    Calls of torch are so short that a second thread makes an evaluation ten times slower on a busy machine and gains
-    little on an idle one.
-    """
+    """Limits torch to one thread on the CPU. Calls of torch are so short that a second thread makes an evaluation ten
+    times slower on a busy machine and gains little on an idle one."""
     threads = torch.get_num_threads()
     try:
         if device == "cpu":

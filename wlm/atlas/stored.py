@@ -19,8 +19,7 @@ from wlm.formats.gltf_writer import Replacement, encode_glb
 class StoredScene:
     """Triangles and masks of a scene: the bytes of a `.glb` file; the nodes that are lit by the sheets; n of their UV
     set `TEXCOORD_n`; whether positions are known to be in metres; whether the other nodes hide what is behind them; and
-    for each sheet its mask, bool [H, W], true where a texel belongs to a chart.
-    """
+    for each sheet its mask, bool [H, W], true where a texel belongs to a chart."""
 
     glb: bytes
     objects: tuple[Placed, ...]
@@ -67,8 +66,7 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
     """Makes the mesh for an engine. Returns the bytes of the stored `.glb`, with an additional UV set if the model has
-    new UVs, and n of the `TEXCOORD_n` at which the model is read.
-    """
+    new UVs, and n of the `TEXCOORD_n` at which the model is read."""
     if not len(model.uv):
         return model.stored.glb, model.stored.uv_set
     return with_uvs(model.scene, model.uv)

@@ -83,7 +83,7 @@ def visible_uv(
 def points_at(
     scene: LightmappedScene, visible: torch.Tensor, barycentric: torch.Tensor, uv: torch.Tensor
 ) -> tuple[torch.Tensor, Points]:
-    """Returns the covered pixels of a view from `visible_uv`, bool [h, w], and the points at these pixels, row by row."""
+    """Returns the covered pixels of a view from `visible_uv`, bool [h, w], and the points at them, row by row."""
     hit = visible >= 0
     triangle = visible[hit].long()
     sheet = torch.from_numpy(scene.triangles.sheet).to(visible.device)[triangle]
@@ -91,9 +91,7 @@ def points_at(
 
 
 def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
-    """Returns the barycentric weights of all three corners, float32 [N, 3], from the weights of corners 0 and 1, [N,
-    2].
-    """
+    """Returns the barycentric weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
     return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
@@ -110,8 +108,8 @@ def visibility(
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, the number of pixels of all views whose UVs lie in each cell; a UV of 1
-        lies in the last cell.
+        float64 [height, width] on the device, the pixels of all views whose UVs lie in each cell; a UV of 1 is in the
+        last cell.
 
     Raises:
         WlmError: There is no such device.

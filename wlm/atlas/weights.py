@@ -22,9 +22,7 @@ _SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
-    """A grid of cells over a sheet, each a quarter of a texel, and maps over this grid, which are computed when first
-    used.
-    """
+    """A grid of cells over a sheet, each a quarter of a texel, and maps over the grid, computed when first used."""
 
     def __init__(self, sheet: Sheet, device: str) -> None:
         self.sheet, self.device = sheet, device
@@ -32,9 +30,7 @@ class FineGrid:
 
     @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The number of the triangle at each cell's centre, and the barycentric weights of its corners, as in
-        `texel_triangles`.
-        """
+        """The triangle at each cell's centre, and the barycentric weights of its corners, as in `texel_triangles`."""
         return texel_triangles(self.sheet, self.height, self.width, self.device)
 
     @cached_property
@@ -61,9 +57,7 @@ class FineGrid:
 
     @cached_property
     def relative(self) -> torch.Tensor:
-        """The factor that turns the squared error of linear light into squared relative error, up to a constant:
-        float64 [2 H, 2 W].
-        """
+        """The factor from squared error to squared relative error of light, up to a constant: float64 [2 H, 2 W]."""
         sheet = self.sheet
         light = torch.from_numpy(sheet.lightmap).to(self.device).mean(2, dtype=torch.float64)
         bright = light[torch.from_numpy(sheet.mask).to(self.device)]
@@ -86,8 +80,7 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
 def weights(scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
     """Returns the weight of each cell of a scene's only sheet, float64 [2 H, 2 W] on the grid's device: `spread` of the
     number of pixels that show it in random views. Views from inside count as much as views from around the scene. At
-    least one weight is above 0.
-    """
+    least one weight is above 0."""
     count, shape = profile.views, (grid.height, grid.width, grid.device)
     views = scene_views(scene, count, seed)
     around, inside = (visibility(scene, each, RESOLUTION, *shape) for each in (views[:count], views[count:]))
@@ -106,8 +99,7 @@ def spread(
 ) -> torch.Tensor:
     """Turns pixel counts of cells, float64 [2 H, 2 W], into weights: cells that no view shows get a small weight, and
     cells at borders of charts a larger weight, as `Profile` says. `mean` is the mean count of a cell, which scales the
-    weight of cells that no view shows; None: the mean over this sheet.
-    """
+    weight of cells that no view shows; None: the mean over this sheet."""
     # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it

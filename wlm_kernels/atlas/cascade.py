@@ -224,19 +224,15 @@ def _check(colour, lut) -> None:
 
 def sample(colour, lut, uv, out) -> None:
     """Writes the cascade's colours C(u), float [N, 3], at points vec2 [N] (eq. 7): u right, v down, clamped to [0, 1];
-    NaN gives NaN.
-
-    T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y in T_p, any numbers; [0, 0, 2] if there is
-    no T_c.
-    """
+    NaN gives NaN. T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y in T_p, any numbers; [0, 0,
+    2] if there is no T_c."""
     _check(colour, lut)
     wp.launch(_sample, uv.shape, inputs=[colour, lut, uv], outputs=[out], device=colour.device)
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
     """Adds the gradients of the two textures of `sample` to `grad_colour` and `grad_lut`; `grad_out`, float [N, 3], is
-    the gradient of the colours.
-    """
+    the gradient of the colours."""
     _check(colour, lut)
     inputs = [colour, lut, uv, grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_colour, grad_lut], device=colour.device)
@@ -244,8 +240,7 @@ def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
     """Writes coordinates vec2 [N] of points in triangles int [N], interpolated from barycentric weights of corners 0
-    and 1, vec2 [N], and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1.
-    """
+    and 1, vec2 [N], and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1."""
     wp.launch(
         _corner_points, triangle.shape, inputs=[triangle, barycentric, corner], outputs=[uv], device=triangle.device
     )
@@ -270,19 +265,16 @@ def surface_points(area, corner, distance: float, seed: int, step, triangle, bar
 
 
 def image_loss(difference, weight: float, grad) -> None:
-    """Writes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3).
-
-    The loss is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of
-    neighbours p and q, horizontal and vertical. d = `difference`, float [H, W, 3], is the image minus the reference;
-    NaN, where neither shows the mesh, counts as 0.
-    """
+    """Writes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3). The loss
+    is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of neighbours p
+    and q, horizontal and vertical. d = `difference`, float [H, W, 3], is the image minus the reference; NaN, where
+    neither shows the mesh, counts as 0."""
     device = difference.device
     wp.launch(_image_loss, difference.shape, inputs=[difference, weight], outputs=[grad], device=device)
 
 
 def pair_loss(difference, weight: float, grad) -> None:
     """Writes the gradient of the loss of N pairs of points: the sum of |d| plus `weight` times the sum of |d_i - d_(N +
-    i)|, where d = `difference`, float [2 N, 3]; NaN counts as 0.
-    """
+    i)|, where d = `difference`, float [2 N, 3]; NaN counts as 0."""
     size = (difference.shape[0] // 2, 3)
     wp.launch(_pair_loss, size, inputs=[difference, weight], outputs=[grad], device=difference.device)

@@ -34,8 +34,7 @@ class Axis:
 @wp.func
 def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
     """Returns the index of the tile that contains a coordinate, and the position in the tile from 0 to 1; tile 0 and
-    NaN for NaN.
-    """
+    NaN for NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)

@@ -216,8 +216,7 @@ def _spans(
     high: wp.array1d[float],
 ):
     """Writes the lowest and highest mean colour, summed over the channels, of one patch per thread, over its own
-    lattice and all larger ones.
-    """
+    lattice and all larger ones."""
     i = wp.tid()
     least = float(wp.inf)
     most = float(-wp.inf)
@@ -306,8 +305,7 @@ def _join(
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
     """Makes the thresholds on a device from lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest
-    distance of two dominant colours), taken as the exact decimal fractions that they print as.
-    """
+    distance of two dominant colours), taken as the exact decimal fractions that they print as."""
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
@@ -382,8 +380,7 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
     """Finds the edges between the patches `begin` to `end` - 1 and all later ones: writes 1 at both places of a pair in
-    `edge`, uint8 [M, M], which must be 0 before.
-    """
+    `edge`, uint8 [M, M], which must be 0 before."""
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
@@ -391,7 +388,6 @@ def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
     """Writes for the nodes at `begin` to `end` - 1 of int [N] the rank of the first head that each is like, or H for
     none. `heads`, int [H], are ascending nodes, `head_low` the `low` of each, and `rank` the order in which heads are
-    compared.
-    """
+    compared."""
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

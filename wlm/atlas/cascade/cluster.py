@@ -81,8 +81,7 @@ def cluster(
         triangle: int [F, 3], vertices.
         lightmap: [H, W, 3], linear RGB, finite.
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
-        max_radiance: Above 0. Brighter triangles share with no other (section 4.1.1). It corresponds to 255 in the
-            paper's 8-bit colours.
+        max_radiance: Above 0. Brighter triangles share with no other (section 4.1.1). It is 255 in 8-bit colours.
         active: bool [F], which triangles take part; None for all.
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
@@ -121,7 +120,7 @@ def cluster(
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """Converts the lightmap for the kernels to 16 bits per channel; a fourth channel is 1 where a texel is too bright."""
+    """Converts the lightmap to 16 bits per channel; a fourth channel is 1 where a texel is too bright."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
     fraction = lightmap.astype(np.float64) / max_radiance
     texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
@@ -136,9 +135,7 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Returns each patch's level, int32 [F]: the index in `SIZES` of the smallest size not below R_s (eq. 1), at most
-    that of `largest`.
-    """
+    """Returns each patch's level, int32 [F]: the index in `SIZES` of the smallest size not below R_s (eq. 1)."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
@@ -146,8 +143,7 @@ def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
     """Yields each group of several nodes with its representative. Where nodes have equally many edges, the one with the
-    lowest triangle number in `number`, int [M], is chosen.
-    """
+    lowest triangle number in `number`, int [M], is chosen."""
     count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
@@ -178,9 +174,7 @@ def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
 
 
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
-    """Finds for each node the first representative (`heads`) that it is like, int [N]; the number of heads if it is
-    like none.
-    """
+    """Finds the first of the representatives `heads` that each node is like, int [N]; their number if there is none."""
     device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
@@ -199,9 +193,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
-    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike; `done`, for progress, counts triangles
-    already in groups.
-    """
+    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike; `done` is only for the progress."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
@@ -215,9 +207,7 @@ def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
 
 
 def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields a representative and the members of its group, all groups of several nodes, and removes them from the
-    graph (section 3.2.2).
-    """
+    """Yields each representative with the members of its group, for groups of several nodes (section 3.2.2)."""
     degree = edge.sum(1, dtype=np.int64)
     remains = np.ones(len(number), bool)
     # Among equals the lowest number comes first.

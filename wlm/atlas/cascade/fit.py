@@ -55,18 +55,15 @@ _PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show
 @dataclass(frozen=True, eq=False)
 class Textures:
     """A cascade before it is stored: the colour texture T_p, float32 [Hp, Wp, 3], linear radiance; and the lookup
-    texture T_c, float32 [Hc, Wc, 2], coordinates in T_p as fractions of its width and height, [0, 0, 2] if there is no
-    T_c.
-    """
+    texture T_c, float32 [Hc, Wc, 2], coordinates in T_p as fractions of its size, [0, 0, 2] if there is no T_c."""
 
     colour: np.ndarray
     lut: np.ndarray
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2). Returns None if the profile's threshold is 0, so
-    that no triangles share texels.
-    """
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0: none share
+    texels."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -112,8 +109,7 @@ def fit_cascade(
             the lightmap itself, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
 
     Returns:
-        A model of method "cascade"; or of method "plain" if `lut_scale` is 0: only the colour texture T_p, read
-        directly at the mesh's UVs.
+        A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
 
     Raises:
         WlmError: An error of `pack` or `tune`, or a package for the blocks of T_p is missing.
@@ -159,11 +155,8 @@ def fit_cascade(
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
     """Makes the textures from which tuning starts (section 3.3.3). Each texel of T_p is the mean of the lightmap's
-    texels that it covers, and T_c holds the coordinates of its texels' centres.
-
-    The repacked lightmap is float32 [H_r, W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts, from which
-    all others are filled.
-    """
+    texels that it covers, and T_c holds the coordinates of its texels' centres. The repacked lightmap is float32 [H_r,
+    W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts, from which all others are filled."""
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
     colour = resized(fill_gaps(lightmap, mask), mask, *sides, "box").numpy().astype(np.float32)
@@ -221,9 +214,8 @@ def tune(
 
 
 def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    """Reads from the checkpoint the groups of `count` triangles that an interrupted compression had formed; None if
-    there are none.
-    """
+    """Reads the groups of `count` triangles that an interrupted compression saved in the checkpoint; None: no
+    groups."""
     triangle = Part(np.int32, (count,), least=0, most=count - 1)
     table = {
         "group": triangle,

@@ -1,4 +1,4 @@
-"""Chooses the number of components of each tile and their size, and places them on the pages of the colour texture T_p."""
+"""Chooses the number of components of each tile and their size, and places them on pages of the colour texture T_p."""
 
 import math
 from dataclasses import dataclass
@@ -53,8 +53,7 @@ class Allocated:
 
 
 def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocated:
-    """Chooses the number and size of the components of all sheets' tiles, and places them. `bits` is the budget of all
-    tiles and factors.
+    """Chooses the number and size of all tiles' components, and places them; `bits` is the budget of tiles and factors.
 
     Raises:
         WlmError: The budget is less than the smallest tiles take, or all pages together are too small.
@@ -116,8 +115,7 @@ def _worth(
     error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
 ) -> np.ndarray:
     """Removes mixtures (factors shared by a group of tiles), the least useful first, until each saves more error than
-    its bits would save elsewhere. Returns `error`, with a very large value where a tile's mixture was removed.
-    """
+    its bits would save elsewhere. Returns `error`, with a very large value where a tile's mixture was removed."""
     tiles = np.arange(error.shape[1])
     both = [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]
     ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in both]

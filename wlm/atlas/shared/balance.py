@@ -30,23 +30,19 @@ _ROUNDS = 4
 @dataclass(frozen=True)
 class ViewShares:
     """The tiles that V views show. `share`, float64 [V, T], is the fraction of a view's pixels that shows each tile, 0
-    for tiles of smaller mip levels; `lost`, float64 [V], is the error of each view for which the current weights were
-    made.
-    """
+    for tiles of smaller mip levels; `lost`, float64 [V], is each view's error for which the weights were made."""
 
     share: csr_array
     lost: np.ndarray
 
     def by_state(self, states: int) -> "ViewShares":
-        """Returns the shares for separate tiles per state: `share` is repeated for each state, since a view's error is
-        the mean over its states.
-        """
+        """Returns the shares for separate tiles, repeated for each state: a view's error is the mean over its
+        states."""
         return replace(self, share=hstack([self.share] * states, "csr") / states)
 
     def psnr(self, error: np.ndarray) -> float:
-        """Returns the PSNR in dB, peak 1, as the mean over the views. `error` [T] is each tile's error divided by its
-        weight.
-        """
+        """Returns the PSNR in dB, peak 1, as the mean over the views; `error` [T] is each tile's error over its
+        weight."""
         if not len(self.lost):
             return -10.0 * math.log10(float(error.mean()) + FLOOR)
         return float(-10.0 * np.log10(self.share @ error + FLOOR).mean())
@@ -62,8 +58,7 @@ def tile_shares(
     device: str,
 ) -> ViewShares:
     """Renders the views of `scene_weights` again and counts the pixels that show each tile. `grids` has the rows and
-    columns of tiles of each sheet.
-    """
+    columns of tiles of each sheet."""
     first = np.cumsum([0, *(rows * columns for rows, columns in grids)])
     row = np.full(first[-1], -1)
     of = np.flatnonzero(tiles.plane < len(scene.sheets))
@@ -97,8 +92,7 @@ def tile_shares(
 
 def balance(tried: list[Candidate], weight: np.ndarray, shown: ViewShares, bits: float) -> np.ndarray:
     """Returns factors for the tiles' weights, float64 [T], that favour tiles in views with little error; the sum of all
-    weights is unchanged. `bits` is the budget of all tiles.
-    """
+    weights is unchanged. `bits` is the budget of all tiles."""
     error, cost, tiles = np.concatenate([each.error for each in tried]), costs(tried), np.arange(len(weight))
     visible = np.asarray(shown.share.sum(0)).ravel() > 0
     if not visible.any():

@@ -68,7 +68,7 @@ class SceneTiles:
         return self.texels[at].to(self.device), self.weight[at].to(self.device)
 
     def points(self, texels: torch.Tensor) -> torch.Tensor:
-        """Returns light at the P points of each tile, [T, N, 3, P], interpolated from texels [T, B + 1, B + 1, N, 3]."""
+        """Returns light at the points of each tile, [T, N, 3, P], interpolated from texels [T, B + 1, B + 1, N, 3]."""
         return tile_light(texels.flatten(3)).unflatten(1, (-1, 3))
 
     def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
@@ -101,8 +101,7 @@ class Candidate:
     """The errors of all T tiles with a certain number of components.
 
     Attributes:
-        mixtures, number: The mixtures (sets of factors that tiles share), and the index of each tile's mixture, int
-            [T].
+        mixtures, number: The mixtures (sets of factors that tiles share), and each tile's mixture, int [T].
         choices: The sizes of the components.
         error: float64 [choices, T], squared error of each tile for each choice, mean over the states.
         left: Estimated error of the whole scene if tiles may have up to this number of components.
@@ -121,9 +120,7 @@ class Candidate:
 
 
 def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
-    """Lists the choices for `count` components: all of one size, or blocks of one size with the last components coarse
-    (a single block).
-    """
+    """Lists the choices for `count` components: all of one size, or in blocks with the last ones coarse (one block)."""
     few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
     return [
         Choice(size, count, coarse)
@@ -135,11 +132,9 @@ def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
 def candidates(
     tiles: SceneTiles, sizes: list[Size], bits: float, seed: int, stages: Stages, batch: int
 ) -> list[Candidate]:
-    """Computes the error of every tile with one component, with two and so on, until more components gain nothing.
-
-    The checkpoint of `stages` keeps each number of components as one finished batch, numbered from `batch`. `bits` is
-    the budget of all tiles and factors.
-    """
+    """Computes the error of every tile with one component, with two and so on, until more components gain nothing. The
+    checkpoint of `stages` keeps each number of components as one finished batch, numbered from `batch`. `bits` is the
+    budget of all tiles and factors."""
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(states, _RANKS[-1])
     ranks = [*(rank for rank in _RANKS if rank < most), most]
@@ -191,9 +186,7 @@ def _curves(
     meter: Meter,
     done: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the index of each tile's mixture and the errors, as `number` and `error` of `Candidate`, for the tiles
-    `members`.
-    """
+    """Returns each tile's mixture and errors, as `number` and `error` of `Candidate`, for the tiles `members`."""
     device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
     factor, offset = mixtures.factor, mixtures.offset
@@ -235,9 +228,7 @@ def costs(tried: list[Candidate]) -> np.ndarray:
 
 
 def _left(tried: list[Candidate], bits: float) -> tuple[float, np.ndarray]:
-    """Estimates the error of the whole scene. Also returns the index of the candidate that each tile would use, int
-    [T].
-    """
+    """Estimates the error of the whole scene; also returns the index of each tile's candidate, int [T]."""
     error = np.concatenate([each.error for each in tried])
     chosen = allocate(error, costs(tried), bits, 0.0)
     of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])

@@ -1,5 +1,4 @@
-"""Compresses the lightmaps of several sheets and states to one model, in which tiles are sums of components that states
-share.
+"""Compresses the lightmaps of several sheets and states to one model, whose tiles are sums of components.
 
 Each state's light is divided by its variation, so that errors count as in PSNR (`weights`). Tiles are grouped, and each
 group shares a mixture: the factors by which one, two or more components are summed in each state (`mixture`). Each tile
@@ -108,8 +107,7 @@ def _of_texels(weight: np.ndarray) -> np.ndarray:
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Solves for the samples of all components and writes them to the colour textures. Returns arrays of the model by
-    name, and the factor by which each component was multiplied, float64 [C, 3].
-    """
+    name, and the factor by which each component was multiplied, float64 [C, 3]."""
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)

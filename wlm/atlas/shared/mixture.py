@@ -5,8 +5,9 @@ light of one tile spans few. Tiles are assigned to mixtures, which are subspaces
 least error for its tiles, and each tile is assigned to the subspace with the least error for it (k-plane clustering,
 Bradley and Mangasarian 2000, with subspaces for planes).
 
-In a mixture of K components with orthonormal directions v_0 to v_(K-1), light x in the states is close to sum_k v_k b_k
-= sum_k v_k c_k - sum_k v_k o_k,    b_k = v_k x,    c_k = b_k + o_k.
+In a mixture of K components with orthonormal directions v_0 to v_(K-1), light x in the states is close to
+
+    sum_k v_k b_k = sum_k v_k c_k - sum_k v_k o_k,    b_k = v_k x,    c_k = b_k + o_k.
 
 Light isn't negative, so v_0 isn't (Perron), nor is b_0. The other b_k are often negative, and least-squares
 samples overshoot. An offset o_k that is larger than most negative values makes every component c_k positive, so that
@@ -27,8 +28,7 @@ _MARGIN, _MARGIN_FIRST = 0.1, 0.02  # margin of o_k over the component's range; 
 
 @dataclass(frozen=True, eq=False)
 class Mixtures:
-    """All G mixtures with the same number of components; a mixture has the factors by which a group of tiles sums its
-    components.
+    """All G mixtures with the same number of components: the factors by which a group of tiles sums its components.
 
     Attributes:
         factor: float32 [G, M, K, 3], the directions. A component is the sum of direction times light over the states,
@@ -53,15 +53,14 @@ class Mixtures:
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
-        """Finds for each tile the mixture that keeps most of its energy, int64 [T], from `moments`; on a tie the first."""
+        """Finds for each tile the mixture that keeps most of its energy, int64 [T], from `moments`."""
         energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
         return _first_best(moment.flatten(1) @ self.kept.T, energy)
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Sums the products of light in pairs of states over the points of each tile: from light [T, M, 3, P] and weights
-    [T, P] to float32 [T, 3, M, M].
-    """
+    [T, P] to float32 [T, 3, M, M]."""
     part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
     return part @ part.transpose(2, 3)
 
@@ -110,10 +109,8 @@ def find_mixtures(
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
     """Finds for each tile the first mixture that keeps about the most energy, int64 [T]. `kept` [T, G] is the energy
-    that each mixture keeps, `energy` [T] the whole energy of each tile.
-
-    Rounding must not assign a tile to a mixture whose offsets were not computed for it.
-    """
+    that each mixture keeps, `energy` [T] the whole energy of each tile. Rounding must not assign a tile to a mixture
+    whose offsets were not computed for it."""
     return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 
 

@@ -49,8 +49,7 @@ _HOPELESS = 1.25  # ratio of sampled separate to shared error above which the re
 class Plane:
     """A sheet, or a mip level of a sheet, to be cut into tiles. `frames`, float32 [M, H, W, 3], are its lightmaps
     without gaps; `weight`, float64 [2 H, 2 W], the weights of quarters of texels; `smaller` the index of the next
-    smaller level, 0 for none.
-    """
+    smaller level, 0 for none."""
 
     name: str
     frames: np.ndarray
@@ -60,11 +59,8 @@ class Plane:
 
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
     """Returns all sheets and then, if `mips`, their mip levels: the first has a quarter of a sheet's sides, rounded up,
-    each next one half of that.
-
-    A level's texel is the mean of the chart texels that it covers. Its weight is that of one such texel, from
-    `scene_weights`.
-    """
+    each next one half of that. A level's texel is the mean of the chart texels that it covers. Its weight is that of
+    one such texel, from `scene_weights`."""
     pairs = zip(scene.sheets, weights, strict=True)
     planes = [Plane(sheet.name, sheet.lightmaps, weight) for sheet, weight in pairs]
     if not mips:

@@ -37,8 +37,7 @@ def peaks_of(scene: LightmappedScene) -> np.ndarray:
 
 def variation(scene: LightmappedScene, peak: np.ndarray, device: str) -> list[np.ndarray]:
     """Returns for each sheet how much light varies, float32 [M, H, W]: the squared second differences along both axes
-    within charts, averaged over the channels. Light is first divided by `peak`, float64 [M].
-    """
+    within charts, averaged over the channels. Light is first divided by `peak`, float64 [M]."""
     result = []
     for sheet in scene.sheets:
         mask = torch.from_numpy(sheet.mask).to(device)
@@ -57,8 +56,7 @@ def _variation(light: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
     """Returns divisors of the M states' light, float64 [M] with geometric mean 1, that make all states vary equally;
-    from `variation` and the weights [H, W] of each sheet's texels.
-    """
+    from `variation` and the weights [H, W] of each sheet's texels."""
     sums = sum((each * weight).sum((1, 2), dtype=np.float64) for each, weight in zip(varies, weights, strict=True))
     total = sum(float(weight.sum()) for weight in weights)
     root = np.sqrt(sums / max(total, 1e-30) + FLOOR)
@@ -69,11 +67,9 @@ def scene_weights(
     scene: LightmappedScene, varies: Sequence[np.ndarray], profile: Profile, seed: int, device: str
 ) -> list[np.ndarray]:
     """Returns for each sheet the weights of quarters of texels, float64 [2 H, 2 W]: how many pixels of random views of
-    the scene show each, 0 where there is no triangle.
-
-    An object that is large in the views thus gets more weight than one that is small, far away or hidden. The weight of
-    a view is the inverse of the variation of the light that it shows; it does not grow with its number of pixels.
-    """
+    the scene show each, 0 where there is no triangle. An object that is large in the views thus gets more weight than
+    one that is small, far away or hidden. The weight of a view is the inverse of the variation of the light that it
+    shows; it does not grow with its number of pixels."""
     grids = [FineGrid(sheet, device) for sheet in scene.sheets]
     visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
     # The cells that `spread` uses.
@@ -91,9 +87,7 @@ def _counts(
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
-    """Sums over the views the fraction of pixels that show each cell of a sheet, divided by how much light varies in
-    the view.
-    """
+    """Sums over the views the fraction of pixels that show each cell, divided by how much light varies in the view."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
@@ -127,8 +121,7 @@ class Detail:
 
     def lost(self, points: Points) -> float:
         """Estimates the error of a view that shows the points, above 0: the mean variation of light over the states,
-        which are scaled to vary equally.
-        """
+        which are scaled to vary equally."""
         height, width, start = self._place[points.sheet.long()].T
         column, row = (
             (points.uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)

@@ -72,8 +72,7 @@ class Tiles:
 def fit_tiles(
     scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
 ) -> AtlasModel | None:
-    """Compresses a scene of one sheet and one state to tiles; returns None if not even the smallest tiles and their
-    table fit the budget.
+    """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget.
 
     Raises:
         WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
@@ -109,9 +108,8 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model from the solved samples of its tiles, the sizes and places of the tiles, and their numbers in the
-    grid, int64 [T].
-    """
+    """Makes the model from the tiles' solved samples, their sizes and places, and their numbers in the grid, int64
+    [T]."""
     size = scene.sheets[0].mask.shape
     counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
@@ -142,8 +140,7 @@ def least_gain(sheet: Sheet) -> float:
 
 def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
     """Cuts a lightmap, float [H, W, 3] without gaps, into tiles. Only tiles with a weight above 0 are returned;
-    `weight`, float64 [2 H, 2 W], has the weights of quarters of texels, at least one above 0.
-    """
+    `weight`, float64 [2 H, 2 W], has the weights of quarters of texels, at least one above 0."""
     index, share = weighted(torch.as_tensor(weight, device=device), size)
     columns = tile_counts(*image.shape[:2], size)[1]
     light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
@@ -153,8 +150,7 @@ def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device:
 
 def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Selects the tiles with a weight above 0 and returns their `index` and `weight`, as in `Tiles`. The argument has
-    the weights of quarters of texels, float64 [2 H, 2 W], at least one above 0.
-    """
+    the weights of quarters of texels, float64 [2 H, 2 W], at least one above 0."""
     rows, columns = tile_counts(*(side // 2 for side in weight.shape), size)
     m = SUPERSAMPLING * size
     folded = _folded(_folded(weight, rows * m).T, columns * m).T
@@ -164,9 +160,7 @@ def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tenso
 
 
 def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -> torch.Tensor:
-    """Cuts the texels of tiles, [T, B + 1, B + 1, ...], out of an image [H, W, ...]; beyond its edges the last texels
-    repeat.
-    """
+    """Cuts the texels of tiles, [T, B + 1, B + 1, ...], out of an image [H, W, ...], whose last texels are repeated."""
     step = torch.arange(size + 1, device=image.device)
     row = ((index // columns)[:, None] * size + step).clamp(max=image.shape[0] - 1)
     column = ((index % columns)[:, None] * size + step).clamp(max=image.shape[1] - 1)
@@ -184,8 +178,7 @@ def tile_light(patch: torch.Tensor) -> torch.Tensor:
 
 def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
     """Sums weights [2 H, N] to one weight per point of tiles along the first axis; weights beyond the outermost texel
-    centres are added to the nearest point.
-    """
+    centres are added to the nearest point."""
     padded = weight.new_zeros((points, weight.shape[1]))
     inner = weight[1:-1]
     padded[: len(inner)] = inner
@@ -195,7 +188,7 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
 
 
 def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
-    """Returns the weights of linear interpolation from samples to points along a tile's axis, float [points, samples]."""
+    """Returns the weights of linear interpolation from samples to points along an axis, float [points, samples]."""
     place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0)).long()
     result = torch.zeros((points, samples), device=device)
@@ -208,11 +201,8 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Returns the samples of least weighted squared error, float [T, ny, nx, 3], for tiles that all have nx x ny
-    samples, after at most `rounds` rounds.
-
-    Conjugate gradients solve the normal equations of each tile and channel, starting from the solution for equal
-    weights.
-    """
+    samples, after at most `rounds` rounds. Conjugate gradients solve the normal equations of each tile and channel,
+    starting from the solution for equal weights."""
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
         light, weight = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight))
@@ -248,9 +238,7 @@ def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
 
 
 def _laid_out(values: torch.Tensor) -> torch.Tensor:
-    """Arranges values [T, ...] in memory; on a GPU the axis of tiles is contiguous, since threads read many tiles at
-    once.
-    """
+    """Arranges values [T, ...] in memory; on a GPU the axis of tiles is contiguous, since threads read many at once."""
     if values.device.type == "cpu":
         return values.contiguous()
     return values.movedim(0, -1).contiguous().movedim(-1, 0)
@@ -267,8 +255,7 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Returns the linear interpolation along an axis: the sample before each point, the weight of the next sample, and
-    the inverse Gram matrix of the interpolation, which is cached since computing it on a GPU is slow.
-    """
+    the inverse Gram matrix of the interpolation, which is cached since computing it on a GPU is slow."""
     matrix = linear(samples, points)
     place = (torch.arange(points) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0))
@@ -279,8 +266,7 @@ def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.T
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
     """Returns the weighted squared error of samples [T, ny, nx, 3] for each tile, averaged over the channels, float64
-    [T]. The sum over all tiles is the MSE.
-    """
+    [T]. The sum over all tiles is the MSE."""
     result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
     flat = samples.permute(0, 3, 1, 2).flatten(2)
     with on_stream(samples.device):
@@ -304,8 +290,7 @@ def curves(
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
     """Returns the error of every tile at every size, float64 [sizes, T], with samples rounded as the size's format
-    stores them. The checkpoint keeps the errors of finished sizes as batch 0.
-    """
+    stores them. The checkpoint keeps the errors of finished sizes as batch 0."""
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
 
@@ -337,11 +322,9 @@ def curves(
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:
-    """Solves for the samples of every tile at its own size; `chosen`, int [T], has indices of sizes.
-
-    Returns groups of tiles of one size: the tiles' numbers, int [n]; their samples, float32 [n, ny, nx, 3], not
-    negative; and the weights of the samples' squared errors [n, ny, nx]. Samples and weights are on the tiles' device.
-    """
+    """Solves for the samples of every tile at its own size; `chosen`, int [T], has indices of sizes. Returns groups of
+    tiles of one size: the tiles' numbers, int [n]; their samples, float32 [n, ny, nx, 3], not negative; and the weights
+    of the samples' squared errors [n, ny, nx]. Samples and weights are on the tiles' device."""
     result = []
     for number in np.unique(chosen).tolist():
         size, members = sizes[number], np.flatnonzero(chosen == number)

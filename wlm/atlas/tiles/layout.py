@@ -2,8 +2,7 @@
 
 Each tile has a curve of error against bits. At the optimum one more bit reduces the error by the same amount in every
 tile. That gain, a Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each
-with its own texture: blocks where the block format is accurate, RGB9E5 texels for other light and for tiles of few
-samples.
+with its own texture: blocks where the block format is accurate, RGB9E5 for other light and for small tiles.
 """
 
 import math
@@ -36,8 +35,7 @@ _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14)  # texels, beside the largest side: a
 @dataclass(frozen=True)
 class Size:
     """A size that a tile may have: samples along x and y, their format (a key of `COLOUR_BITS`), and whether the tile
-    is in the second texture of "mixed".
-    """
+    is in the second texture of "mixed"."""
 
     nx: int
     ny: int
@@ -58,8 +56,7 @@ class Size:
 @dataclass(frozen=True)
 class Layout:
     """The chosen size of each tile, an index, int [T]; x and y of each tile's first texel, int64 [T, 2]; and the rows
-    and columns of T_p and of the second texture of "mixed".
-    """
+    and columns of T_p and of the second texture of "mixed"."""
 
     chosen: np.ndarray
     first: np.ndarray
@@ -67,9 +64,7 @@ class Layout:
 
 
 def sizes_of(profile: Profile) -> list[Size]:
-    """Returns the sizes that a tile may have. In block formats tiles consist of whole blocks, so that no two tiles
-    share a block.
-    """
+    """Returns the sizes that a tile may have; in block formats tiles consist of whole blocks and share none."""
     most, colour = profile.tile + 1, profile.colour
     code = first_block_code(colour)
     most_texels = min(most, code)
@@ -118,9 +113,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves that gives the smallest texture. Returns this width and the texture's rows and
-    columns.
-    """
+    """Finds the width of shelves for the smallest texture; returns this width and the texture's rows and columns."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -178,18 +171,15 @@ def composed(
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rows [n, ny, 1] and columns [n, 1, nx] of all texels of n rectangles, given their first texels (x, y)
-    [n, 2].
-    """
+    """Returns the rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n,
+    2]."""
     row = first[:, 1, None, None] + np.arange(ny)[:, None]
     return row, first[:, 0, None, None] + np.arange(nx)
 
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
     """Chooses the size of each tile, int [T], for the least sum of errors, float64 [sizes, T], within a budget of bits;
-    each bit must save an error of at least `least`. If even the cheapest sizes exceed the budget, all tiles get the
-    cheapest.
-    """
+    each bit must save an error of at least `least`. If even the cheapest exceed the budget, all tiles get them."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
@@ -216,8 +206,7 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 class _Run:
     """The places of the rectangles of one size. The first `beside` rectangles start at (x, y) on a shelf shared with
     another size; all others fill separate shelves of `each` rectangles from y = `below` on. `widest` is the right end
-    of all of them.
-    """
+    of all of them."""
 
     beside: int
     x: int
@@ -229,9 +218,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Kinds:
-    """The different sizes of rectangles, sorted by height and then width, largest first, and the number of rectangles
-    of each size.
-    """
+    """The different sizes of rectangles, by falling height and then width, and the number of rectangles of each."""
 
     size: np.ndarray
     count: np.ndarray
@@ -243,9 +230,8 @@ class _Kinds:
         return cls(size[order], count[order])
 
     def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Places the rectangles of each size on shelves of a width; returns the places and the total height of the
-        shelves.
-        """
+        """Places the rectangles of each size on shelves of a width; returns the places and the shelves' total
+        height."""
         runs, x, y, height = [], 0, 0, 0
         for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
             each = width // w
@@ -263,8 +249,7 @@ class _Kinds:
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Packs rectangles, int [R, 2] widths and heights, on shelves of one width, in order of height; each shelf is as
-    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the total height of the shelves.
-    """
+    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the total height of the shelves."""
     first = np.zeros((len(sizes), 2), np.int64)
     if not len(sizes):
         return first, 0
