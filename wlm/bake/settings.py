@@ -43,7 +43,7 @@ class Daylight(_Settings):
     """Sun and sky by solar time, from Mitsuba's `sunsky` (Hosek and Wilkie 2012, 2013).
 
     Attributes:
-        latitude: Degrees, north positive.
+        latitude: Latitude in degrees, north positive.
         day: Day of the year, 1 to 366.
         north: Degrees by which north is turned from -z towards -x.
         turbidity: Turbidity of the air: 1 is clear air, 10 is haze.
@@ -117,7 +117,7 @@ class LightmapSettings(_Settings):
         resolution: Width and height in texels.
         uv_set: n of `TEXCOORD_n`; None: 1 if it exists, else 0.
         unwrap: Whether to create new UVs, `TEXCOORD_1`, and write the mesh with them.
-        padding: Texels between new charts.
+        padding: Distance between new charts, in texels.
         supersample: Sample positions along a texel's side; a texel is their mean.
         directional: Whether to bake light directions, too.
     """

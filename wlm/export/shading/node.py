@@ -149,7 +149,7 @@ def _is_constant(item: object) -> bool:
 
 
 def _nodes(body: tuple[Statement, ...]) -> Iterator[Node]:
-    """Iterates over all nodes of all expressions."""
+    """Iterates over all nodes of all expressions in a function body."""
 
     def within(node: Node) -> Iterator[Node]:
         yield node
