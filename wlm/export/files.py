@@ -47,13 +47,8 @@ def write_texture(folder: Path, name: str, texture: Texture, ending: str | None 
     else:
         write_ktx2(made, content, *size, texture.fmt, mips=texture.mips)
     file = made if ending is None else made.rename(folder / (name + ending))
-    return texture_entry(texture, file.name)
-
-
-def texture_entry(texture: Texture, file: str) -> dict[str, Any]:
-    """Returns the entry of a texture's file for the folder's index."""
     return {
-        "file": file,
+        "file": file.name,
         "format": texture.fmt,
         "width": texture.width,
         "height": texture.height,

@@ -133,13 +133,7 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
     """Computes the shader's tables of some hours.
 
-    A table has four floats for F_uvt: its slices before and after tau, the share of the second, and the columns of the
-    grid; the same for F_ut and F_vt, and 0. Then `record_fours` groups of four for each tile of the grid:
-
-        0    code, index among the images of its textures, start of its network, share of the second frame
-        1    code 0: its colour; 1 and 2: shift scale; 3: the least colour, and the layer of the first frame
-        2    code 1 and 2: spread scale; 3: the greatest colour
-        3    code 1 and 2: bias of the first layer, with the encoded time in it; 3: in two, the second frame
+    The text `hours` of `_ABOUT` describes a table; the fourth number of the first four is the columns of the grid.
 
     Args:
         model: The sheet.

@@ -163,10 +163,7 @@ def load(
 
     A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
 
-    `set.json` is an object with `width`, `height` and `lightmaps` (a list of `{"time_hours", "file"}`), and may have
-    `name`, `period_hours`, `mask` (the name of a PNG, or "alpha"; without it all texels are valid) and `mesh` (the name
-    of a glTF or OBJ file, which only `evaluate` reads). Other keys are ignored. Names of files are relative to it. With
-    `layers` and `atlases` it describes several layers of several atlases (docs/formats.md).
+    The keys of a `set.json` are described in docs/formats.md. Names of files are relative to it.
 
     The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are read in natural order of their names
     ("2" before "10"). Without `times`, the hours are read from the names if every name ends like `_18_55h`, `_18.55h`,
@@ -210,14 +207,8 @@ def load(
             if valid is None:
                 valid = _valid(listing, atlas, layer, stack, chosen)
                 mask_from = "the alpha of the light; --mask all takes all" if stack.alpha is not None else str(chosen)
-            states = _States(
-                [state[atlas.name, layer.name].label for state in listing.states],
-                stamps,
-                period,
-                str(listing.where),
-                mask_from,
-                listing.warn_order,
-            )
+            labels = [state[atlas.name, layer.name].label for state in listing.states]
+            states = _States(labels, stamps, period, str(listing.where), mask_from, listing.warn_order)
             for sheet, frames in stack.frames.items():
                 mesh = None if sheet.linear else atlas.mesh
                 sheets[sheet] = states.checked(listing.name, sheet, frames, valid, stack.warnings, mesh)
@@ -396,8 +387,8 @@ class _Reader:
         first = sources[0]
         pixels, names = _read(first, layer)
         has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
-        stack = self._stack(atlas, layer, pixels, names, has_alpha, first)
         size, known = pixels.shape[:2], names
+        stack = self._stack(atlas, layer, size, names, has_alpha, first.path)
 
         def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
             place, source = self._place[index], sources[index]
@@ -432,19 +423,19 @@ class _Reader:
         self,
         atlas: AtlasInfo,
         layer: LayerInfo,
-        pixels: np.ndarray,
+        size: tuple[int, int],
         names: tuple[str, ...],
         alpha: bool,
-        source: Source,
+        first: Path,
     ) -> _Stack:
-        """Allocates memory for a layer, given its first picture."""
+        """Allocates memory for a layer, given the size and the channels of its first picture."""
         channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
         if missing := [channel for channel in channels if channel not in names]:
             found = ", ".join(names)
-            raise WlmError(f"{source.path}: layer {layer.name}: expected a channel {missing[0]}, found {found}")
-        size, where = pixels.shape[:2], self._listing.where
+            raise WlmError(f"{first}: layer {layer.name}: expected a channel {missing[0]}, found {found}")
+        where = self._listing.where
         if atlas.size not in (None, size):
-            raise WlmError(f"{source.path}: is {_size(size)}, but {where} states {_size(atlas.size)}")
+            raise WlmError(f"{first}: is {_size(size)}, but {where} states {_size(atlas.size)}")
         sheets = sheets_of(atlas.name, layer.name, channels, layer.encoding)
         self._sizes |= dict.fromkeys(sheets, size)
         check_sheets(str(where), self._sizes)

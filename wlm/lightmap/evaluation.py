@@ -191,7 +191,9 @@ def evaluate(
     # Texels of one sheet of each atlas: layers share an area.
     areas = {sheet.atlas: _area(own, lightmaps.sheets[sheet].mask) for sheet, own in reversed(model.sheets.items())}
     texels = sum(areas.values()) * len(model.times)
-    layers = dict.fromkeys(sheet.layer for sheet in model.sheets)
+    layers: dict[str, list[np.ndarray]] = {}
+    for sheet, report in reports.items():
+        layers.setdefault(sheet.layer, []).append(report.psnr_by_tile.ravel().repeat(len(sheet.channels)))
     weights = [len(sheet.channels) for sheet in reports]
     return Report(
         **{name: _mean([getattr(report, name) for report in reports.values()], weights) for name in MEANS},
@@ -204,7 +206,7 @@ def evaluate(
         seconds=time.perf_counter() - start,
         profile=model.profile.name,
         sheets=reports,
-        psnr_by_layer={layer: _layer_psnr(reports, layer) for layer in layers},
+        psnr_by_layer={layer: float(nanmean(np.concatenate(grids))) for layer, grids in layers.items()},
         warnings=list(dict.fromkeys(warnings)),
     )
 
@@ -246,24 +248,8 @@ def _mean(values: Sequence[float], weights: Sequence[int]) -> float:
     return float(np.average(*counted.T[:1], weights=counted[:, 1])) if len(counted) else float("nan")
 
 
-def _layer_psnr(reports: dict[Sheet, SheetReport], layer: str) -> float:
-    """Returns the mean PSNR of a layer, see `Report`."""
-    grids = [
-        report.psnr_by_tile.ravel().repeat(len(sheet.channels))
-        for sheet, report in reports.items()
-        if sheet.layer == layer
-    ]
-    return float(nanmean(np.concatenate(grids)))
-
-
 def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.ndarray) -> float:
-    """Computes the mean PSNR over the tiles of one lightmap of a sheet, dB: `SheetReport.psnr_by_time` of its hour.
-
-    Args:
-        model, lightmaps: The sheet and its input, of one size.
-        number: Number of the lightmap in the sheet.
-        decoded: float32 [H, W, 3], the decoded map at its hour.
-    """
+    """Computes the mean PSNR over the tiles of a decoded map [H, W, 3] against the input's lightmap of a number, dB."""
     mask, name = lightmaps.mask & _stored(model), f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
     return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
@@ -275,11 +261,8 @@ def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu"
     `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB. The lines
     have the number of texels and the largest loss.
     """
-    lines = []
-    for sheet, own in model.sheets.items():
-        if not sheet.linear and own.kind.any():
-            lines += _lost_light(own, lightmaps.sheets[sheet], device)
-    return lines
+    lit = [sheet for sheet, own in model.sheets.items() if not sheet.linear and own.kind.any()]
+    return [line for sheet in lit for line in _lost_light(model.sheets[sheet], lightmaps.sheets[sheet], device)]
 
 
 def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[str]:
@@ -308,15 +291,10 @@ def _place(tile: int, stamp: float) -> str:
 
 
 def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
-    """Returns bits per texel and time: `size * 8 / (area * times)`.
+    """Returns the bits per texel and time of a number of bytes, given the valid texels of the input, bool [H, W].
 
     The area is the whole map with the gaps between charts, as the file replaces textures of that size. If the model
     only holds some of the tiles with a valid texel, it is the part of the map that these cover.
-
-    Args:
-        model: The sheet's model.
-        mask: Valid texels of the input, bool [H, W].
-        size: Bytes.
     """
     return size * 8 / (_area(model, mask) * len(model.times))
 
@@ -337,16 +315,11 @@ def count_kinds(model: SheetModel) -> dict[str, int]:
 def _stored(model: SheetModel) -> np.ndarray:
     """Returns the texels of the tiles that are not empty, bool [H, W]."""
     grid = model.grid
-    tiles = (model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols)
-    return tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: grid.height, : grid.width]
+    return grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
 
 
 def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
-    """Checks that a sheet fits a model.
-
-    Returns:
-        bool [H, W], the valid texels of stored tiles: the texels that are scored.
-    """
+    """Checks that a sheet fits a model; returns the texels that are scored, the valid ones of stored tiles, [H, W]."""
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
         raise WlmError(
@@ -402,11 +375,7 @@ def _sheet_report(
 
 def _left_out(model: SheetModel, lightmaps: SheetFrames, summary: Summary) -> dict[str, int]:
     """Counts tiles times times without a score by reason; the metrics count a masked tile as one of few texels."""
-    grid = model.grid
-    valid = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
-    valid[: grid.height, : grid.width] = lightmaps.mask
-    valid = valid.reshape(grid.rows, TILE, grid.cols, TILE).any(axis=(1, 3)).ravel()
-    times = len(model.times)
+    valid, times = model.grid.tiles_with(lightmaps.mask).ravel(), len(model.times)
     empty = int((~valid).sum()) * times
     not_held = int((valid & (model.kind == TileKind.EMPTY)).sum()) * times
     return {

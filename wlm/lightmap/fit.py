@@ -153,21 +153,13 @@ def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
 
 @dataclass(frozen=True, eq=False)
 class _Facts:
-    """Numbers that are stored of a tile beside its maps and network, rounded as in the file (section 4).
-
-    Attributes:
-        kind: Its kind.
-        scale: [T, 3] of tiles with maps: codes, of a static tile half floats.
-        peak: uint8 [T] of these, codes of the largest colour.
-        affine: [2, 3] of these, shift and spread.
-        constant: float64 [T, 3], radiance of a constant tile.
-    """
+    """Numbers that are stored of a tile beside its maps and network, rounded as in the file (section 4)."""
 
     kind: TileKind
-    scale: np.ndarray | None = None
-    peak: np.ndarray | None = None
-    affine: np.ndarray | None = None
-    constant: np.ndarray | None = None
+    scale: np.ndarray | None = None  # [T, 3] of tiles with maps: codes, of a static tile half floats
+    peak: np.ndarray | None = None  # uint8 [T] of tiles with maps, codes of the largest colour
+    affine: np.ndarray | None = None  # [2, 3] of tiles with maps, shift and spread
+    constant: np.ndarray | None = None  # float64 [T, 3], radiance of a constant tile
 
 
 class SheetFit:
@@ -211,6 +203,8 @@ class SheetFit:
         kind[self.index] = self.kinds
         table = part_table(fitted, kind, times)
         arrays = {name: np.zeros(part.shape, part.dtype) for name, part in table.items() if name != "constant"}
+        values = np.array([tile.constant for tile in facts if tile.kind == TileKind.CONSTANT]).reshape(-1, times, 3)
+        half = values.astype(np.float16)
         self.model = SheetModel(
             name=lightmaps.name,
             width=grid.width,
@@ -220,7 +214,7 @@ class SheetFit:
             profile=fitted,
             mask=lightmaps.mask,
             kind=kind,
-            constant=_constants(facts, times),
+            constant=half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32),
             **arrays,
         )
         self._mapped = np.flatnonzero(np.isin(self.kinds, (TileKind.STATIC, TileKind.DYNAMIC)))
@@ -241,12 +235,7 @@ class SheetFit:
                 meter.report(i + 1)
 
     def batches(self, first: int, most: int | None = None) -> list[Batch]:
-        """Returns batches of `BATCH_TEXELS`, of at most `most` tiles and at least one; dynamic tiles come first.
-
-        Args:
-            first: Number of the first batch.
-            most: Largest number of tiles; None: no limit.
-        """
+        """Returns batches of `BATCH_TEXELS`, of 1 to `most` tiles, numbered from `first`; dynamic tiles come first."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
         size = size if most is None else min(size, most)
         result: list[Batch] = []
@@ -345,10 +334,3 @@ def _classify(
         if len(facts) % _LOOK == 0 and meter.due(len(facts)):
             meter.report(len(facts))
     return facts
-
-
-def _constants(facts: Sequence[_Facts], times: int) -> np.ndarray:
-    """Returns the radiance of constant tiles, [N_c, T, 3]: half floats, or float32 if one would be over 1% off."""
-    values = np.array([tile.constant for tile in facts if tile.kind == TileKind.CONSTANT]).reshape(-1, times, 3)
-    half = values.astype(np.float16)
-    return half if (np.abs(half - values) <= _CONSTANT_ERROR * values).all() else values.astype(np.float32)

@@ -27,11 +27,7 @@ class Gaps:
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Gaps:
-        """Finds the invalid texels within `wlm.texels.REACH` of a valid one.
-
-        Args:
-            mask: bool [H, W], true where a texel is valid.
-        """
+        """Finds the invalid texels within `wlm.texels.REACH` of a valid one, given the valid texels [H, W]."""
         return cls(*near_gaps(mask))
 
     def fill(self, image: np.ndarray) -> None:

@@ -6,7 +6,7 @@ of atlases and layers; the plain set of one lightmap for each time has one atlas
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -132,13 +132,13 @@ def list_set(
         listing = _parse(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
+    if layers is None:
+        return listing
     names = [layer.name for layer in listing.layers]
-    for name in layers or ():
-        if name not in names:
-            raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got {name!r}")
-    if layers is not None and not layers:
-        raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got none")
-    return replace(listing, layers=tuple(layer for layer in listing.layers if layers is None or layer.name in layers))
+    wrong = [repr(name) for name in layers if name not in names] or ([] if layers else ["none"])
+    if wrong:
+        raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got {wrong[0]}")
+    return replace(listing, layers=tuple(layer for layer in listing.layers if layer.name in layers))
 
 
 def natural(name: str) -> list[str | int]:
@@ -186,11 +186,6 @@ def _check_count(where: Path, items: Sequence[object], times: Sequence[float], n
         raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected one each")
 
 
-def _plain_states(files: Iterable[Path]) -> list[dict[tuple[str, str], Source]]:
-    """Returns the states of a set with one picture for each time."""
-    return [{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files]
-
-
 def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
     """Lists a folder of lightmaps without a `set.json`; a "mask.png" in it is the mask."""
     try:
@@ -218,7 +213,7 @@ def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
         period=None,
         layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
         atlases=(AtlasInfo(LIGHT.atlas, str(mask) if mask.is_file() else "all"),),
-        states=_plain_states(files),
+        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files],
         labels=[file.name for file in files],
         # Names do not have to sort by their hours ("_5.5h" before "_5.45h"): only times from the caller have an order.
         warn_order=times is not None,
@@ -301,7 +296,9 @@ def _labelled(path: Path, *place: int) -> Source:
 
 def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
     """Reads a `set.json`."""
-    content = _read_set(path)
+    content = read_json_file(path, "the set")
+    if not isinstance(content, dict):
+        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
     plain = "layers" not in content
     if plain:
         layers = (LayerInfo(LIGHT.layer, LIGHT.encoding),)
@@ -320,7 +317,9 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
     if content.get("name") is not None:
         name = _field(path, content, "name", "", is_text, "a name")
     if content.get("period_hours") is not None:
-        period = float(_field(path, content, "period_hours", "", _is_positive, "a number above 0"))
+        period = float(
+            _field(path, content, "period_hours", "", lambda value: _is_number(value) and value > 0, "a number above 0")
+        )
     if len(entries) > TIMES:
         raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
     states, stamps, found = [], [], {}
@@ -334,7 +333,14 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
             source = _source(path, entry["file"], f"{place}.file", found, trust)
             states.append({(LIGHT.atlas, LIGHT.layer): replace(source, label=source.path.name)})
         else:
-            states.append(_state(path, entry, place, layers, atlases, found, trust))
+            files = _field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
+            states.append({})
+            for atlas in atlases:
+                of_atlas = _field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
+                for layer in layers:
+                    at, expected = f"{place}.files.{atlas.name}.", "a file, or an object (file, slice, slices)"
+                    value = _field(path, of_atlas, layer.name, at, _is_source, expected)
+                    states[-1][atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
         if times is None:
             stamps.append(float(_field(path, entry, "time_hours", f"{place}.", _is_number, "a finite number")))
     if times is not None:
@@ -350,27 +356,6 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         states=states,
         labels=labels or [f"lightmaps[{i}]" for i in range(len(states))],
     )
-
-
-def _state(
-    path: Path,
-    entry: dict[str, Any],
-    place: str,
-    layers: tuple[LayerInfo, ...],
-    atlases: tuple[AtlasInfo, ...],
-    found: dict[str, Path],
-    trust: bool,
-) -> dict[tuple[str, str], Source]:
-    """Reads the pictures of one time of a set with layers."""
-    files = _field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
-    state = {}
-    for atlas in atlases:
-        of_atlas = _field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
-        for layer in layers:
-            at = f"{place}.files.{atlas.name}."
-            value = _field(path, of_atlas, layer.name, at, _is_source, "a file, or an object (file, slice, slices)")
-            state[atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
-    return state
 
 
 def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> dict[str, Any]:
@@ -429,10 +414,7 @@ def _mesh(path: Path, holder: dict[str, Any], place: str, trust: bool) -> Path |
 
 
 def _source(path: Path, value: Any, place: str, found: dict[str, Path], trust: bool) -> Source:
-    """Reads a picture: the name of a file, or an object that chooses a slice of one.
-
-    `found` holds the files that were named before, so that links are followed once.
-    """
+    """Reads a picture: a file, or a slice of one. `found` holds the files named before: links are followed once."""
     options = {"file": value} if isinstance(value, str) else value
     file = _field(path, options, "file", f"{place}.", is_text, "the name of a picture")
     if file not in found:
@@ -453,24 +435,8 @@ def _is_source(value: object) -> bool:
     return is_text(value) or isinstance(value, dict)
 
 
-def _read_set(path: Path) -> dict[str, Any]:
-    """Reads a `set.json`.
-
-    Raises:
-        WlmError: It cannot be read, or is not a JSON object.
-    """
-    content = read_json_file(path, "the set")
-    if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
-    return content
-
-
 def _field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
-    """Returns the value of a field of an object at a place of the file, such as `lightmaps[0].`, if `ok` accepts it.
-
-    Raises:
-        WlmError: The field is missing or wrong; the line names the place, the key and the expected values.
-    """
+    """Returns the value of a field of an object at a place of the file, such as `lightmaps[0].`, if `ok` accepts it."""
     if key not in holder:
         raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
     if not ok(holder[key]):
@@ -492,11 +458,6 @@ def _is_number(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) <= 1e300
-
-
-def _is_positive(value: object) -> bool:
-    """Returns whether a value is such a number above 0."""
-    return _is_number(value) and value > 0
 
 
 def _is_list(value: object) -> bool:

@@ -1,10 +1,9 @@
 """Decoding to 32 bits a texel at run time: all data stays on the device, and a decode only launches kernels.
 
 `wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
-the
-tiles of one kind of one sheet, with gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` for wide networks, an
-`ExactDecoder` for static tiles, and a `FrameDecoder`. `wlm.lightmap.runtime_texture` puts them together to a texture of
-the map.
+the tiles of one kind of one sheet, with gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` for wide
+networks, an `ExactDecoder` for static tiles, and a `FrameDecoder`. `wlm.lightmap.runtime_texture` puts them together to
+a texture of the map.
 """
 
 from __future__ import annotations
@@ -77,7 +76,15 @@ class RuntimeDecoder:
 class _MapDecoder(RuntimeDecoder):
     """Static or dynamic tiles."""
 
-    def __init__(self, model: SheetModel, device: str, gelu: str | None, kind: TileKind, shared: bool) -> None:
+    def __init__(
+        self,
+        model: SheetModel,
+        device: str = "cpu",
+        gelu: str | None = None,
+        kind: TileKind = TileKind.DYNAMIC,
+        shared: bool = False,
+    ) -> None:
+        """Uploads the tiles of one kind, STATIC or DYNAMIC; other arguments and errors as for `StripDecoder`."""
         device, self.gelu = interop.check_device(device), gelu_of(model, gelu)
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
@@ -172,17 +179,6 @@ class MatrixDecoder(_ScratchDecoder):
 
 class ExactDecoder(_MapDecoder):
     """The plain path of static or dynamic tiles: one thread decodes one texel, in training's order of operations."""
-
-    def __init__(
-        self,
-        model: SheetModel,
-        device: str = "cpu",
-        gelu: str | None = None,
-        kind: TileKind = TileKind.DYNAMIC,
-        shared: bool = False,
-    ) -> None:
-        """Uploads the tiles of one kind, STATIC or DYNAMIC; other arguments and errors as for `StripDecoder`."""
-        super().__init__(model, device, gelu, kind, shared)
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
         self._tiles.launch(state, self._rows, 1 + self.shared, out)

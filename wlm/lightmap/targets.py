@@ -35,15 +35,9 @@ class Targets:
         metric_weight: float,
         peak: float | None = None,
     ) -> None:
-        """Normalises and weights colour.
+        """Normalises and weights colour [N, T, 128, 128, 3] in gamma space, valid in a mask [N, 128, 128].
 
-        Args:
-            number: int [N].
-            colour: float32 [N, T, 128, 128, 3], in gamma space.
-            mask: bool [N, 128, 128], valid texels.
-            scale: float32 [N, T, 3], as rounded for the file.
-            affine: float32 [N, 2, 3], shift and spread, as rounded for the file.
-            gamma, metric_weight, peak: As in `Profile`.
+        `scale` [N, T, 3] and `affine` [N, 2, 3], the shift and the spread, are float32, as rounded for the file.
         """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)

@@ -48,15 +48,7 @@ class TileGrid:
 
     @classmethod
     def of(cls, height: int, width: int) -> TileGrid:
-        """Makes the grid of a map.
-
-        Args:
-            height: In texels, at least 1.
-            width: In texels, at least 1.
-
-        Raises:
-            WlmError: A size is below 1 or larger than `wlm.texels.check_size` allows.
-        """
+        """Makes the grid of a map, whose size must be one that `wlm.texels.check_size` allows."""
         check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
@@ -66,11 +58,7 @@ class TileGrid:
         return self.rows * self.cols
 
     def origin(self, index: int) -> tuple[int, int]:
-        """Returns the row and the column of the first texel of a tile.
-
-        Args:
-            index: Number of the tile in [0, count).
-        """
+        """Returns the row and the column of the first texel of the tile with a number in [0, count)."""
         if not 0 <= index < self.count:
             raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
         row, column = divmod(int(index), self.cols)
@@ -80,6 +68,16 @@ class TileGrid:
         """Returns the rows and the columns of the map that a tile covers."""
         y, x = self.origin(index)
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
+
+    def tiles_with(self, mask: np.ndarray) -> np.ndarray:
+        """Returns the tiles with a texel in a mask [H, W], bool [rows, columns]."""
+        whole = np.zeros((self.rows * TILE, self.cols * TILE), bool)
+        whole[: self.height, : self.width] = mask
+        return whole.reshape(self.rows, TILE, self.cols, TILE).any(axis=(1, 3))
+
+    def texels_of(self, tiles: np.ndarray) -> np.ndarray:
+        """Returns the texels of chosen tiles [rows, columns], bool [H, W]."""
+        return tiles.repeat(TILE, 0).repeat(TILE, 1)[: self.height, : self.width]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,15 +164,7 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
 
 def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
-    """Cuts tiles out of a sheet without a copy.
-
-    Args:
-        lightmaps: The sheet, frames `[T, H, W, 3]`.
-        index: `[N]` int64, numbers of the tiles.
-
-    Raises:
-        WlmError: A number is outside the grid or given twice, or there is none.
-    """
+    """Cuts the tiles with the numbers `[N]` out of a sheet without a copy; errors as for `check_index`."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     check_index(index, grid)
     windows = [grid.window(tile) for tile in index]
@@ -182,12 +172,7 @@ def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
 
 
 def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns the valid texels of a tile, bool [128, 128]; false past the map's end.
-
-    Args:
-        mask: bool [H, W], true where a texel is valid.
-        number: Number of the tile in the grid.
-    """
+    """Returns the texels of a mask [H, W] in the tile with a number, bool [128, 128]; false past the map's end."""
     return _whole(mask[TileGrid.of(*mask.shape).window(number)])
 
 
@@ -255,7 +240,6 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
 
     Returns:
         `TileKind` of each tile, `[N]` int64.
-
     """
     means = channel_means(tiles.colour, tiles.mask)
     kinds = np.empty(len(tiles.index), np.int64)
@@ -273,11 +257,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
 
 
 def check_index(index: np.ndarray, grid: TileGrid) -> None:
-    """Checks numbers of tiles, `[N]`.
-
-    Raises:
-        WlmError: There is no number, a number is outside the grid, or a number is given twice.
-    """
+    """Raises `WlmError` unless numbers of tiles, `[N]`, are in the grid and distinct, and there is at least one."""
     if not index.size:
         raise WlmError("tiles: expected at least one tile, got none")
     for tile in (index.min(), index.max()):
@@ -333,14 +313,9 @@ def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -
 
 
 def _is_static(
-    colour: np.ndarray,  # [T, 128, 128, 3]
-    valid: np.ndarray,  # [128, 128]
-    means: np.ndarray,  # [T, 3]
-    gamma: float,
-    budget_db: float,
-    set_peak: float | None,
+    colour: np.ndarray, valid: np.ndarray, means: np.ndarray, gamma: float, budget_db: float, set_peak: float | None
 ) -> bool:
-    """Returns whether one colour per time, multiplied by one pattern, meets the budget at every time."""
+    """Returns whether one colour per time [T, 3], multiplied by one pattern, meets the budget at every time."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
     for frame, mean in zip(colour, means, strict=True):
         linear = frame[valid].astype(np.float64) ** gamma

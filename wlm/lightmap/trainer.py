@@ -35,11 +35,9 @@ CPU_LANES = 2
 
 
 def _padded(count: int) -> int:
-    """Returns the length of an optimiser's tensor of `count` numbers.
-
-    Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
-    CPUs: without a remainder, a tile is the same in any batch.
-    """
+    """Returns the length of an optimiser's tensor of `count` numbers."""
+    # Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
+    # CPUs: without a remainder, a tile is the same in any batch.
     return -(-count // _VECTOR) * _VECTOR
 
 
@@ -161,9 +159,14 @@ class Trainer:
         wrap = interop.to_warp
         self._moments, self._adams = {}, {}
         if self._cuda:
-            adams = [self._moments_of(*named) for named in (("maps", self.maps), *self._named_nets())]
+            named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
+            adams = [self._moments_of(*item) for item in named.items()]
         else:
-            self._adams = self._torch_adams([stored_hidden, stored_output])
+            maps = self.maps.detach().requires_grad_()
+            maps.grad = self.maps_grad
+            options = {"lr": 1.0, "betas": (_MOMENTUM, self._decay), "eps": _ADAM_EPSILON, "fused": True}
+            for name, values in (("adam_maps", [maps]), ("adam_net", [stored_hidden, stored_output])):
+                self._adams[name] = torch.optim.Adam(values, **options)
 
         vec = self._kernels.net.vec_hidden
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
@@ -199,9 +202,6 @@ class Trainer:
             self._maps_sums = (wrap(self._acc), *maps)
             self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
 
-    def _named_nets(self) -> tuple[tuple[str, torch.Tensor], ...]:
-        return ("hidden", self.hidden), ("output", self.output)
-
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
         """Returns Adam on a GPU for one array of parameters, with moments of 0."""
         adam = gather.Adam()
@@ -212,14 +212,6 @@ class Trainer:
             self._moments[f"adam_{name}.{key}"] = moments
             setattr(adam, field, interop.to_warp(moments))
         return adam
-
-    def _torch_adams(self, nets: list[torch.Tensor]) -> dict[str, torch.optim.Adam]:
-        """Returns torch's Adam, for the CPU."""
-        maps = self.maps.detach().requires_grad_()
-        maps.grad = self.maps_grad
-        betas = (_MOMENTUM, self._decay)
-        options = {"lr": 1.0, "betas": betas, "eps": _ADAM_EPSILON, "fused": True}
-        return {"adam_maps": torch.optim.Adam([maps], **options), "adam_net": torch.optim.Adam(nets, **options)}
 
     def _upload(self, targets: Targets, seed: int, gamma: float, slices: int) -> None:
         tau, encoding = encode_time(self.axis)
@@ -352,12 +344,7 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """Returns the maps and networks as the file holds them.
-
-        Returns:
-            `net` and `uv`, and for dynamic tiles `uvt`, `ut` and `vt`, as in `SheetModel`; `net` is `net_static` of
-            static tiles.
-        """
+        """Returns the maps and networks by name, as in `SheetModel`; the networks of static tiles are also `net`."""
         nets = self.hidden.detach(), self.output.detach()
         if self._integers:
             nets = self._on_levels
@@ -480,15 +467,7 @@ class Fitter:
         self._trainer: Trainer | None = None
 
     def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
-        """Begins a batch, or continues it.
-
-        Args:
-            job: Its tiles.
-            state: State of the batch at an earlier step; None: from the first step.
-
-        Raises:
-            ValueError: The state is not of this batch.
-        """
+        """Begins a batch, or continues it from its state at an earlier step; a state of another one is a ValueError."""
         self.close()
         options = job.dynamic, self._seed, self._device, self._track
         self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)

@@ -2,20 +2,14 @@
 
 The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels at the stored times. A renderer reads
 elsewhere: it filters, so that texels of the gaps between charts and of neighbouring tiles count too, at any hour. The
-scores here are over the same tiles and times, relative to the same range, that of the tile at that time:
+scores here are over the same tiles and times, relative to the same range, that of the tile at that time. They are
+described in docs/lightmap.md and at `ShownScore`. Random points and places are the same in every run, and reads are
+clamped at the ends of the map.
 
-- `seen`: bilinear reads at 4 random points of each valid texel, the same in every run, from the decoded map and from
-  the original whose gaps hold the nearest valid texel. Both are clamped at the ends of the map.
-- `ring`: the texels of gaps that touch a valid texel, corners included, against the same original.
-- `between`: the valid texels half-way between neighbouring stored times, against the mean of both originals (eq. 2 of
-  neural-dynamic-gi); in a set with a period also between the last time and the first.
-- `border`: the RMS error of the points of `seen` that read two tiles or more, divided by that of the other points of
-  the same tiles. Errors are relative to the range of the tile that a texel belongs to, so that a dark tile beside a
-  bright one is not blamed for the error of the other.
-- `flicker`: two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
-  times. With D the decoded and R the original light, the mean over valid texels, tiles and steps of
+`flicker` takes two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
+times. With D the decoded and R the original light, it is the mean over valid texels, tiles and steps of
 
-      max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
+    max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
 
 Views: cameras are spread evenly on a sphere around the mesh of the set (`wlm.ops.views`), each at one of its times in
 turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the light of the lightmap at its
@@ -41,7 +35,7 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry, read_geometry
 from wlm.interop import check_device
 from wlm.lightmap.data import SheetFrames
-from wlm.lightmap.tiles import TILE, TileGrid
+from wlm.lightmap.tiles import TILE, TileGrid, valid_texels
 from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, psnr_from_mse
 from wlm.metrics.tiled import nanmean
 from wlm.ops import raster
@@ -270,7 +264,8 @@ class Tally:
         self._add_points(index, error, metrics)
         squared = self._ring.sums(np.square(ring, dtype=np.float64))
         counted = metrics.scored & (self._ring.count >= MIN_VALID_TEXELS)
-        self._rings[index] = _psnr(squared / (3 * self._ring.count.clip(1)), metrics.range, counted)
+        for at in zip(*np.nonzero(counted), strict=True):
+            self._rings[index][at] = psnr_from_mse(squared[at] / (3 * self._ring.count[at]), metrics.range[at])
         if self._views is not None:
             self._views.add(index, filled, decoded)
 
@@ -317,8 +312,8 @@ class Tally:
     def _left_out(self) -> np.ndarray | None:
         """bool [H, W], the tiles whose valid texels are not scored; None if there are none."""
         grid = self._grid
-        tiles = _tiles_with(self._lightmaps.mask, grid) & ~_tiles_with(self._mask, grid)
-        return tiles.repeat(TILE, 0).repeat(TILE, 1)[: grid.height, : grid.width] if tiles.any() else None
+        tiles = grid.tiles_with(self._lightmaps.mask) & ~grid.tiles_with(self._mask)
+        return grid.texels_of(tiles) if tiles.any() else None
 
     def _add_points(self, index: int, error: np.ndarray, metrics: FrameMetrics) -> None:
         """Scores the reads at points: a read of the difference is the difference of the reads."""
@@ -329,10 +324,7 @@ class Tally:
         spans = np.pad(spans[: grid.height, : grid.width], ends, mode="edge")
         for row, column in np.argwhere(metrics.scored):
             y, x = row * TILE, column * TILE
-            valid = np.zeros((TILE, TILE), bool)
-            inside = self._mask[y : y + TILE, x : x + TILE]
-            valid[: inside.shape[0], : inside.shape[1]] = inside
-            own = valid.ravel().repeat(POINTS)
+            own = valid_texels(self._mask, row * grid.cols + column).ravel().repeat(POINTS)
             box = np.s_[y : y + TILE + 2, x : x + TILE + 2]
             reads = read @ padded[box].reshape(-1, 3)
             squared = np.square(reads[own], dtype=np.float64).mean(1)
@@ -420,16 +412,3 @@ def _points() -> tuple[csr_array, np.ndarray]:
     read = (weight.astype(np.float32).ravel(), texel.ravel(), np.arange(0, texel.size + 1, 4))
     sides = np.stack([top < 0, top + 1 == TILE, left < 0, left + 1 == TILE])
     return csr_array(read, shape=(len(texel), side * side)), sides
-
-
-def _tiles_with(mask: np.ndarray, grid: TileGrid) -> np.ndarray:
-    """Returns the tiles with a texel in the mask, bool [rows, columns]."""
-    whole = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
-    whole[: grid.height, : grid.width] = mask
-    return whole.reshape(grid.rows, TILE, grid.cols, TILE).any(axis=(1, 3))
-
-
-def _psnr(mse: np.ndarray, span: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Returns `psnr_from_mse` of tiles [rows, columns]; NaN if a tile is not counted."""
-    pairs = zip(mse.flat, span.flat, counted.flat, strict=True)
-    return np.array([psnr_from_mse(m, s) if c else math.nan for m, s, c in pairs]).reshape(mse.shape)

@@ -46,7 +46,7 @@ class Training:
     """Result of a training.
 
     Attributes:
-        finished: Whether it is finished; otherwise it ran out of time and can be resumed.
+        finished: Whether all rounds are done; otherwise the time ran out and the training can be resumed.
         best: Validation PSNR of the saved network; NaN if none has been validated.
         score: The last validation, or None.
         steps, skipped: Numbers of steps, and of steps without an update.
@@ -178,7 +178,7 @@ class _Run:
 
     @property
     def late(self) -> bool:
-        """Whether the time is up."""
+        """Whether the time limit of the training has passed."""
         return self.meter.seconds > self.limit
 
     @property
@@ -263,7 +263,7 @@ class _Run:
         return Training(finished, self.best, self.score, step, skipped, self.seconds, self._saved())
 
     def _saved(self) -> SmokeModel | None:
-        """Loads the output; None if it is missing or damaged: the next best network replaces it."""
+        """Loads the network of the output file; None if the file is missing or damaged, and will be replaced."""
         try:
             return load(self.output, SmokeModel.SYSTEM)
         except WlmError:

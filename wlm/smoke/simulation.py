@@ -29,11 +29,7 @@ _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene.
-
-    Args:
-        scene: The scene.
-        device: Result of `wlm.interop.check_device`.
+    """Builds the solver of a scene on a device, a result of `wlm.interop.check_device`.
 
     Raises:
         WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
@@ -82,7 +78,7 @@ def simulate(
 
     The state is saved in the folder every `checkpoint_every` seconds, also within a frame, and when `progress` raises
     KeyboardInterrupt. A resumed simulation gives the same frames: on the CPU to the bit, on a GPU up to the order of
-    atomic sums, and with smoke in bricks up to their threshold.
+    atomic sums, and with the setting `bricks` up to the threshold below which a brick counts as empty.
 
     Args:
         frames: The folder, prepared by `wlm.smoke.data.open_frames`.
@@ -165,7 +161,7 @@ def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
 
 
 def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
-    """Does one step of the smoke, which begins at a time in frames, with the sources that are active then."""
+    """Does the smoke's step that begins at time `frames`, in frame intervals, with the sources that are active then."""
     solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
     solver.step()
 

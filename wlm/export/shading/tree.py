@@ -10,7 +10,7 @@ VECTORS = {
 SCALARS = ("float", "int", "uint", "bool", "void")
 SAMPLERS = ("sampler2D", "usampler2D", "sampler2DArray")
 _TYPES = {*VECTORS, *SCALARS, *SAMPLERS}
-_LEVELS = (
+LEVELS = (
     ("||",),
     ("&&",),
     ("|",),
@@ -260,11 +260,11 @@ class _Reader:
         return Node("choice", "?", (condition, chosen, self.expression()))
 
     def _binary(self, level: int) -> Node:
-        if level == len(_LEVELS):
+        if level == len(LEVELS):
             return self._unary()
         left = self._binary(level + 1)
         self.quiet()
-        while self.word.text in _LEVELS[level]:
+        while self.word.text in LEVELS[level]:
             mark = self.take().text
             left = Node("binary", mark, (left, self._binary(level + 1)))
             self.quiet()

@@ -1,19 +1,34 @@
 """Base class of writers that turn a parsed shader into source text of a shading language."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 
-from wlm.export.shading.tree import SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
+from wlm.export.shading.tree import LEVELS, SAMPLERS, SCALARS, VECTORS, Function, Node, Shader, Statement, Variable
 
-_STRENGTH = {
-    mark: strength
-    for strength, marks in enumerate(
-        (("||",), ("&&",), ("|",), ("^",), ("&",), ("==", "!="), ("<", ">", "<=", ">="), ("<<", ">>"), ("+", "-"))
-    )
-    for mark in marks
-} | dict.fromkeys("*/%", 9)
+_STRENGTH = {mark: strength for strength, marks in enumerate(LEVELS) for mark in marks}
 # Pairs of outer and inner operator that need no brackets in any language, WGSL included.
 _PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")}
+FILTERS = {"textureLod", "textureGrad"}
+"""Functions that read a texture through its filter."""
+
 _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
+
+
+def nodes_of(body: tuple[Statement, ...]) -> Iterator[Node]:
+    """Iterates over all nodes of all expressions."""
+
+    def within(node: Node) -> Iterator[Node]:
+        yield node
+        for part in node.parts:
+            yield from within(part)
+
+    for statement in body:
+        for part in statement.parts:
+            yield from within(part)
+        if statement.variable is not None and statement.variable.value is not None:
+            yield from within(statement.variable.value)
+        for inner in statement.bodies:
+            yield from nodes_of(inner)
 
 
 class Writer(ABC):
@@ -207,19 +222,7 @@ class Writer(ABC):
         return [each for each in self.bound.values() if each.type in SAMPLERS]
 
     @property
-    def filters(self) -> bool:
-        """Whether any texture is read through the filter."""
-
-        def reads(node: Node) -> bool:
-            called = node.kind == "call" and node.text in ("textureLod", "textureGrad")
-            return called or any(map(reads, node.parts))
-
-        def among(body: tuple[Statement, ...]) -> bool:
-            return any(
-                any(map(reads, each.parts))
-                or (each.variable is not None and each.variable.value is not None and reads(each.variable.value))
-                or any(map(among, each.bodies))
-                for each in body
-            )
-
-        return any(among(each.body) for each in self.functions.values())
+    def filters(self) -> list[str]:
+        """Names of the textures that are read through the filter, one for each read."""
+        nodes = (node for function in self.functions.values() for node in nodes_of(function.body))
+        return [node.parts[0].text for node in nodes if node.kind == "call" and node.text in FILTERS]

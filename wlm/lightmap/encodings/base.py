@@ -10,7 +10,7 @@ import numpy as np
 
 from wlm.bundle import Texture
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.tiles import TileKind
 
 
 class DeviceTiles(ABC):
@@ -43,26 +43,11 @@ class DeviceTiles(ABC):
 
     @abstractmethod
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance.
-
-        Args:
-            rows: int32 [k], positions in `numbers`.
-            time: In the unit of the set's times, stored or between.
-
-        Returns:
-            float32 [k, 128, 128, 3]; gaps are not filled.
-        """
+        """Decodes tiles at positions [k] of `numbers` to linear radiance, float32 [k, 128, 128, 3]; gaps stay empty."""
 
     @abstractmethod
     def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles to 8 bits relative to their bounds: radiance = (byte / 255 * bound) ** gamma.
-
-        Args:
-            rows, time: As for `radiance`.
-
-        Returns:
-            uint8 [k, 128, 128, 4]; alpha is 255.
-        """
+        """Decodes tiles to 8 bits, uint8 [k, 128, 128, 4]: radiance = (byte / 255 * bound) ** gamma; alpha is 255."""
 
 
 class Encoding(ABC):
@@ -113,10 +98,8 @@ class Encoding(ABC):
     def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
         """Writes the records of all tiles of this encoding into the shader's tables of some hours.
 
-        Args:
-            sheet: The arrays.
-            times: Stored times, or any times if networks interpolate.
-            records: float32 [times, tiles, fours, 4], written; the first number of each record is set already.
+        Times are stored ones, or any if networks interpolate. `records`, float32 [times, tiles, fours, 4], is written;
+        the first number of each record is set already.
         """
 
 
@@ -147,12 +130,6 @@ def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[
     grid = padded.reshape(-1, across, *images.shape[1:]).swapaxes(1, 2)
     data = np.ascontiguousarray(grid).reshape(grid.shape[0] * grid.shape[1], -1, images.shape[-1])
     return {"data": data, "fmt": fmt, "width": across * width, "height": -(-len(images) // across) * height}
-
-
-def layered(images: np.ndarray, fmt: str) -> Texture:
-    """Arranges tiles at all times, [n, T, rows, columns, bytes], in a texture array with a layer for each time."""
-    made = [side_by_side(images[:, i], fmt, TILE, TILE) for i in range(images.shape[1])]
-    return Texture(**made[0] | {"data": np.stack([layer["data"] for layer in made])}, layers=len(made))
 
 
 def rgba(words: Any) -> np.ndarray:

@@ -22,7 +22,7 @@ from wlm.formats import bc7_modes
 from wlm.formats.bc7 import BLOCK_BYTES, blocks_image
 from wlm.formats.block_reuse import by_block, reuse_in_order
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, layered, rgba
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import BLOCKS, SheetModel
 from wlm.lightmap.profile import Profile
@@ -78,12 +78,7 @@ def choose_frames(
 
 
 def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Finds the blocks of a tile with a texel within `REACH` of a valid one, which filtered reads reach: bool [32, 32].
-
-    Args:
-        mask: bool [H, W], the valid texels of the map.
-        number: Number of the tile in the grid.
-    """
+    """Finds the blocks of a tile within `REACH` of a texel of a mask [H, W], which filtered reads reach, [32, 32]."""
     y, x = TileGrid.of(*mask.shape).origin(number)
     near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
     part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
@@ -225,7 +220,11 @@ class Frames(Encoding):
         return [FrameTiles(sheet, device)] if len(sheet.frames) else []
 
     def textures(self, sheet: SheetModel) -> dict[str, Texture]:
-        return {"frames": layered(sheet.frames, "BC7_UNORM")} if len(sheet.frames) else {}
+        if not len(sheet.frames):
+            return {}
+        made = [side_by_side(images, "BC7_UNORM", TILE, TILE) for images in sheet.frames.swapaxes(0, 1)]
+        data = np.stack([layer["data"] for layer in made])
+        return {"frames": Texture(**made[0] | {"data": data}, layers=len(made))}
 
     def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
         row = sheet.row(number)

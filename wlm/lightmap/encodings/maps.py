@@ -71,17 +71,11 @@ class Reads:
 
     @classmethod
     def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
-        """Finds the reads of a tile.
-
-        Args:
-            used: bool [128, 128], the valid texels of the tile.
-            axis: The time axis. Only stored times are evaluated if light between them is mixed as radiance.
-            resolution, slices: Size of F_uvt.
-            columns, rows: Size of F_ut and F_vt.
-        """
+        """Finds the reads of the valid texels of a tile, bool [128, 128], given the sizes of F_uvt and the planes."""
         centres = (np.arange(TILE) + 0.5) / TILE
         across = _cells(centres, resolution).astype(np.int64)
         along = _cells(centres, columns)
+        # Only stored times are evaluated if light between them is mixed as radiance.
         read_slices, read_rows = (
             _cells(encode_time(axis)[0], count, axis.periodic).any(0)
             if axis.interpolation == "radiance"
@@ -144,11 +138,7 @@ def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
-    """Checks the maps and networks of tiles, as a trainer returns them, before they are used.
-
-    Raises:
-        WlmError: A block is not of BC7 mode 6, or a network is not on the levels that the settings state.
-    """
+    """Checks that maps and networks from a trainer are blocks of mode 6, and networks on the levels of the settings."""
     for name in ("uv", "uvt") if dynamic else ("uv",):
         _unpacked(parts[name].reshape(-1, BLOCK_BYTES))
     if profile.net_bits == 8:
@@ -165,11 +155,8 @@ def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
-    """Splits blocks of mode 6, uint8 [..., 16], into bytes of endpoints and of indices, uint8 [n, 8] each.
-
-    The P bit of the first endpoint is the top bit of the first byte; that of the second is in the half with the
-    indices.
-    """
+    """Splits blocks of mode 6, uint8 [..., 16], into bytes of endpoints and of indices, uint8 [n, 8] each."""
+    # The P bit of the first endpoint is the top bit of the first byte; that of the second is with the indices.
     low, high = np.ascontiguousarray(blocks).reshape(-1, BLOCK_BYTES).view("<u8").T
     if ((low & _LOW_7) != _MODE_6).any():
         raise WlmError("maps: expected blocks of BC7 mode 6, found others")
@@ -197,14 +184,7 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
 
     The weights into one unit share the largest magnitude m among them, a half float; a weight is q m / 127 with an
     integer q from -127 to 127, rounded to a half float. Biases are half floats. The fit evaluates exactly these numbers
-    (`wlm_kernels.lightmap.levels`), so that the file loses nothing.
-
-    Args:
-        net: float16 [P], see `SheetModel.net`.
-        inputs, hidden: I and H.
-
-    Raises:
-        WlmError: A weight is not on its level.
+    (`wlm_kernels.lightmap.levels`), so that the file loses nothing; a weight that is not on its level is a `WlmError`.
     """
     whole, halves = [], []
     for weights, bias in _layers(net, inputs, hidden):
@@ -305,12 +285,7 @@ class MapTiles(DeviceTiles):
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns the numbers that kernels need for one time.
-
-        Args:
-            time: In the unit of the set's times.
-            state: From an earlier call, overwritten in place; None allocates a new one.
-        """
+        """Returns the numbers that kernels need for one time, written into an earlier state or, for None, a new one."""
         before, after, share = self._axis.neighbours(time)
         if state is None:
             state = decode_kernels.TimeState()
@@ -365,7 +340,7 @@ def fours(profile: Profile) -> int:
     return -(-profile.hidden // 4)
 
 
-def shader_networks(sheet: SheetModel) -> tuple[np.ndarray, np.ndarray]:
+def shader_networks(sheet: SheetModel) -> np.ndarray:
     """Returns the networks of all tiles as the shader reads them: W1, b1, W2, b2, W3, b3, a row of W for each input.
 
     Dynamic tiles come first, then static ones. Rows are filled up with zeros to groups of four, and rows of zeros are
@@ -403,10 +378,7 @@ def network_starts(sheet: SheetModel) -> np.ndarray:
 
 
 def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns the index of each tile with maps, in the order of `mapped`, among the images of the textures, int [N_m].
-
-    Dynamic tiles come first, then static ones.
-    """
+    """Returns the index of each mapped tile among the images, of which those of dynamic tiles are first, int [N_m]."""
     static = sheet.kind[sheet.mapped] == TileKind.STATIC
     rows = np.empty(len(static), int)
     rows[np.argsort(static, kind="stable")] = np.arange(len(static))

@@ -67,7 +67,7 @@ class Trainer:
         return self._sums.tolist()
 
     def clear_losses(self) -> None:
-        """Starts new sums."""
+        """Resets the sums of the losses to 0."""
         self._sums.zero_()
 
     def run(self, pool: Pool, plan: Plan) -> None:
@@ -147,7 +147,7 @@ class Trainer:
         return {name: np.array(value.detach().cpu().numpy(), order="C") for name, value in tensors.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """Returns the table of the parts of a `state` after a number of steps."""
+        """Returns the type, shape and range of each array of a `state` after a number of steps."""
         table = {
             "step": Part(np.int64, (), least=step, most=step),
             "sums": Part(np.float32, tuple(self._sums.shape)),
@@ -189,7 +189,7 @@ class Trainer:
 
 
 def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
-    """Returns the index of the plane that replaces each plane in a mirrored image."""
+    """Returns for each plane the index of the plane that takes its place when the image is mirrored."""
     return torch.tensor([planes.index(_MIRRORED.get(name, name)) for name in planes], device=device)
 
 
