@@ -12,7 +12,7 @@ from typing import Any
 
 
 def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Makes the `__getattr__` and `__dir__` of a package.
+    """Returns a `__getattr__` and a `__dir__` for a package that import its public names at first use.
 
     `places` names for each public name the module that defines it, or for a subpackage its own full name. A public name
     must not be the name of a submodule, because importing the submodule would replace it.
@@ -31,7 +31,7 @@ def facade(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any
 
 
 def stub(package: str, places: Mapping[str, str]) -> str:
-    """Writes the stub of a package.
+    """Returns the text of a package's stub file.
 
     Args:
         package, places: Arguments of `facade`.
@@ -47,7 +47,7 @@ def stub(package: str, places: Mapping[str, str]) -> str:
 
 
 def packages(root: Path) -> dict[Path, str]:
-    """Finds the packages with a facade, and the text of the stub of each, by the path of the stub.
+    """Returns the stub text of each package that uses `facade`, by the path of the stub file.
 
     Args:
         root: The folder of the package `wlm`.

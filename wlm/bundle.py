@@ -1,7 +1,7 @@
 """`Bundle`: the textures, buffers and shader that a model puts on a GPU.
 
-Every system has a function `bundle(model, ...)` that makes one, and its model has a method of that name. Everything
-that leaves a model consumes it: the raw folder and the engine kits of `wlm.export`, the HTML page, the viewer and
+Every system has a function `bundle(model, ...)` that makes one, and its model has a method of that name. All exports
+and viewers of models read bundles: the raw folder and the engine kits of `wlm.export`, the HTML page, the viewer and
 `wlm inspect`. They rely on these names:
 
     system    textures                               buffers                       reference           files
@@ -63,7 +63,7 @@ class Texture:
             `wlm.formats.ktx2.VK_FORMATS`.
         width, height: Size in texels.
         layers: Number of layers of a texture array; 0 for a plain texture.
-        mips: Number of mip levels below the largest.
+        mips: Number of mip levels after the full-size one.
         image: float32 [H, W, 3], or [L, H, W, 3] of an array: the decoded texels of BC6H and ASTC, for engines that
             do not load these formats. None for all other formats.
     """
@@ -83,7 +83,7 @@ class Texture:
         Args:
             texels: [H, W] or [H, W, C], or with `layered` [L, H, W] or [L, H, W, C]; little-endian numbers of the
                 format's own type.
-            fmt: As `fmt` of the class.
+            fmt: Pixel format, see the class.
             layered: Whether the first axis counts the layers of a texture array.
         """
         height, width = texels.shape[layered : layered + 2]
@@ -103,18 +103,18 @@ class Bundle:
         system: Name of the system, "lightmap" for example.
         name: Name of the model, shown in reports and used for an engine's assets.
         shader: GLSL source that reads the textures and buffers; empty for a collection whose parts have their own.
-        document: Description of all of it as JSON values, without the keys in `RESERVED`. Its entry "about" explains
-            the others in sentences. The key "values" marks a part whose texels are not light.
+        document: Description of the model's data as JSON values, without the keys in `RESERVED`. Its entry "about"
+            explains the others in sentences. The key "values" marks a part whose texels are not light.
         textures: Textures by name.
         buffers: Little-endian arrays of numbers by name, in the layout that the shader reads.
         reference: Arrays that a reader of the bundle should reproduce, by name: for a lightmap `frame`, float32
             [H, W, 3] linear RGB at the first stored time.
         files: Further files by name, such as the mesh of an atlas.
-        parts: Bundles of the members of a collection that are read by themselves, by name: sheets of a lightmap.
+        parts: Bundles of the members of a collection by name, such as the layers of a lightmap, each read by itself.
             Empty for a single item.
-        exact: Name of the macro with which the shader fetches texels and mixes them in floats, where it otherwise
-            uses the texture filter; empty if it has no such variant.
-        model: The model itself, for kits that sample it at other places than it stores: grids of probes.
+        exact: Name of the macro with which the shader fetches texels and interpolates in floats instead of using the
+            texture filter; empty if the shader has no such variant.
+        model: The model itself, for kits that sample it at other positions than the stored ones: grids of probes.
     """
 
     system: str
@@ -131,7 +131,7 @@ class Bundle:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the textures and buffers take in GPU memory, those of the parts included."""
+        """Bytes that the textures and buffers take in GPU memory, including the ones in `parts`."""
         own = sum(item.nbytes for item in (*self.textures.values(), *self.buffers.values()))
         return own + sum(part.nbytes for part in self.parts.values())
 
@@ -139,8 +139,8 @@ class Bundle:
 def sampler(name: str, kind: str) -> str:
     """Declares a texture in GLSL so that the including shader can replace or bind it.
 
-    If the macro of the name in capitals is defined before, that other texture is read. If the macro ending in
-    `_BINDING` is defined, as Vulkan needs it, the texture is at that binding.
+    If a macro with the name in capitals is defined before, its value names the texture to read instead. If that macro's
+    name followed by `_BINDING` is defined, as Vulkan needs it, it gives the texture's binding number.
 
     Args:
         name: Name of the uniform, `wlm_atlas_colour` for example.

@@ -204,7 +204,7 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Writes the beginning of a value of any size."""
+    """Formats a value for a message, like `repr`, but only its beginning if it is long."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -64,7 +64,7 @@ def free_memory(device: wp.Device) -> int:
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable:"):
             return int(line.split()[1]) * 1024
-    raise WlmError("/proc/meminfo: MemAvailable: expected it, found none")
+    raise WlmError("/proc/meminfo: expected an entry MemAvailable, found none")
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
@@ -74,8 +74,7 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     A gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`.
 
     Args:
-        tensor: Any strides; those of the trailing dimensions that a vector or matrix type takes up must be
-            contiguous.
+        tensor: A tensor of any strides; trailing dimensions that become a vector or matrix must be contiguous.
         dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's scalar.
 
     Returns:

@@ -67,8 +67,8 @@ class Settings(BaseModel):
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
-        """Loads a profile by its name (`configs/FILES-NAME.yaml`) or the path of a YAML file; settings are returned as
-        they are.
+        """Loads a profile by its name (`configs/FILES-NAME.yaml`) or the path of a YAML file; an instance is returned
+        unchanged.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.
@@ -84,7 +84,7 @@ class Settings(BaseModel):
         `prefix` is the text before the setting's name in an error; `"--"` writes the name as an option.
 
         Raises:
-            WlmError: Unknown or out of range.
+            WlmError: A setting is unknown or out of range.
         """
         changes = {name: value for name, value in values.items() if value is not None}
         return check_settings(type(self), self.model_dump() | changes, prefix) if changes else self
@@ -175,7 +175,7 @@ def plain(value: Any) -> Any:
 
 
 class Header(BaseModel):
-    """The settings in a file's header: the base of each codec's table.
+    """Base of the classes that describe and check the settings in a model file's header.
 
     Types are strict: a text is never read as a number, nor a float as a count. NaN and infinity are refused.
     """
@@ -184,10 +184,10 @@ class Header(BaseModel):
 
 
 class Model:
-    """Base of a system's model: what its file holds.
+    """Base of a system's model, which holds the content of a model file.
 
-    Saving, loading and decoding are asked for here and done in the system's `codec` and `decode`. These stand above
-    its `model`, so they are looked up when they are called.
+    The methods call the system's modules `codec`, `decode` and `bundle`. These import the system's `model`, so a method
+    imports them only when it is called.
 
     Attributes:
         SYSTEM: The system's name in files.
@@ -232,7 +232,7 @@ class Model:
         """Converts the model to textures, buffers and shader source for a GPU; the device computes the reference
         values.
 
-        `options` are those of the system's `bundle`.
+        `options` are passed to the function `bundle` of the system.
 
         Raises:
             WlmError: No such device.
@@ -240,12 +240,12 @@ class Model:
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-        """Returns settings, parts and source of the file."""
+        """Returns the settings, the parts and the source hash that `save` writes."""
         return _module(self.SYSTEM, "codec").encode(self)
 
 
 def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
-    """Reads the model of any system from a file; with `system`, only of that system.
+    """Reads a model of any system from a file; with `system`, a model of another system is an error.
 
     Raises:
         WlmError: One line: the file is no model, is cut short or damaged, is of another system or version, or has

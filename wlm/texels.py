@@ -87,20 +87,6 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return filled
 
 
-def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Fills texels outside the mask with means of increasingly large neighbourhoods, which compress to few bits.
-
-    Args:
-        images: float32 [..., H, W, C].
-        mask: bool [H, W]; texels outside it aren't read.
-
-    Returns:
-        A new array; 0 where the mask is empty.
-    """
-    weight = mask.astype(np.float32)[..., None]
-    return _pull_push(np.where(mask[..., None], images, np.float32(0.0)), weight)
-
-
 def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the texels within `REACH` of a valid one, and the nearest valid one of each, for a mask bool [H, W].
 
@@ -144,7 +130,7 @@ def _nearest(mask: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Computes `_nearest` by threads on overlapping strips; None if a nearest texel may lie outside the overlap."""
+    """Computes `_nearest` in threads, on overlapping strips of rows; None if the overlap may be too small."""
     height, width = mask.shape
     rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
 
@@ -208,20 +194,3 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
 
 def _texels(count: int) -> str:
     return f"{count} {'texel' if count == 1 else 'texels'}"
-
-
-def _pull_push(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Fills gaps in values [..., h, w, C] that are premultiplied by weights [h, w, 1] in [0, 1]."""
-    height, width = weight.shape[:2]
-    if height == width == 1:
-        return values / np.where(weight > 0.0, weight, np.float32(1.0))
-    pad = ((0, height % 2), (0, width % 2), (0, 0))
-    halves = [
-        sum(np.pad(array, ((0, 0),) * (array.ndim - 3) + pad)[..., y::2, x::2, :] for y in (0, 1) for x in (0, 1))
-        for array in (values, weight)
-    ]
-    # A coarse texel with any weight gets full weight: it is the mean of the valid texels that it covers.
-    whole = 1.0 / np.maximum(halves[1], np.float32(1.0))
-    coarse = _pull_push(halves[0] * whole, halves[1] * whole)
-    fine = coarse.repeat(2, axis=-3).repeat(2, axis=-2)[..., :height, :width, :]
-    return values + (1.0 - weight) * fine

@@ -61,7 +61,7 @@ class Workers(ABC):
 
     Attributes:
         count: Number of workers.
-        remote: Whether they work in parallel with this process.
+        remote: Whether the workers run in parallel with this process.
     """
 
     count: int

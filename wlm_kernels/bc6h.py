@@ -1,7 +1,7 @@
 """Encodes blocks of 4 x 4 texels as unsigned BC6H with a small weighted squared error in linear light.
 
 BC6H interpolates between two colours in a space that is roughly the logarithm of light. A block is fitted there by
-weighted least squares, with the squared slope of light as a further weight of each texel; the texels' levels are then
+weighted least squares, with the squared slope of light as a further weight of each texel; the texels' indices are then
 chosen by their error in linear light. The most precise mode that can represent the endpoints is used. One line for all
 texels and the two best of the 32 partitions into two lines are encoded, and the best of these blocks is kept.
 
@@ -40,10 +40,10 @@ class _Texels:
     Attributes:
         light: Linear light of each texel.
         weight: Weight of each texel's squared error.
-        place: The light in BC6H's 16-bit space, not rounded.
-        pull: Weight of each channel's squared error in that space.
-        middle: Mean of the places.
-        metric: Scale of each channel's distance from the mean: the root of the mean pull.
+        place: The colour of each texel in BC6H's 16-bit space, not rounded.
+        pull: Weight of each channel's squared error in the 16-bit space.
+        middle: Mean of `place` over the texels.
+        metric: Scale of each channel's distance from the mean: the square root of the mean of `pull`.
     """
 
     light: Colours
@@ -59,8 +59,8 @@ class _Sums:
     """The normal equations of a line's two ends, by channel.
 
     Attributes:
-        aa, ab, bb: Weighted products of the texels' shares of the first and of the second end.
-        ay, by: Weighted sums of their places times these shares.
+        aa, ab, bb: Weighted sums of products of the texels' interpolation weights a (first end) and b (second end).
+        ay, by: Weighted sums of the texels' colours (`place`) times a, and times b.
     """
 
     aa: wp.vec3
@@ -72,7 +72,7 @@ class _Sums:
 
 @wp.func
 def _place_of(light: float) -> wp.vec2:
-    """Returns light in BC6H's space, and the slope of light there."""
+    """Returns linear light converted to BC6H's 16-bit space, and the derivative of light by the result."""
     if light < _LEAST_NORMAL:
         return wp.vec2(light * 16777216.0 * _STRETCH, 1.0 / (16777216.0 * _STRETCH))
     exponent = wp.floor(wp.log2(light))
@@ -89,7 +89,7 @@ def _in(mask: int, texel: int) -> bool:
 
 @wp.func
 def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
-    """Computes the principal axis of `_moments`, and the variance along it times the weight."""
+    """Computes the principal axis of `_moments`, and the variance along the axis times the total weight."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
     yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
@@ -119,13 +119,13 @@ def _spread(m: _Moments) -> float:
 
 @wp.func
 def _scaled(texels: _Texels, texel: int) -> wp.vec3:
-    """Computes a texel's place relative to the middle, scaled by the metric."""
+    """Returns a texel's colour in the 16-bit space relative to the block's mean, scaled by `texels.metric`."""
     return wp.cw_mul(texels.place[texel] - texels.middle, texels.metric)
 
 
 @wp.func
 def _moments(texels: _Texels, mask: int) -> _Moments:
-    """Computes weight, weighted sum and the six weighted channel products of some texels' scaled places."""
+    """Sums weights, weighted colours (`_scaled`) and their six weighted channel products over the texels in `mask`."""
     total = _Moments()
     square = wp.cw_mul(texels.metric, texels.metric)
     for i in range(_TEXELS):
@@ -139,14 +139,14 @@ def _moments(texels: _Texels, mask: int) -> _Moments:
 
 @wp.func
 def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
-    """Fits a line through some texels: the extremes along their principal axis, refined twice by least squares.
+    """Fits a line to the texels in `mask`: the extremes along their principal axis, refined twice by least squares.
 
     Args:
         texels: The block.
-        mask: The texels.
+        mask: The line's texels, one bit each.
         ends: The endpoints of both lines; rows 2 `line` and 2 `line` + 1 are replaced.
         moments: The moments of these texels.
-        steps: The index of the line's far end.
+        steps: The largest index, which selects the line's second end.
     """
     principal = _axis_of(moments, _AXIS_ROUNDS)
     axis = wp.vec3(principal[0], principal[1], principal[2])
@@ -189,7 +189,7 @@ def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
 
 @wp.func
 def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
-    """Adds a texel at share `t` of the way from the first end to the second to the normal equations."""
+    """Adds a texel to the normal equations; `t` is its interpolation weight of the second end."""
     s = 1.0 - t
     sums.aa += pull * (s * s)
     sums.ab += pull * (s * t)
@@ -213,7 +213,7 @@ def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
 
 @wp.func
 def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
-    """Fits a line's ends by least squares, with each texel at the nearest level between the previous ends."""
+    """Fits a line's ends by least squares, with each texel at its nearest index between the previous ends."""
     along = b - a
     sums = _Sums()
     for i in range(_TEXELS):
@@ -242,7 +242,7 @@ def _whole(code: int, bits: int) -> int:
 
 @wp.func
 def _coded(place: float, bits: int) -> int:
-    """Returns the code of `bits` bits that expands to the 16-bit value nearest to a place."""
+    """Returns the code of `bits` bits that expands to the 16-bit value nearest to `place`."""
     top = (1 << bits) - 1
     if bits == 16:
         return wp.clamp(int(place + 0.5), 0, top)
@@ -256,7 +256,7 @@ def _coded(place: float, bits: int) -> int:
 
 @wp.func
 def _share(index: int, steps: int) -> int:
-    """Returns the far end's share at an index, in 64ths; 3 and 4 bits round alike."""
+    """Returns the second end's interpolation weight at an index, in 64ths; `steps` is the largest index, 7 or 15."""
     return (index * 64 + steps // 2) // steps
 
 
@@ -335,7 +335,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
 
 @wp.func
 def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
-    """Orders the ends so that the first is nearer to the line's anchor texel, whose index has one bit less."""
+    """Swaps a line's ends if that brings the first nearer to the anchor texel, whose index has one bit less."""
     a, b = ends[2 * line], ends[2 * line + 1]
     pull = texels.pull[anchor]
     along = wp.cw_mul(pull, b - a)
@@ -388,7 +388,7 @@ def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int
 
 @wp.func
 def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
-    """Finds the partition with the least scatter about its two lines among those not in `tried`, and the scatter."""
+    """Returns the partition, of those not in `tried`, with the least scatter about its two lines, and the scatter."""
     least = float(_HUGE)
     partition = int(0)
     for p in range(32):
@@ -420,7 +420,7 @@ def _encode(
     blocks: wp.array2d[wp.uint32],
     decoded: wp.array2d[wp.vec3],
 ):
-    """One block per thread.
+    """Encodes one block per thread.
 
     Every function is called at one place, in loops over partitions, lines and rounds: compilers inline each call, and
     ten copies of a function took the CUDA compiler half a minute.
@@ -483,7 +483,7 @@ def _encode(
 
 
 def encode(light, weight, tables: Tables, blocks, decoded) -> None:
-    """Encodes blocks.
+    """Encodes N blocks of 4 x 4 texels as unsigned BC6H.
 
     Args:
         light: vec3 [N, 16], texels row by row, finite; clamped to [0, 65504].

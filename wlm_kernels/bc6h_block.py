@@ -35,7 +35,7 @@ class Block:
 
     Attributes:
         error: Weighted squared error of its texels.
-        mode, partition: Rows of the mode and the partition in the tables.
+        mode, partition: Rows of the mode and of the partition in `Tables.modes` and `Tables.masks`.
         code: The endpoints w, x, y and z as the mode stores them, without differences.
         index: Index of each texel.
         light: Decoded light of each texel.
@@ -51,7 +51,7 @@ class Block:
 
 @wp.func
 def write_block(number: int, block: Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
-    """Packs a block into 128 bits."""
+    """Packs a block into 128 bits and writes them to row `number` of `blocks`."""
     mode = block.mode
     word = wp.vec4ui()
     word[0] = wp.uint32(tables.modes[mode, 0])

@@ -37,7 +37,7 @@ def axis_index(i: int, size: int, periodic: int) -> int:
 
 @wp.struct
 class _Cell:
-    """Position of a point in its volume along the width, the height and the first axis; `base` is the volume's row 0.
+    """A point's cells and weights along width (x), height (y) and first axis (t); its volume starts at row `base`.
 
     A plane is a volume of height 1, in which only the first four of eight corners differ.
     """
@@ -151,11 +151,11 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
     Args:
         values: float [L * T, H, W, C], L planes (H = 1) or volumes, concatenated because Warp arrays have at most four
             dimensions.
-        times: T, number of slices of each.
+        times: T, number of slices of each plane or volume.
         layers: int [N], the plane or volume of each point, 0 to L - 1; of shape [0]: L is 1.
         points: float [N, 2] (u, t) or [N, 3] (u, v, t).
         out: float [N, C], written.
-        periodic: Whether the axis of T wraps.
+        periodic: Whether the first axis, of length T, wraps round.
     """
     inputs = [values, times, layers, points, int(periodic)]
     wp.launch(_sample, points.shape[0], inputs=inputs, outputs=[out], device=values.device)
@@ -164,12 +164,12 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
 def sample_backward(
     values, times: int, layers, points, grad_out, grad_values, grad_points, periodic: bool = False
 ) -> None:
-    """The adjoint of `sample`; by a coordinate it is the slope between two cell centres, 0 where it is clamped.
+    """Backward pass of `sample`; a coordinate's gradient is the slope between two cell centres, 0 where clamped.
 
     On CUDA points are added to `grad_values` in any order, so that the last bits change from run to run.
 
     Args:
-        values, times, layers, points, periodic: As for `sample`.
+        values, times, layers, points, periodic: Arguments of `sample`.
         grad_out: float [N, C].
         grad_values: float [L * T, H, W, C], added to; of shape [0, 0, 0, 0]: not computed.
         grad_points: float, like `points`, written; of shape [0, 0]: not computed.

@@ -121,13 +121,13 @@ class MlpKernels:
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 
     def backward(self, hidden, output, x, grad_y, grad_x, h1, h2, d1, d2) -> None:
-        """The adjoint of each layer, one input of one network per thread.
+        """Computes the adjoint of each layer, one input of one network per thread.
 
-        A layer's weights have the gradient h^T d, its bias the sum of d, of its input h and the adjoint d of its result
-        before the activation: x and d1, h1 and d2, h2 and grad_y.
+        With a layer's input h and the adjoint d of its result before the activation, the gradient of its weights is h^T
+        d and of its bias the sum of d. The three layers' (h, d) are (x, d1), (h1, d2), (h2, grad_y).
 
         Args:
-            hidden, output, x: As for `forward`.
+            hidden, output, x: Weights and inputs, see `forward`.
             grad_y: vecO [N, B].
             grad_x: vecI [N, B], written.
             h1, h2: vecH [N, B], written: the layers' results.
@@ -138,13 +138,13 @@ class MlpKernels:
 
 
 def parameter_count(inputs: int, hidden: int) -> int:
-    """Scalars in one network of the given shape."""
+    """Returns the number of weights and biases in one network with three outputs."""
     return (inputs + hidden + 2) * hidden + 3 * (hidden + 1)
 
 
 @functools.cache
 def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> MlpKernels:
-    """Builds (once) the functions of one network shape.
+    """Returns the functions of one network shape, which are built once and cached.
 
     Args:
         inputs: I >= 1.

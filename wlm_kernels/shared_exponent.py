@@ -1,6 +1,6 @@
 """RGB9E5 texels in kernels: three mantissas of nine bits and one exponent.
 
-Read first: `wlm.formats.shared_exponent`, the same on the host.
+Read `wlm.formats.shared_exponent` first: the same in NumPy.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ LARGEST = wp.constant(65408.0)
 
 @wp.func
 def unpack_rgb9e5(word: wp.uint32) -> wp.vec3:
-    """Unpacks a texel to linear light."""
+    """Unpacks an RGB9E5 texel to linear RGB."""
     scale = wp.pow(2.0, float(int(wp.rshift(word, wp.uint32(27)))) - 24.0)
     return scale * wp.vec3(
         float(int(word & wp.uint32(511))),
@@ -23,7 +23,7 @@ def unpack_rgb9e5(word: wp.uint32) -> wp.vec3:
 
 @wp.func
 def pack_rgb9e5(light: wp.vec3) -> wp.uint32:
-    """Packs linear light, clamped to the format's range."""
+    """Packs linear RGB, clamped to the format's range, into an RGB9E5 texel."""
     r = wp.clamp(light[0], 0.0, LARGEST)
     g = wp.clamp(light[1], 0.0, LARGEST)
     b = wp.clamp(light[2], 0.0, LARGEST)

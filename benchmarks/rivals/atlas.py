@@ -20,6 +20,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from benchmarks.rivals.lightmap_blocks import ispc_bc6h
 from benchmarks.rivals.rival import Rival
 from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
@@ -85,7 +86,7 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
         decoded = quantise(half.astype(np.float32), "bc6h")["texels"]
     elif codec == "bc6h":
         padded = np.pad(half, ((0, -height % block[1]), (0, -width % block[0]), (0, 0)), mode="edge")
-        data = hdr_blocks.encode_bc6h(padded, "slow", _EXTRA)
+        data = ispc_bc6h(padded)
         decoded = hdr_blocks.decode_bc6h(data, *padded.shape[:2], _EXTRA)[:height, :width]
     else:
         coder = hdr_blocks.astc(block, hdr_blocks.ASTC_MEDIUM, _EXTRA)

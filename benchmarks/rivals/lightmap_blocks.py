@@ -15,8 +15,10 @@ All functions raise a `WlmError` if shapes do not fit, a valid texel is NaN or i
 package is missing.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
 from wlm.formats import bc7_modes, hdr_blocks
 from wlm.formats.block_reuse import reuse_blocks
-from wlm.formats.hdr_blocks import ASTC_THOROUGH, need
+from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
 
@@ -34,6 +36,9 @@ _BC_PROFILE = "slow"
 _RING_WEIGHT = 0.25
 _ASTC_BLOCKS = (4, 5, 6, 8, 10, 12)
 _ASTC_PROFILES = ("best", "ldr", "hdr")
+_ASTC_THOROUGH = 98.0  # astcenc's preset "thorough"
+# Above the PSNR of any block. In the LDR profile the presets stop the search of a block at 29 to 32 dB.
+_NO_LIMIT_DB = 999.0
 
 
 def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
@@ -47,7 +52,7 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival
         return hdr_blocks.decode_bc6h(data, *padded.shape[:2], EXTRA)
 
     def encode() -> bytes:
-        data = hdr_blocks.encode_bc6h(padded, _BC_PROFILE, EXTRA)
+        data = ispc_bc6h(padded)
         if loss == 0.0:
             return data
         # Errors of codes, as shares of their tile's range.
@@ -57,6 +62,17 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival
         return reuse_blocks(data, to_codes(decode(data)), codes, weight / np.square(span), weight * (loss / 255.0) ** 2)
 
     return _cropped(_measured(_with_loss("bc6h", loss), encode, decode), image)
+
+
+def ispc_bc6h(texels: np.ndarray) -> bytes:
+    """Encodes texels, half [H, W, 3], finite and not negative, as unsigned BC6H by Intel's ISPC texture compressor.
+
+    H and W are multiples of 4.
+    """
+    texcomp, (height, width) = need("ispc_texcomp", EXTRA), texels.shape[:2]
+    rgba = np.pad(texels, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+    surface = texcomp.RGBASurface(rgba.tobytes(), width, height, rgba.strides[0])
+    return texcomp.compress_blocks_bc6h(surface, texcomp.BC6HEncSettings.from_profile(_BC_PROFILE))
 
 
 def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
@@ -122,7 +138,7 @@ def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
 
 def _astc(image: np.ndarray, mask: np.ndarray, block: int, profile: str) -> Rival:
     ldr = profile == "ldr"
-    codec = hdr_blocks.astc((block, block), ASTC_THOROUGH, EXTRA, ldr=ldr)
+    codec = _astc_codec(need("astc_encoder", EXTRA), block, ldr)
     if ldr:
         texels, ranges = _levels(image, mask, block)
         scale = ranges.tobytes()
@@ -134,6 +150,15 @@ def _astc(image: np.ndarray, mask: np.ndarray, block: int, profile: str) -> Riva
     )
     rival = replace(_cropped(rival, image), option=profile.upper())
     return replace(rival, decoded=ranges.radiance(rival.decoded)) if ldr else rival
+
+
+@functools.cache
+def _astc_codec(codec: ModuleType, block: int, ldr: bool) -> hdr_blocks.Astc:
+    profile = codec.ASTCProfile.LDR if ldr else codec.ASTCProfile.HDR_RGB_LDR_A
+    config = codec.ASTCConfig(profile, block, block, 1, _ASTC_THOROUGH)
+    if ldr:
+        config.tune_db_limit = _NO_LIMIT_DB  # the HDR profile has no such limit
+    return hdr_blocks.Astc(codec, config)
 
 
 def _measured(

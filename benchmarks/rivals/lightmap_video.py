@@ -14,7 +14,6 @@ from benchmarks.rivals.lightmap_levels import TileRanges, prepare, seen_texels, 
 from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
-from wlm.texels import fill_smoothly
 from wlm.workers import cores
 
 BITS = 10  # bits of a sample
@@ -101,9 +100,40 @@ def decode_levels(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     return levels
 
 
+def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Fills texels outside the mask with means of increasingly large neighbourhoods, which compress to few bits.
+
+    Args:
+        images: float32 [..., H, W, C].
+        mask: bool [H, W]; texels outside it aren't read.
+
+    Returns:
+        A new array; 0 where the mask is empty.
+    """
+    weight = mask.astype(np.float32)[..., None]
+    return _pull_push(np.where(mask[..., None], images, np.float32(0.0)), weight)
+
+
 def _stream_bytes(data: bytes) -> int:
     """Returns the bytes of the AV1 stream alone, without AVIF's boxes."""
     at = 0
     while data[at + 4 : at + 8] != b"mdat":
         at += int.from_bytes(data[at : at + 4], "big")
     return int.from_bytes(data[at : at + 4], "big") - 8
+
+
+def _pull_push(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Fills gaps in values [..., h, w, C] that are premultiplied by weights [h, w, 1] in [0, 1]."""
+    height, width = weight.shape[:2]
+    if height == width == 1:
+        return values / np.where(weight > 0.0, weight, np.float32(1.0))
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    halves = [
+        sum(np.pad(array, ((0, 0),) * (array.ndim - 3) + pad)[..., y::2, x::2, :] for y in (0, 1) for x in (0, 1))
+        for array in (values, weight)
+    ]
+    # A coarse texel with any weight gets full weight: it is the mean of the valid texels that it covers.
+    whole = 1.0 / np.maximum(halves[1], np.float32(1.0))
+    coarse = _pull_push(halves[0] * whole, halves[1] * whole)
+    fine = coarse.repeat(2, axis=-3).repeat(2, axis=-2)[..., :height, :width, :]
+    return values + (1.0 - weight) * fine

@@ -28,7 +28,8 @@ def rows(lightmaps):
     return run_rows(lightmaps, PROFILE, [*ABLATION, *SWEPT], device="cpu", **VIEWS)
 
 
-def test_rows_and_means(rows):
+def test_rows_and_means(rows, tmp_path):
+    check_outputs(rows, tmp_path, (Panel("bpp"),))
     names = [*(("ablation", name) for name in ABLATION), *(("sweep", name) for name in SWEPT)]
     scenes = [f"{scene}, ablation of small" for scene in ("sheet day", "cube night", "mean over 2 lightmaps")]
     assert keys(rows) == names * 3
@@ -60,10 +61,6 @@ def test_each_row_lacks_its_part(rows):
     assert cube["ASTC"]["bpp"] < whole["bpp"] and cube["ASTC"]["colour_width"] == whole["colour_width"]
     assert cube["scale 0.3"]["lut_width"] < whole["lut_width"] < cube["lut_scale 1"]["lut_width"]
     assert cube["colour_scale 0.8"]["colour_width"] == pytest.approx(2 * whole["colour_width"], abs=1)
-
-
-def test_rows_make_a_file_and_tables(rows, tmp_path):
-    check_outputs(rows, tmp_path, (Panel("bpp"),))
 
 
 def test_a_missing_package(lightmaps, monkeypatch):

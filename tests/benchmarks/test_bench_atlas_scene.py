@@ -112,7 +112,8 @@ def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
     assert "expected a set with a mesh" in error_of(read_scene, tmp_path)
 
 
-def test_rows(scene, rows):
+def test_rows(scene, rows, tmp_path):
+    check_outputs(rows, tmp_path, (Panel("bpp"),))
     assert keys(rows) == [("scene", "few"), ("parts", "bits of few")]
     whole, parts = rows
     assert whole.scene == "boxes, 2 objects, 2 states" and whole["lightmaps"] == 4
@@ -132,10 +133,6 @@ def test_parts_are_lightmaps_of_their_own(scene):
     assert many.bits == pytest.approx(0.12 * source_bits, rel=0.15)
     scores = compare(scene, {"few": few, "many": many}, views=2, resolution=48)
     assert scores["many"].psnr > scores["few"].psnr + 10.0 and min(scores["many"].psnr_by_state) > 30.0
-
-
-def test_rows_make_a_file_and_tables(rows, tmp_path):
-    check_outputs(rows, tmp_path, (Panel("bpp"),))
 
 
 def test_a_scene_without_its_parts_and_one_that_has_no_room(scene, few):

@@ -30,7 +30,8 @@ def made(lightmaps):
     return rows, lines, counts
 
 
-def test_every_row_has_its_figures(made, lightmaps):
+def test_every_row_has_its_figures(made, lightmaps, tmp_path):
+    check_outputs(made[0], tmp_path, (Panel("bpp"),))
     rows, lines, counts = made
     names = [*VARIANTS, KERNELS]
     assert [row.option for row in rows] == names and counts == list(range(1, len(names) + 1))
@@ -45,10 +46,6 @@ def test_every_row_has_its_figures(made, lightmaps):
     network = {name: 2 * (features.inputs * 16 + 16 * 16 + 16 * 3 + 35) for name, features in VARIANTS.items()}
     for name, features in VARIANTS.items():
         assert by_name[name]["bytes"] == features.bytes + network[name] + 4 * 5 + 12
-
-
-def test_rows_make_a_file_and_tables(made, tmp_path):
-    check_outputs(made[0], tmp_path, (Panel("bpp"),))
 
 
 def test_one_row_and_a_missing_package(lightmaps, monkeypatch):

@@ -100,17 +100,6 @@ def test_a_panel_of_errors_shows_its_methods_and_falls(tmp_path, as_text, monkey
     assert front.get_xydata()[:3].tolist() == [[1.0, 1e-2], [2.0, 1e-6], [4.0, 1e-7]]
 
 
-def test_picture_size_suits_a_readme_and_repeats(tmp_path):
-    first, second = tmp_path / "a.png", tmp_path / "b.PNG"
-    plot(ROWS, first)
-    plot(ROWS, second)
-    with Image.open(first) as picture:
-        assert picture.size == (1500, 585)
-        # Not blank: the first method's colour is there.
-        assert (0, 0x72, 0xB2) in {colour[:3] for _, colour in picture.convert("RGB").getcolors(1 << 24)}
-    assert first.read_bytes() == second.read_bytes()
-
-
 def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
     """Eight rows in a small corner: the boxes of their labels stay apart and inside the picture."""
     from matplotlib.figure import Figure

@@ -5,7 +5,7 @@ import pytest
 from builders.bench_rows import check_outputs, keys
 
 import benchmarks.probe as bench
-from benchmarks.probe import PANELS, ProbeBench, run, run_rows
+from benchmarks.probe import PANELS, run, run_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
@@ -41,7 +41,8 @@ def rows(sets):
     return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), shares=(5, 10), frames=4, repeats=1)
 
 
-def test_every_row_has_its_figures(rows):
+def test_every_row_has_its_figures(rows, tmp_path):
+    check_outputs(rows, tmp_path, PANELS)
     ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20")]
     ways = ["sphere", "exact"]
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
@@ -93,18 +94,6 @@ def test_rivals_alone_are_the_same(sets, rows, monkeypatch):
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
-
-
-def test_the_volume_alone_is_the_same(sets, rows):
-    lossless, components = ProbeBench(sets[0], "cpu", None).volume(frames=4)
-    (beside,) = (row for row in rows if row.scene == "room" and row.option == "lossless, walk of 4 frames")
-    assert components.option == "pca, walk of 4 frames" and components["light_psnr"] > 30.0
-    for name in ("psnr", "light_psnr", "blocks", "coverage"):
-        assert lossless[name] == beside[name]
-
-
-def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
-    check_outputs(rows, tmp_path, PANELS)
 
 
 def test_what_is_refused(sets):

@@ -1,6 +1,8 @@
 """The networks' benchmark on tiny grids: every row has its figures, and they agree with what they are of."""
 
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
 from benchmarks import path_tracer
-from benchmarks.path_tracer import PathTracer, denoise
+from benchmarks.path_tracer import PathTracer, choose_variant, denoise
+from benchmarks.runner import Bench
 from benchmarks.smoke_network import (
     FULL,
     PANELS,
@@ -22,7 +25,6 @@ from benchmarks.smoke_network import (
     run_rows,
     score,
 )
-from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.codec import shipped
 from wlm.smoke.march.fine import bake
@@ -47,7 +49,6 @@ TINY = replace(
     samples=(1,),
     repeats=1,
 )
-STEP = 0.8  # of a guiding map of 32 voxels
 NETWORK = NetworkSettings(guide="six", width=8, levels=2, stem=2)
 SETTINGS = DatasetSettings(guide="six")
 
@@ -109,14 +110,6 @@ def test_flip_book(rows):
     for row in turned.values():
         assert row.notes == "coarse march of h 0.8, network young"
         assert row["coarse_psnr"] > 40.0 and row["network_psnr"] == pytest.approx(row["coarse_psnr"], abs=0.01)
-
-
-def test_profiles(rows):
-    profiles = by_option(rows, "profiles")
-    names = [name.removeprefix("network-") for name in profile_names("smoke") if name.startswith("network-")]
-    assert list(profiles) == [f"{name}, fp32" for name in names] and {"fast", "paper"} <= set(names)
-    for row in profiles.values():
-        assert row["file_size"] == pytest.approx(2e-6 * row["parameters"])
 
 
 def test_density_and_flicker(rows):
@@ -209,3 +202,48 @@ def test_a_path_tracer_finds_the_same_light():
 def _plume():
     volume = make_plume(24, hot=False, extinction=14.0)
     return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("backends", "llvm", "variant"),
+    [(("llvm",), 19, "llvm_ad_rgb"), (("llvm",), 18, "scalar_rgb"), (("cuda",), 19, "scalar_rgb")],
+)
+def test_the_variant_is_the_fastest_that_works(monkeypatch, backends, llvm, variant):
+    detail = SimpleNamespace(llvm_version=lambda: (llvm, 1, 0))
+    names = SimpleNamespace(LLVM="llvm")
+    module = SimpleNamespace(JitBackend=names, has_backend=lambda name: name in backends, detail=detail)
+    monkeypatch.setitem(sys.modules, "drjit", module)
+    monkeypatch.setattr(path_tracer, "has_tracer", lambda: True)
+    assert choose_variant() == variant
+
+
+@pytest.mark.parametrize("denoiser", [True, False])
+def test_traced_rows(monkeypatch, denoiser):
+    """Two scenes of grey smoke, and a tracer that finds the same light everywhere."""
+    lines = []
+    traced = Bench("smoke-network", "cpu", lines.append, clock="time_ms")
+    traced.camera, traced.sizes = None, SimpleNamespace(frames=2, samples=(1, 4), few=1, resolution=16)
+    traced.frames = [SimpleNamespace(later=None) for _ in range(4)]
+    traced.references = [torch.full((8, 16, 16), 0.5) for _ in range(4)]
+
+    class Tracer:
+        variant = "scalar_rgb"
+
+        def __init__(self, volume, camera):
+            pass
+
+        def __call__(self, samples):
+            return np.full((6, 16, 16), 0.2, np.float32), np.ones((16, 16))
+
+    monkeypatch.setattr(bench, "PathTracer", Tracer)
+    monkeypatch.setattr(bench, "has_tracer", lambda: True)
+    monkeypatch.setattr(bench, "has_denoiser", lambda: denoiser)
+    monkeypatch.setattr(bench, "denoise", lambda images: images)
+    rows = bench.traced_rows(traced)
+    options = ["1 sample", "1 sample, denoised", "4 samples", "4 samples, denoised"]
+    assert [row.option for row in rows] == (options if denoiser else options[::2])
+    assert all(row.notes == "on the CPU, scalar_rgb" and row["time_ms"] > 0.0 for row in rows)
+    # 0.2 is 0.4845 in sRGB.
+    assert rows[0]["psnr"] == pytest.approx(-20.0 * np.log10(0.5 - 0.48453), abs=0.01)
+    monkeypatch.setattr(bench, "has_tracer", lambda: False)
+    assert bench.traced_rows(traced) == [] and "left out, mitsuba is not installed" in lines[-1]

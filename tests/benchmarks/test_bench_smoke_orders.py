@@ -7,21 +7,16 @@ import numpy as np
 import pytest
 import torch
 from builders.bench_rows import ENVIRONMENT
-from builders.orders import input_alone
 from builders.smoke_plumes import facing, plume
 
 import benchmarks.rivals.smoke_orders as rivals
 import benchmarks.smoke_orders as bench
 from benchmarks import read_json, tables, write_json
-from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves, three_octaves
-from benchmarks.runner import Bench
-from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, grid_rows, run
+from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves
+from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, run
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
-from wlm.smoke.transport.learning import psnr
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.orders import OrdersModel, load_orders
-from wlm.smoke.transport.tracing import trace
 
 SINGLE = GridSizes((12, 16), extinctions=(20.0,), pixels=10, samples=64)
 SMALL = {"plumes": 1, "pixels": 10, "samples": 96, "scale": 0.08, "frames": 20, "sides": 1}
@@ -47,8 +42,10 @@ def rows():
         return run(device="cpu", sizes=TINY)
 
 
-def test_every_row_has_its_figures(rows):
+def test_every_row_has_its_figures(rows, tmp_path):
     """Of each scene and albedo each way, what a frame takes by it, and the references' noise; flicker of the jet."""
+    write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
+    assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT) and "| learned mix |" in tables(rows)
     scenes = [f"{name}, albedo {albedo:g}" for name in ("plumes", "jet") for albedo in ALBEDOS]
     assert list(dict.fromkeys(row.scene for row in rows)) == [*scenes, "single lights", "plumes", "plume and cloud"]
     assert [row.option for row in rows if row.method == GRIDS] == ["12 voxels", "16 voxels"]
@@ -81,17 +78,6 @@ def test_who_is_nearest(rows):
         assert found["fitted octaves"]["psnr"] > found["three octaves"]["psnr"] + 1.0
 
 
-def test_a_mix_that_takes_from_its_input_is_seen():
-    """By the least gain of any light; one that hands on its input has none."""
-    bench_ = Bench("smoke", "cpu", None, clock="time_ms", warmup=0, repeats=1, few=1)
-    model = load_orders()
-    wild, none = OrdersModel(1.5 * model.weights, model.known), input_alone()
-    sizes = replace(SINGLE, grids=(12,))
-    worst, still = (grid_rows(bench_, sizes, each)[0] for each in (wild, none))
-    assert worst["gain_min"] < -0.5 and abs(still["gain_min"]) < 1e-3 and abs(still["gain"]) < 1e-3
-    assert worst["voxels"] == 12 and still["psnr_min"] <= still["psnr"]
-
-
 def test_flicker_is_what_the_smokes_motion_leaves():
     """Of a picture that moves as its smoke does there is none; of one that stays, the reference's and more."""
     random = torch.Generator().manual_seed(2)
@@ -113,20 +99,12 @@ def test_flicker_is_what_the_smokes_motion_leaves():
     assert set(bench._flicker(shots, [light, 1.5 * light], still, opacity)) == {"flicker"}
 
 
-def test_rows_make_a_file_and_a_table(rows, tmp_path):
-    write_json(tmp_path / "rows.json", rows, ENVIRONMENT)
-    assert read_json(tmp_path / "rows.json") == (list(rows), ENVIRONMENT)
-    assert "| learned mix |" in tables(rows)
-
-
-def test_rivals_are_nearer_than_single_scattering(device: str):
-    """A thick plume from aside; octaves of the smoke's own extinction are single scattering."""
+def test_planes_of_rivals(device: str):
+    """Octaves of the smoke's own extinction are single scattering, and a blur keeps the light."""
     volume = plume(device=device)
     camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=16)
     lights = [Light((1.0, 0.5, 0.6))]
-    wanted = trace(volume, camera, lights, samples=256).total
     once = light_smoke(volume, camera, lights).shade()
-    assert psnr(three_octaves(volume, camera, lights, 1.0), wanted) > psnr(once, wanted) + 2.0
     planes = filter_planes(volume, camera, lights)
     assert planes.shape == (1, 12 * (1 + len(SCALES)), 16, 16)
     # A blur keeps what doesn't leave the image.

@@ -21,11 +21,12 @@ import imagecodecs
 import numpy as np
 import pytest
 from PIL import Image
+from rich.markup import escape
 
 from benchmarks.rows import read_runs
 from wlm import atlas, lightmap
 from wlm.atlas.stored import with_uvs
-from wlm.cli.console import escape, note, show, show_text, table
+from wlm.cli.console import note, show, show_text, table
 from wlm.config import load_settings
 from wlm.errors import WlmError, printable
 from wlm.fluid.volume import load_volume

@@ -10,6 +10,17 @@ def array(values: np.ndarray, dtype, device: str, grad: bool = False) -> wp.arra
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, requires_grad=grad)
 
 
+def half_array(values: torch.Tensor, half: bool, device: str) -> wp.array:
+    """Puts a tensor on a device, in half or single floats."""
+    return wp.array(values.numpy(), dtype=wp.float16 if half else float, device=device)
+
+
+def noise(half: bool, *shape: int) -> torch.Tensor:
+    """Normal random float32 values; with `half`, values that half floats hold."""
+    values = torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)))
+    return values.half().float() if half else values
+
+
 def exact(values: np.ndarray, grad: bool = False) -> torch.Tensor:
     """The same values for the reference, which runs on the CPU."""
     return torch.tensor(np.asarray(values), dtype=torch.float64, requires_grad=grad)

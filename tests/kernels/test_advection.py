@@ -108,9 +108,6 @@ def _turning(n: int, angle: float) -> np.ndarray:
     return np.stack([-angle * at[..., 1], angle * at[..., 0], 0 * at[..., 2]], -1)
 
 
-# The reference.
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("ends", [((OPEN, CLOSED), (PERIODIC, PERIODIC), (CLOSED, OPEN)), SHUT])
 def test_a_step_is_the_references(ends, scheme: str, device: str):
@@ -136,9 +133,6 @@ def test_half_floats_round_once_a_step(device: str):
     single, half = (Grid(u, 2, SHUT, device, scheme="semi-lagrangian", storage=s) for s in STORAGES)
     expected, got = (grid.carried(values, 1.0) for grid in (single, half))
     np.testing.assert_allclose(got, expected, rtol=2.0**-11, atol=1e-7)
-
-
-# Exact solutions.
 
 
 def _turn_error(n: int, scheme: str, device: str) -> float:
@@ -181,34 +175,6 @@ def test_a_constant_stays(scheme: str, storage: str, device: str):
         np.testing.assert_allclose(grid.array(field), constant, rtol=0, atol=tolerance)
 
 
-# Faces and solids.
-
-
-def test_clean_air_comes_in_and_walls_hold(device: str):
-    u = np.broadcast_to((0.6, 0.0, 0.0), (6, 2, 2, 3))
-    for end, expected in ((OPEN, 0.0), (CLOSED, 1.0)):
-        grid = Grid(u, 1, ((end, end), *WRAPPED[:2]), device)
-        got = grid.carried(np.ones(grid.shape), 1.0, 40)
-        np.testing.assert_allclose(got, expected, atol=1e-6)
-
-
-def test_a_solid_holds_no_smoke_and_takes_none(device: str):
-    """Wind onto a plate: no smoke in it, none behind it, and it doesn't thin the smoke before it."""
-    u = np.broadcast_to((0.4, 0.0, 0.0), (8, 3, 3, 3)).copy()
-    solid = np.zeros((8, 3, 3), bool)
-    solid[4] = True
-    u[solid] = 0
-    u[5:] = 0
-    start = np.zeros((16, 6, 6))
-    start[:8] = 1.0
-    for scheme in SCHEMES:
-        grid = Grid(u, 2, ((CLOSED, CLOSED), *WRAPPED[:2]), device, solid=solid, scheme=scheme)
-        carried = grid.run(grid.fields(start, start), 1.0, 10)
-        for field in (carried.density, carried.temperature):
-            np.testing.assert_array_equal(grid.array(field)[8:], 0.0)
-            np.testing.assert_allclose(grid.array(field)[:8], 1.0, atol=1e-6)
-
-
 def test_solids_that_come_and_go(device: str):
     """Covered smoke is lost; freed cells get the mean of their coarse neighbours."""
     coarse = (4, 3, 3)
@@ -234,9 +200,6 @@ def test_solids_that_come_and_go(device: str):
     fields = grid.fields(np.zeros(grid.shape))
     advection_sources.change_solids(grid.box, full, walls[0], fields)
     np.testing.assert_array_equal(grid.array(fields.density), 0.0)
-
-
-# Sources and buoyancy.
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -298,9 +261,6 @@ def test_buoyancy_is_of_means(refinement: int, device: str):
     np.testing.assert_allclose(force.numpy().reshape(*coarse, 3), expected, atol=1e-5)
 
 
-# Bricks.
-
-
 @pytest.mark.parametrize("ends", [WRAPPED, SHUT])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_bricks_give_the_dense_result(scheme: str, ends, device: str):
@@ -345,9 +305,6 @@ def test_bricks_follow_the_smoke(device: str):
     still = Grid(u, 1, SHUT, device, reach=1.0)
     still.run(still.fields(np.zeros(grid.shape)), 1.0, 3)
     assert still.computed == np.prod(grid.shape)
-
-
-# The rest.
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

@@ -125,15 +125,9 @@ def test_points_on_a_surface(device: str):
     def draw(step: int) -> tuple[np.ndarray, np.ndarray]:
         triangle = wp.zeros(2 * count, dtype=int, device=device)
         barycentric = wp.zeros(2 * count, dtype=wp.vec2, device=device)
-        cascade.surface_points(
-            array(np.cumsum(areas), wp.float64, device),
-            array(corner, wp.vec2, device),
-            apart,
-            3,
-            array(np.array([step]), int, device),
-            triangle,
-            barycentric,
-        )
+        surface = array(np.cumsum(areas), wp.float64, device), array(corner, wp.vec2, device)
+        count_of_steps = array(np.array([step]), int, device)
+        cascade.surface_points(*surface, apart, 3, count_of_steps, triangle, barycentric)
         return triangle.numpy(), barycentric.numpy()
 
     triangle, weights = draw(0)

@@ -4,16 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 from builders.synthetic import random_sheet
-from reference import temporal as reference
 
-from kernels.compare import array, close, exact
-from kernels.stepping import TILE, Case, draw, trainer
-from wlm.formats.bc7 import decode_image
+from kernels.compare import array, close
+from kernels.stepping import Case, draw, trainer
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.maps import MapTiles
+from wlm.lightmap.exact import colour_tile64, decode_tile64
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import StripDecoder
 from wlm.lightmap.tiles import TileKind
@@ -45,52 +43,6 @@ def _model(hidden: int, gelu: str, periodic: bool = True, **settings) -> SheetMo
     return dataclasses.replace(model, scale=scale, peak=peak, affine=affine)
 
 
-def _reference_colour(model: SheetModel, number: int, time: float, gelu: str) -> np.ndarray:
-    """Colour in gamma space, float64 [128, 128, 3], from the stored bytes; between times by eq. 2."""
-    if model.profile.interpolation == "network":
-        return _network_colour(model, number, time, gelu)
-    before, after, share = model.axis.neighbours(time)
-    gamma = model.profile.gamma
-    early, late = (_network_colour(model, number, model.times[k], gelu) ** gamma for k in (before, after))
-    return ((1.0 - share) * early + share * late) ** (1.0 / gamma)
-
-
-def _network_colour(model: SheetModel, number: int, time: float, gelu: str) -> np.ndarray:
-    """What the network makes of one time."""
-    row = int((model.kind[:number] >= TileKind.STATIC).sum())
-    of_kind = int((model.kind[:number] == model.kind[number]).sum())
-    temporal, net = None, model.net_static
-    if model.kind[number] == TileKind.DYNAMIC:
-        slices = [decode_image(blocks) for blocks in model.uvt[of_kind]]
-        planes = (exact(plane[of_kind] / 255.0)[None] for plane in (model.ut, model.vt))
-        temporal, net = (exact(np.stack(slices) / 255.0)[None], *planes), model.net
-    width, inputs = model.profile.hidden, model.profile.inputs(temporal is not None)
-    weights = exact(net[of_kind])
-    split = (inputs + width + 2) * width
-    place = torch.cartesian_prod(torch.arange(TILE), torch.arange(TILE))
-    tau = torch.full((len(place),), model.axis.place(time), dtype=torch.float64)
-    features = reference.features_of(
-        exact(decode_image(model.uv[row]) / 255.0)[None],
-        temporal,
-        torch.zeros(len(place), dtype=torch.long),
-        place,
-        tau,
-        exact(model.axis.encode(time)).expand(len(place), 4),
-        model.axis.periodic,
-    )
-    before, after, share = model.axis.neighbours(time)
-    scale = model.scales[row].astype(np.float64)
-    colour = reference.decode(
-        features,
-        weights[:split].reshape(-1, width),
-        weights[split:].reshape(-1, 3),
-        gelu,
-        exact(model.affine[row]),
-        exact((1.0 - share) * scale[before] + share * scale[after]),
-    )
-    return colour.reshape(TILE, TILE, 3).numpy()
-
-
 @pytest.mark.parametrize("periodic", [True, False], ids=["periodic", "clamped"])
 @pytest.mark.parametrize(("hidden", "gelu"), SHAPES)
 def test_exact_against_reference(device: str, hidden: int, gelu: str, periodic: bool):
@@ -102,7 +54,7 @@ def test_exact_against_reference(device: str, hidden: int, gelu: str, periodic: 
         radiance = decoder.tiles(numbers, time)
         codes, bounds = decoder.tiles_8bit(numbers, time)
         for i, number in enumerate(numbers):
-            colour = _reference_colour(model, number, time, gelu)
+            colour = colour_tile64(model, number, time)
             close(radiance[i], colour**model.profile.gamma, 2e-5, f"tile {number} at {time}")
             expected = np.floor(np.clip(colour / bounds[i], 0, 1) * 255.0 + 0.5)
             assert expected.std() > 10, "a picture of one colour tests nothing"
@@ -117,7 +69,7 @@ def test_extreme_sizes(device: str, resolution: int, slices: int, columns: int, 
     sizes = {"uvt_resolution": resolution, "uvt_slices": slices, "plane_columns": columns, "plane_rows": rows}
     model = _model(16, "tanh", **sizes)
     radiance = SheetDecoder(model, device).tiles([2], BETWEEN[1])[0]
-    close(radiance, _reference_colour(model, 2, BETWEEN[1], "tanh") ** model.profile.gamma, 2e-5)
+    close(radiance, decode_tile64(model, 2, BETWEEN[1]), 2e-5)
     _hold_strip(model, device, BETWEEN)
 
 

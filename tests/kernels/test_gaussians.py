@@ -113,37 +113,6 @@ def test_against_autograd(device: str, anisotropy: float, support: str):
     _hold_all(_problem(9, anisotropy), device, support, turns=anisotropy > 1)
 
 
-@pytest.mark.parametrize("latent", [1, 17, *(pytest.param(n, marks=pytest.mark.slow) for n in (12, 32))])
-def test_latents(device: str, latent: int):
-    """Latents on both sides of 16, where a loop is no longer unrolled."""
-    _hold_all(_problem(latent, 8.0), device)
-
-
-def test_differences(device: str):
-    """The slope along a random direction of each group, by central differences."""
-    # At 6 standard deviations, what crosses the border of a Gaussian's reach is 1e-8 of its height.
-    problem = _problem(9, 30.0)
-    random = np.random.default_rng(5)
-    grad = Sums(problem, device, cut=6.0).backward()
-    for group, part in GROUPS.items():
-        direction = np.zeros_like(problem.rows)
-        direction[:, part] = random.normal(size=direction[:, part].shape)
-        if group == "centre":
-            direction[:, part] *= np.exp(problem.rows[:, 3:6].min(1, keepdims=True))
-        elif group == "rotation":
-            direction[:, part] /= 30.0
-
-        def objective(step: float, direction=direction) -> float:
-            moved = Problem(problem.rows + np.float32(step) * direction, problem.x, problem.grad_f)
-            return float((Sums(moved, device, cut=6.0).forward().astype(np.float64) * problem.grad_f).sum())
-
-        # Two lengths of the step together leave an error of the fifth order.
-        h = 0.02
-        slope = 8.0 * (objective(h) - objective(-h)) - (objective(2 * h) - objective(-2 * h))
-        along = (grad.astype(np.float64) * direction).sum()
-        assert slope / (12.0 * h) == pytest.approx(along, rel=3e-4), group
-
-
 def test_hard_gaussians(device: str):
     """No rotation stored, collapsed, flat, as large as all, and far off, among ordinary ones."""
     problem = _problem(9, 8.0)
@@ -176,18 +145,6 @@ def test_one_gaussian_and_one_point(device: str):
     _hold_all(problem, device)
 
 
-def test_none(device: str):
-    """No points, or no Gaussians."""
-    problem = _problem(1, 8.0)
-    nowhere = Problem(problem.rows, problem.x[:0], problem.grad_f[:, :0])
-    nothing = Problem(problem.rows[:0], problem.x, problem.grad_f)
-    for lists in (False, True):
-        sums = Sums(nowhere, device, lists=lists)
-        assert sums.forward().shape == (1, 0) and not sums.backward()[:, 3:].any()
-        sums = Sums(nothing, device, lists=lists)
-        assert not sums.forward().any() and sums.backward().shape == (0, 11)
-
-
 def test_not_a_number(device: str):
     """A point that is NaN gets 0 and gives nothing; a Gaussian that is NaN adds nothing to any point."""
     problem = _problem(1, 8.0)
@@ -209,17 +166,3 @@ def test_same_bits_every_time(device: str, lists: bool):
     first, second = (Sums(problem, device, lists=lists) for _ in range(2))
     np.testing.assert_array_equal(first.forward(), second.forward())
     np.testing.assert_array_equal(first.backward(), second.backward())
-
-
-def test_error_of_the_cut(device: str):
-    """What a cut leaves out of a sum is less than exp(-cut^2 / 2) of each latent; a sphere leaves out less."""
-    problem = _problem(9, 8.0)
-    whole = Sums(problem, device, cut=12.0).forward()
-    size = np.abs(problem.rows[:, 10:]).sum(0)[:, None]
-    errors = {s: [np.abs(Sums(problem, device, s, cut=cut).forward() - whole) for cut in (2.0, 3.0)] for s in SUPPORTS}
-    for cut, error in zip((2.0, 3.0), errors["ellipsoid"], strict=True):
-        assert (error <= np.exp(-cut * cut / 2) * size).all()
-    for two, three in errors.values():
-        assert 0 < three.max() < 0.2 * two.max()
-    for ellipsoid, sphere in zip(errors["ellipsoid"], errors["sphere"], strict=True):
-        assert sphere.mean() < ellipsoid.mean()

@@ -128,20 +128,6 @@ def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind
         close(result[plane], expected[plane], LOOSE, f"plane {plane}")
 
 
-def test_six_way_against_single_lights(device: str):
-    """The sweeps converge to the independent march from each sample as both steps shrink."""
-    scene = _scene(True)
-    ways = [sign * axis for axis in (scene.right, scene.up, scene.toward) for sign in (1.0, -1.0)]
-    fine = [_lit(scene, device, way, step=0.04, g=0.3) for way in ways]
-    close(_lit(scene, device, ways[0], step=0.7, g=0.3), reference.lit(scene, ways[0], 0.7, 0.3), LOOSE, "one light")
-    errors = []
-    for step in (0.5, 0.125):
-        maps = _six(scene, device, step=step, g=0.3)
-        errors.append([np.sqrt(np.square(maps[c] - fine[c]).mean() / np.square(fine[c]).mean()) for c in range(6)])
-    assert max(errors[1]) < 1.5e-3
-    assert max(errors[1]) < 0.4 * max(errors[0])
-
-
 @pytest.mark.parametrize("extinction", [1e-4, 0.05, 2.0])
 def test_slab_closed_forms(device: str, extinction: float):
     """A ray through the middle of a block has closed forms, and an integral for the light from the sides."""

@@ -25,6 +25,13 @@ def _steps(pair: tuple[Trainer, Trainer], quantised: bool) -> list[Step]:
     return steps
 
 
+def _hold(pair: tuple[Trainer, Trainer], quantised: bool) -> None:
+    expected, found = _steps(pair, quantised)
+    close(found.loss, expected.loss, 1e-3, "loss")
+    for key, grad in expected.grads.items():
+        close(found.grads[key], grad, tolerance(pair[1]), f"gradient of {key}")
+
+
 @pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
 @pytest.mark.parametrize("temporal", [True, False], ids=["dynamic", "static"])
 @pytest.mark.parametrize("hidden", [16, 32, 48, 64])
@@ -34,10 +41,7 @@ def test_loss_and_gradients(hidden: int, temporal: bool, quantised: bool):
     settings = {"net_bits": 8 if hidden == 64 else 16}
     case = Case(temporal=temporal, hidden=hidden, gelu=gelu, samples=2048, emphasis=0.7, settings=settings)
     pair = _pair(case)
-    expected, found = _steps(pair, quantised)
-    close(found.loss, expected.loss, 1e-3, "loss")
-    for key, grad in expected.grads.items():
-        close(found.grads[key], grad, tolerance(pair[1]), f"gradient of {key}")
+    _hold(pair, quantised)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e5])
@@ -48,10 +52,7 @@ def test_gradients_beyond_the_range_of_halves(factor: float):
     for fit in pair:
         weight = fit.batch.weight.numpy() * factor * np.logspace(-6, 0, times)[None, :, None]
         fit.batch.weight = wp.array(weight.astype(np.float32), dtype=wp.vec3, device=fit.device)
-    expected, found = _steps(pair, False)
-    close(found.loss, expected.loss, 1e-3, "loss")
-    for key, grad in expected.grads.items():
-        close(found.grads[key], grad, tolerance(pair[1]), f"gradient of {key}")
+    _hold(pair, False)
 
 
 def test_each_sample_counts():

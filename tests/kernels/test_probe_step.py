@@ -245,17 +245,9 @@ class Training:
             probe_step.count_step(self.control)
             s.prepare()
             s.collect(self.grad_f)
-            s.launches.update(
-                self.optimiser,
-                s.values,
-                s.used,
-                s.shapes,
-                s.sums,
-                self._moments,
-                self.net,
-                self._net_moments,
-                array(partial, float, s.device),
-            )
+            rows = s.values, s.used, s.shapes, s.sums, self._moments
+            net = self.net, self._net_moments, array(partial, float, s.device)
+            s.launches.update(self.optimiser, *rows, *net)
         return s.values.numpy(), self.net.numpy()
 
     def expected(self, kind) -> tuple[np.ndarray, np.ndarray]:

@@ -436,17 +436,3 @@ def test_interpolate_what_is_not_there(device: str):
     grad, grad_uv = wp.zeros_like(attribute), wp.zeros_like(uv)
     raster_gradient.interpolate_backward(attribute, triangle, visible, uv, out, grad, grad_uv)
     np.testing.assert_array_equal(grad.numpy()[:, 0], [0.25, 0.25, 0.5])
-
-
-def test_wrong_arguments(device: str):
-    triangle = wp.zeros((2, 3), dtype=int, device=device)
-    for options, message in (
-        ({"space": "screen"}, "space: expected one of clip, uv, got 'screen'"),
-        ({"height": 0}, "height: expected 1 to 16384, got 0"),
-        ({"width": 16385}, "width: expected 1 to 16384, got 16385"),
-        ({"triangle": wp.zeros((2, 4), dtype=int, device=device)}, r"triangle: expected \[F, 3\], got \(2, 4\)"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Rasterizer(**{"triangle": triangle, "height": 4, "width": 4, **options})
-    with pytest.raises(ValueError, match=r"position: expected \[V, 4\] in clip space, got \(5, 2\)"):
-        Rasterizer(triangle, 4, 4).run(wp.zeros((5, 2), dtype=float, device=device))

@@ -6,20 +6,11 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
+from kernels.compare import half_array, noise
 from wlm_kernels.smoke import marches
-from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import LIGHTS, PLANES, STRIP, Taps, decode, encode_six, kernels
 
 _EVERY = [(plane % 2, 5 * plane) for plane in range(PLANES)]  # a group and a first output for each plane
-
-
-def _random(half: bool, *shape: int) -> torch.Tensor:
-    values = torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)))
-    return values.half().float() if half else values
-
-
-def _array(values: torch.Tensor, half: bool, device: str) -> wp.array:
-    return wp.array(values.numpy(), dtype=wp.float16 if half else float, device=device)
 
 
 def _near(guide: torch.Tensor, reach: int, half: bool, device: str) -> np.ndarray:
@@ -27,7 +18,7 @@ def _near(guide: torch.Tensor, reach: int, half: bool, device: str) -> np.ndarra
     blocks = [-(-size // reach) for size in guide.shape[1:]]
     smoke = wp.full(blocks, -1, dtype=int, device=device)
     dim = blocks[0] * blocks[1] * made.lanes
-    wp.launch(made.near, dim, inputs=[_array(guide, half, device)], outputs=[smoke], device=device)
+    wp.launch(made.near, dim, inputs=[half_array(guide, half, device)], outputs=[smoke], device=device)
     return smoke.numpy()
 
 
@@ -37,8 +28,8 @@ def _compose(heads, guide, filters, places, stem, smoke, *, reach=8, half=False,
     weights = filters.permute(1, 3, 2, 0).reshape(-1, PLANES).contiguous()
     height, width = guide.shape[1:]
     inputs = [
-        _array(heads.permute(0, 2, 3, 1).contiguous(), half, device),
-        _array(guide, half, device),
+        half_array(heads.permute(0, 2, 3, 1).contiguous(), half, device),
+        half_array(guide, half, device),
         wp.array(weights.numpy(), dtype=Taps, device=device),
         wp.array(np.array(places), dtype=int, ndim=2, device=device),
         stem,
@@ -72,8 +63,8 @@ def _wanted(heads, guide, filters, places, stem, smoke, reach=8) -> torch.Tensor
 @pytest.mark.parametrize("size", [(1, 1), (4, 8), (17, 23), (41, 50)])
 def test_planes_of_heads_and_a_filter(device, size, stem, half):
     """Sums are float32 also for half floats. The image of the heads may be larger, and the filter may omit planes."""
-    heads = _random(half, 2, 5 * PLANES + 4, *(-(-extent // stem) + 1 for extent in size))
-    guide, filters = _random(half, 4, *size), _random(False, PLANES, 3, 5, 5)
+    heads = noise(half, 2, 5 * PLANES + 4, *(-(-extent // stem) + 1 for extent in size))
+    guide, filters = noise(half, 4, *size), noise(False, PLANES, 3, 5, 5)
     smoke = [[int(i == j == 0) for j in range(-(-size[1] // 8))] for i in range(-(-size[0] // 8))]
     result = _compose(heads, guide, filters, _EVERY, stem, smoke, half=half, device=device)
     expected = _wanted(heads, guide, filters, _EVERY, stem, smoke)
@@ -85,7 +76,11 @@ def test_planes_of_heads_and_a_filter(device, size, stem, half):
 @pytest.mark.parametrize("edge, planes", [(1, 0), (1, 2), (3, 1)])
 @pytest.mark.parametrize("reach", [4, 32])
 def test_other_filters_and_reaches(device, edge, planes, reach):
-    heads, guide, filters = _random(False, 2, 40, 41, 50), _random(False, 3, 41, 50), _random(False, PLANES, 2, 3, 3)
+    heads, guide, filters = (
+        noise(False, 2, 40, 41, 50),
+        noise(False, 3, 41, 50),
+        noise(False, PLANES, 2, 3, 3),
+    )
     filters = filters[:, :planes, :edge, :edge].contiguous()
     blocks = [-(-41 // reach), -(-50 // reach)]
     smoke = np.zeros(blocks, dtype=np.int32)
@@ -97,7 +92,11 @@ def test_other_filters_and_reaches(device, edge, planes, reach):
 
 
 def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
-    heads, guide, filters = _random(False, 2, 40, 32, 32), _random(False, 3, 32, 32), _random(False, PLANES, 2, 3, 3)
+    heads, guide, filters = (
+        noise(False, 2, 40, 32, 32),
+        noise(False, 3, 32, 32),
+        noise(False, PLANES, 2, 3, 3),
+    )
     heads[:, :, 2, 2] = heads[:, :, 20, 20] = guide[:, 9, 30] = torch.nan
     smoke = [[1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
     result = _compose(heads, guide, filters, _EVERY, 1, smoke, device=device)
@@ -109,7 +108,7 @@ def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
 @pytest.mark.parametrize("size", [(1, 1), (8, 5), (17, 70), (100, 33)])
 def test_blocks_with_smoke(device, size, reach, half):
     """A single pixel counts, also the last of a block; 0, negative values and NaN do not."""
-    guide = _random(half, 4, *size)
+    guide = noise(half, 4, *size)
     some = torch.rand(size, generator=torch.Generator().manual_seed(1))
     guide[2] = torch.where(some < 0.01, 1e-3, torch.where(some < 0.5, torch.nan, -(some > 0.9).float()))
     guide[2, -1, -1] = 1e-6
@@ -129,13 +128,13 @@ def _srgb(linear: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("hot", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (7, 40)])
 def test_the_guide_of_six_lights(device, size, hot):
-    planes = 2 * _random(False, 9, *size)
+    planes = 2 * noise(False, 9, *size)
     values = (0.0, 0.003, 0.0031308, 0.0032, 1.0, 1e4, 1e-30, -0.0, torch.nan)
     if size[1] > len(values):
         planes[:, 3, : len(values)] = torch.tensor(values)
     near, far = -0.5, 1.75
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
-    encode_six(_array(planes, False, device), near, far, hot, out)
+    encode_six(half_array(planes, False, device), near, far, hot, out)
     result = torch.from_numpy(out.numpy()).double()
     of = dict(zip(marches.PLANES, planes.double(), strict=True))
     glow = of["emission"].clamp(min=0) if hot else torch.zeros(size, dtype=torch.float64)
@@ -147,11 +146,11 @@ def test_the_guide_of_six_lights(device, size, hot):
 
 
 def test_decode(device):
-    planes = 1.5 * _random(False, PLANES, 5, 7) + 0.5
+    planes = 1.5 * noise(False, PLANES, 5, 7) + 0.5
     for i, value in enumerate((0.0, 0.04045, 0.0404, 1.0, 1.00001, 0.999999, -1e30, 1e30, np.nan)):
         planes[:, i // 7, i % 7] = value
     out = wp.full(planes.shape, -1.0, dtype=float, device=device)
-    decode(_array(planes, False, device), out)
+    decode(half_array(planes, False, device), out)
     result, code = torch.from_numpy(out.numpy()).double(), planes.double()
     light = torch.where(code <= 0.04045, code.clamp(min=0) / 12.92, ((code.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)
     torch.testing.assert_close(result[:LIGHTS], light[:LIGHTS].float().double(), rtol=3e-6, atol=0, equal_nan=True)
@@ -171,12 +170,3 @@ def test_wrong_edges_and_reaches_are_refused():
     for reach in (2, 12, 64):
         with pytest.raises(ValueError, match="reach: expected 4, 8, 16 or 32"):
             kernels(5, reach, False, False)
-
-
-@pytest.mark.parametrize("half", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_compiles_for_a_gpu(tmp_path, half):
-    made = kernels(5, 8, half, True)
-    alone = {"encode": smoke_planes._encode_six, "decode": smoke_planes._decode}
-    for name, kernel in {"near": made.near, "compose": made.compose, **alone}.items():
-        files = wp.compile_aot_module(kernel.module, arch=[90], module_dir=tmp_path / name)
-        assert any(path.suffix in (".ptx", ".cubin") and path.stat().st_size for path in files)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 
 from kernels.compare import array, close, exact
@@ -118,20 +117,6 @@ def test_weights_of_a_wide_texture(device: str):
     close(Reading(image, uv, device).forward()[:, 0], want, 1e-6)
 
 
-def test_gradients_that_are_not_computed(device: str):
-    """An empty buffer stays empty, the other is as with both."""
-    image, uv = np.random.default_rng(5).normal(size=(4, 4, 2)).astype(np.float32), _points((4, 4, 2))
-    reading = Reading(image, uv, device)
-    toward = array(np.ones((len(uv), 2), np.float32), float, device)
-    both = reading.backward(toward.numpy())
-    grad_image, grad_uv = wp.zeros_like(reading.image), wp.zeros_like(reading.uv)
-    texture.sample_backward(reading.image, reading.uv, toward, grad_image, wp.empty(0, dtype=wp.vec2, device=device))
-    none = wp.empty((0, 0, 0), dtype=float, device=device)
-    texture.sample_backward(reading.image, reading.uv, toward, none, grad_uv)
-    close(grad_image, both[0], 1e-6)
-    np.testing.assert_array_equal(grad_uv.numpy(), both[1])
-
-
 @wp.kernel(enable_backward=False)
 def _wave(
     # in:
@@ -153,30 +138,3 @@ def test_triangle_wave(device: str):
     close(y[:-1, 0], np.arccos(np.cos(np.pi * x[:-1].astype(np.float64))) / np.pi, 1e-6)
     phase = np.mod(x[:500], 2.0)
     np.testing.assert_array_equal(y[:500, 1], np.where(phase < 1.0, 1.0, -1.0))
-
-
-def test_nothing_to_read(device: str):
-    """No points, no work; no texels, an error."""
-    image = np.ones((2, 2, 3), np.float32)
-    reading = Reading(image, np.zeros((0, 2), np.float32), device)
-    assert reading.forward().shape == (0, 3)
-    assert not reading.backward(np.zeros((0, 3), np.float32))[0].any()
-    with pytest.raises(ValueError, match=r"texture: expected \[H, W, C\], none of them 0, got \(0, 2, 3\)"):
-        Reading(image[:0], np.zeros((1, 2), np.float32), device).forward()
-
-
-def test_wrong_names(device: str):
-    uv, image = np.zeros((1, 2), np.float32), np.ones((2, 2, 3), np.float32)
-    with pytest.raises(ValueError, match="filter: expected one of linear, nearest, got 'cubic'"):
-        Reading(image, uv, device, filter="cubic").forward()
-    with pytest.raises(ValueError, match="boundary: expected one of clamp, wrap, mirror, got 'zero'"):
-        Reading(image, uv, device, boundary="zero").forward()
-
-
-def test_twin_gradient_reaches_texels():
-    """The twin itself: each sample's weights add up to 1."""
-    image = torch.zeros(3, 4, 1, dtype=torch.float64, requires_grad=True)
-    uv = exact(_points((3, 4, 1)))
-    for boundary in BOUNDARIES:
-        (grad,) = torch.autograd.grad(plain.texture(image, uv, boundary=boundary).sum(), image)
-        assert float(grad.sum()) == pytest.approx(len(uv))

@@ -119,8 +119,3 @@ def test_entries_at_the_end_of_their_range(device: str):
     uv = np.stack([(np.linspace(0, 15, 31) + 0.5) / 16, np.zeros(31)], 1)
     got = _decode(uv, 16, 16, 15, lut, texels, device)
     np.testing.assert_allclose(got, np.repeat(np.linspace(0, 15, 31)[:, None], 3, 1), atol=1e-5)
-
-
-def test_no_point(device: str):
-    lut, texels = _table(29, 29, 7, 8)
-    assert _decode(np.empty((0, 2)), 29, 29, 7, lut, texels, device).shape == (0, 3)

@@ -58,7 +58,7 @@ class Surface:
         position: float64 [V, 3], in the world.
         triangle: int32 [F, 3]; counter-clockwise as seen from the front.
         normal: float64 [V, 3], unit shading normals; 0 where the file has none.
-        uv: float64 [V, 2], lightmap UVs; None if it has none and isn't baked.
+        uv: float64 [V, 2], lightmap UVs; None if the surface has none and isn't baked.
         texture_uv: float32 [V, 2], UVs of the material's texture, or None.
         material: The material.
     """
@@ -80,7 +80,7 @@ class Geometry:
         surfaces: The surfaces in the order of the file.
         replacements: Input of `write_glb` for an unwrapped file; otherwise empty.
         uv_set: n of the lightmap's `TEXCOORD_n`; None if it wasn't requested.
-        usual: Whether readers choose this set by default: 1 if it exists, else 0.
+        usual: Whether readers choose this UV set by default: `TEXCOORD_1` if it exists, else `TEXCOORD_0`.
     """
 
     document: GltfDocument
@@ -100,8 +100,8 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
     """Reads a glTF file; `settings` selects the lightmap UVs or how to unwrap them, None if no UVs are needed.
 
     Raises:
-        WlmError: It can't be read, has no triangle with area, is too small, too large or too far from the origin for
-            rays in float32, or lacks the lightmap's UVs.
+        WlmError: The file can't be read, has no triangle with area, is too small, too large or too far from the origin
+            for rays in float32, or lacks the lightmap's UVs.
     """
     document, primitives = read_gltf(path, trust)
     for each in primitives:

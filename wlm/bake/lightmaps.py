@@ -1,4 +1,4 @@
-"""Bakes a scene's lightmaps by the hour: irradiance and noise per texel, coverage, and the set's `set.json`."""
+"""Bakes a scene's lightmaps for each hour: irradiance and noise per texel, coverage, and the set's `set.json`."""
 
 import json
 import os

@@ -65,7 +65,7 @@ class Tracing:
     Attributes:
         outside: The sun and the ambient light.
         sun_direct: Whether the sun's direct light is included.
-        samples: Paths per texel or probe, rounded up to a multiple of 8.
+        samples: Number of paths per texel or probe, rounded up to a multiple of 8.
         bounces: Maximum number of reflections.
         seed: Seed of the random numbers.
     """
@@ -195,7 +195,7 @@ def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any
 
 
 def _gather(one: Any, count: int, channels: int, tracing: Tracing, report: Any) -> Gathered:
-    """Averages samples in batches and estimates the noise from the batches' spread."""
+    """Averages samples in batches and estimates the noise from the differences between the batches' means."""
     each = -(-tracing.samples // _PARTS)
     at_once = max(1, _LANES // each)
     total, square = np.zeros((2, count, channels))

@@ -1,4 +1,4 @@
-"""Bakes a scene's light probes by the hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
+"""Bakes a scene's light probes for each hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
 
 import math
 import os
@@ -41,7 +41,7 @@ class BakedProbes:
 
 
 def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
-    """Computes the probes' positions, float32 [N, 3]; `seed` is that of the random positions on surfaces.
+    """Computes the probes' positions, float32 [N, 3]; `seed` selects the random positions on surfaces.
 
     Raises:
         WlmError: There would be more than a million probes.
@@ -125,7 +125,7 @@ def bake_probes(
 
 
 def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
-    """Writes probes as `.npz`: `position`, `sh` of one hour or `sh_HOUR` of several, and the noise likewise.
+    """Writes probes as `.npz`: `position`, `sh` for one hour or `sh_HOUR` for each of several, and likewise the noise.
 
     Raises:
         WlmError: The file can't be written.

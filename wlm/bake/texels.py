@@ -24,7 +24,7 @@ class Texels:
         first: int64 [T + 1], index of each texel's first sample.
         position: float32 [N, 3], sample positions.
         normal: float32 [N, 3], unit shading normals.
-        face: float32 [N, 3], unit geometric normals of the triangles, on the same side.
+        face: float32 [N, 3], unit geometric normals of the triangles, on the side of `normal`.
         coverage: float32 [T], the covered share of the texel.
     """
 
@@ -82,8 +82,8 @@ def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, super
     overlap = float((raster.coverage.numpy()[row, column] > 1).mean())
     if overlap > _OVERLAP:
         raise WlmError(
-            f"{where}: lightmap UVs: {overlap:.0%} of what is covered lies in several triangles, expected each place "
-            "in one: lightmap.unwrap: true makes new ones"
+            f"{where}: lightmap UVs: {overlap:.0%} of the covered area lies in several triangles, expected no "
+            "overlap: lightmap.unwrap: true makes new UVs"
         )
     chosen = number[row, column]
     local = np.arange(3 * len(triangle), dtype=np.int32).reshape(-1, 3)

@@ -90,8 +90,8 @@ def each_hour(
 ) -> list[dict[str, np.ndarray]]:
     """Computes the result of each hour, except those in the checkpoint.
 
-    `make` computes the arrays of an hour, which `table` describes, and calls its second argument with the finished
-    share; `progress` is called regularly.
+    `make(hour, report)` computes the arrays of an hour, which `table` describes, and calls `report` with the finished
+    share of the work; `progress` is called regularly.
     """
     meter, results = Meter(progress, "bake", _REPORTS * len(hours)), []
     try:

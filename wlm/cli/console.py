@@ -26,27 +26,6 @@ if TYPE_CHECKING:
     from wlm.formats.checkpoint import Checkpoint
     from wlm.system import OnProgress, Progress
 
-__all__ = [
-    "check_output",
-    "escape",
-    "exclusive",
-    "note",
-    "note_start",
-    "note_warnings",
-    "number",
-    "progress_bar",
-    "quiet_warp",
-    "running",
-    "show",
-    "show_facts",
-    "show_figures",
-    "show_files",
-    "show_json",
-    "show_text",
-    "table",
-    "write_json",
-]
-
 _PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
 _PLAIN_REPORTS = 10  # lines of progress in a log
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"

@@ -8,8 +8,10 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
+from rich.markup import escape
+
 from wlm import __version__
-from wlm.cli.console import escape, quiet_warp, show, table
+from wlm.cli.console import quiet_warp, show, table
 
 
 def doctor() -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from wlm.cli import models
 from wlm.cli.console import (
     check_output,
-    escape,
     exclusive,
     note,
     note_warnings,

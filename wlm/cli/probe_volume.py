@@ -19,12 +19,8 @@ _DECIBELS = {
 }
 _COSTS = {"blocks decoded per frame": "updated", "frame, ms": "update_ms"}
 
-app = typer.Typer(help="Light probes: the cascaded volume that a renderer samples.")
-
-
-@app.callback()
-def _group() -> None:
-    """Light probes: the cascaded volume that a renderer samples."""
+# The callback keeps the name of the only command in the command line.
+app = typer.Typer(help="Light probes: the cascaded volume that a renderer samples.", callback=lambda: None)
 
 
 @app.command()

@@ -7,11 +7,11 @@ from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from rich.markup import escape
 
 from wlm.cli import smoke_book, smoke_network
 from wlm.cli.console import (
     check_output,
-    escape,
     exclusive,
     note,
     note_warnings,

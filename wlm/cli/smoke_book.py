@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from rich.markup import escape
 
-from wlm.cli.console import check_output, escape, note, quiet_warp, running, show, table
+from wlm.cli.console import check_output, note, quiet_warp, running, show, table
 from wlm.cli.options import Device, Engine, ShaderLanguage, output_option
 from wlm.cli.smoke_options import SHEET, Background, White, check_white, outputs, vector, vectors
 from wlm.errors import WlmError

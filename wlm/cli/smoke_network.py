@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from wlm.cli.console import (
     check_output,
-    escape,
     exclusive,
     note,
     number,

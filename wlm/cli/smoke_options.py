@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
-from wlm.cli.console import check_output, escape, note, note_warnings, number, running, show, table
+from wlm.cli.console import check_output, note, note_warnings, number, running, show, table
 from wlm.cli.options import Device, Trust
 from wlm.errors import WlmError
 

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.markup import escape
 
-from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
+from wlm.cli.console import check_output, quiet_warp, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Up
 from wlm.errors import WlmError
 

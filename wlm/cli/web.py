@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
-from wlm.cli.console import check_output, escape, quiet_warp, running, show, table
+from wlm.cli.console import check_output, quiet_warp, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Up, output_option
 
 

@@ -1,4 +1,4 @@
-"""Models as files for other programs: raw folders, kits for engines, shaders in other languages, and HTML pages.
+"""Exports models for other programs: raw folders, kits for engines, shaders in other languages, and HTML pages.
 
 import wlm
 

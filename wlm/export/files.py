@@ -29,7 +29,7 @@ _UNORM_16 = 65535
 
 
 def write_texture(folder: Path, name: str, texture: Texture, ending: str | None = None) -> dict[str, Any]:
-    """Writes a texture as a DDS file, or as KTX2 if DDS does not have its format, and returns its entry of the index.
+    """Writes a texture as DDS, or as KTX2 if DDS lacks its format, and returns its entry for the folder's index.
 
     `ending` replaces the usual ending of the file's name, ".dds" or ".ktx2".
 
@@ -47,13 +47,8 @@ def write_texture(folder: Path, name: str, texture: Texture, ending: str | None 
     else:
         write_ktx2(made, content, *size, texture.fmt, mips=texture.mips)
     file = made if ending is None else made.rename(folder / (name + ending))
-    return texture_entry(texture, file.name)
-
-
-def texture_entry(texture: Texture, file: str) -> dict[str, Any]:
-    """Describes a texture for an index."""
     return {
-        "file": file,
+        "file": file.name,
         "format": texture.fmt,
         "width": texture.width,
         "height": texture.height,
@@ -63,7 +58,7 @@ def texture_entry(texture: Texture, file: str) -> dict[str, Any]:
 
 
 def write_buffer(folder: Path, name: str, values: np.ndarray, ending: str = ".bin") -> dict[str, Any]:
-    """Writes an array of numbers as little-endian bytes, and returns its entry of the index."""
+    """Writes an array of numbers as little-endian bytes, and returns its entry for the folder's index."""
     values = values.astype(values.dtype.newbyteorder("<"), copy=False)
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise WlmError(f"{name}: cannot export: a number is NaN or infinite")
@@ -72,7 +67,7 @@ def write_buffer(folder: Path, name: str, values: np.ndarray, ending: str = ".bi
 
 
 def write_reference(folder: Path, name: str, values: np.ndarray) -> dict[str, Any]:
-    """Writes a picture as EXR, any other array as bytes."""
+    """Writes a picture as EXR, any other array as bytes; returns its entry for the folder's index."""
     if values.ndim != 3 or values.shape[2] != 3:
         return write_buffer(folder, name, values)
     write_exr(folder / f"{name}.exr", values, half=False)
@@ -83,8 +78,8 @@ def decode_texture(texture: Texture) -> np.ndarray:
     """Decodes the largest level of a texture for engines that import pictures.
 
     Returns:
-        [H, W, C], or [L, H, W, C] of an array: uint8 levels of 8-bit formats and BC7, whole numbers of UINT formats,
-        float32 of all others. BC6H and ASTC give the texture's own `image`.
+        [H, W, C], or [L, H, W, C] for an array of L layers: uint8 for 8-bit formats and BC7, integers for UINT formats,
+        else float32. For BC6H and ASTC it is the texture's own `image`.
     """
     if texture.image is not None:
         return texture.image

@@ -4,7 +4,7 @@ Both are written from the model's `Bundle`. The folder's index, `bundle.json`, h
 level, and beside it:
 
     format, version     "wlm-bundle" and its number
-    system, name        as of the bundle
+    system, name        those of the bundle
     engine              the engine of a kit; null for a raw folder
     shader              file of the shader; null for a collection
     textures            by name: file, format, width, height, layers of an array (0: no array), mips
@@ -59,11 +59,11 @@ def export(
         folder: The folder; made if it does not exist.
         engine: One of `wlm.export.ENGINES`; None for the raw folder.
         shader: Language of the raw folder's shader, one of `wlm.export.LANGUAGES`.
-        exact: Whether the raw folder's shader fetches texels and mixes them in floats instead of using the filter.
-        device: Device that decodes the reference, "cpu" or "cuda:0" for example.
+        exact: Whether the raw folder's shader fetches texels and interpolates in floats, without the texture filter.
+        device: Device that decodes the model for the folder's reference image, for example "cpu" or "cuda:0".
         options: Options of the kit. Probes: `original`, the file that was compressed, if the model does not store its
-            positions; `cells` of a grid along its longest side (three, godot, unreal); `mirror`, the axis to mirror
-            (unity).
+            positions; `cells`, the number of a grid's cells along its longest side (three, godot, unreal); `mirror`,
+            the axis to mirror (unity).
 
     Returns:
         The files written, the index last.
@@ -108,7 +108,7 @@ def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None
 
 
 def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: dict[str, Any]) -> None:
-    """Writes the kit of a bundle, or of each of its parts that are light, in a subfolder each."""
+    """Writes the kit of a bundle, or of each part of a collection that contains light, in a subfolder each."""
     if not bundle.parts:
         if bundle.system not in _KITS:
             raise WlmError(f"{bundle.name}: there is no kit for {engine}; expected the raw folder")

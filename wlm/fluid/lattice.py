@@ -1,17 +1,7 @@
 """A lattice Boltzmann solver of air (neural-six-way-lightmaps, section 5).
 
 Lengths are in cells, times in steps, and the density of air at rest is 1; `Domain` converts. Arrays are [X, Y, Z],
-cell centres at half integers. Special cases:
-
-====================================  =================================================================
-a flow that blows up                  error within `CHECK_EVERY` steps: first step and cell, and the cause
-a wall, body or inlet too fast        error: the speed and `MAX_SPEED`
-a body over an inlet                  no inflow through the covered part
-a body over the whole domain          no motion
-a grid or an axis of one cell         valid
-a domain too large for the memory     error before the allocation: required and available memory
-a cell freed with no fluid around it  at rest at density 1
-====================================  =================================================================
+cell centres at half integers.
 """
 
 import math

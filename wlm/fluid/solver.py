@@ -3,21 +3,6 @@
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
 order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
-Special cases:
-
-=====================================  ===================================================================
-no smoke                               valid: the air moves, every density is 0
-an obstacle that covers an inlet       no inflow through the covered part
-an obstacle or an inlet too fast       error of the lattice: the speed and its limit
-air that blows up                      error of the lattice, within `wlm.fluid.lattice.CHECK_EVERY` of its
-                                       steps: step, cell, cause, and the last saved state, which is kept
-smoke in an obstacle                   none; smoke that a moving obstacle covers is lost, cells that it
-                                       frees get the mean of the cells beside them
-smoke at faces                         leaves through inlets and outlets, where clean air comes in; stays at
-                                       walls. A face with an inlet is open as a whole
-a grid of one voxel                    valid
-grids too large for the memory         error before the allocation: required and available memory
-=====================================  ===================================================================
 """
 
 import hashlib

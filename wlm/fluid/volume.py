@@ -1,29 +1,6 @@
 """Density volumes of smoke: validated input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
 
-Special cases. Repairs are listed in `DensityVolume.warnings`, one line for each kind.
-
-====================================  ================================================================
-input                                 result
-====================================  ================================================================
-NaN or infinite voxels                0; warning with the count and the first voxel
-negative voxels                       0; warning likewise (solvers and filters produce small ones)
-all voxels zero, or a single voxel    valid
-no voxel                              error
-float16                               stays half; float32, float64 and integers become float32
-float64 beyond float32                treated as infinite: 0, warning
-other types, other than 3 dimensions  error
-more than 1024^3 voxels, or more than error, unless the file is trusted
-512^3 claimed by a much smaller file
-temperature of another shape          error
-temperature at which a voxel emits    lowered; warning with the count and the first voxel
-more than 65,504 (half's maximum)
-a length, extinction or emission      error
-beyond float32
-voxels of a `.nvdb` or `.vdb` that    resampled to cubic voxels (`wlm.fluid.grids`)
-are not cubes along the axes
-grids of points, vectors, integers    ignored in a `.vdb`; an error if chosen in a `.nvdb`
-a file missing or damaged             error that names the file and the field
-====================================  ================================================================
+Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
 A grid's density has no unit: the extinction per length is `extinction` times the density.
 """
@@ -162,10 +139,10 @@ def from_array(
         name: Name in messages.
 
     Returns:
-        The volume, repaired as in the module's table.
+        The volume, repaired as `docs/fluid.md` lists.
 
     Raises:
-        WlmError: An error of the module's table.
+        WlmError: The input is one of the errors of `docs/fluid.md`.
     """
     device = check_device(device)
     # Kernels compute in float32.
@@ -222,10 +199,10 @@ def load_volume(
         temperature: Name of the temperature's array or grid; None: `temperature`, if it exists.
 
     Returns:
-        The volume, repaired as in the module's table.
+        The volume, repaired as `docs/fluid.md` lists.
 
     Raises:
-        WlmError: An error of the module's table; the message names the file and the field.
+        WlmError: The input is one of the errors of `docs/fluid.md`; the message names the file and the field.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -304,7 +281,7 @@ def _check(
     warnings: list[str],
     dtype: torch.dtype | None = None,
 ) -> torch.Tensor:
-    """Returns the values in `dtype` (None: half if they are half, else float32), repaired as in the module's table."""
+    """Returns the values in `dtype` (None: half if they are half, else float32), repaired as `docs/fluid.md` lists."""
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:

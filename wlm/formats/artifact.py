@@ -1,4 +1,4 @@
-"""The artifact: everything that one system's fit produced, in one safetensors file.
+"""The artifact: one safetensors file with all results of a fit by one system, such as "lightmap" or "probe".
 
 The file is a valid safetensors file: an 8-byte length, a JSON header, the tensors. The header's
 `__metadata__`, whose values must be strings, has two keys:
@@ -7,9 +7,9 @@ The file is a valid safetensors file: an 8-byte length, a JSON header, the tenso
   file with the digest's own 32 characters as zeros;
 - `settings`: JSON, with `"` and `'` exchanged, because each `"` inside a JSON string would cost an escape.
 
-A part is a tensor; its byte count is what its type and shape say, and its offsets must say the same.
+Each tensor is called a part. Its offsets in the header must span exactly the bytes of its type and shape.
 
-An artifact without a source is a compact one (`wlm.formats.compact`).
+An artifact whose source is empty is stored in another, compact form: `wlm.formats.compact`.
 """
 
 import hashlib
@@ -58,7 +58,7 @@ _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 
 
 def _finite(text: str) -> float:
-    """A number of JSON; for Python's parser NaN, Infinity and 1e999 are some too."""
+    """Parses a number in JSON; refuses NaN, Infinity and 1e999, which Python's JSON parser accepts."""
     if not math.isfinite(value := float(text)):
         raise ValueError(f"expected finite numbers, found {one_line(text, 30)}")
     return value
@@ -74,7 +74,7 @@ class Artifact:
     Attributes:
         system: The system that wrote it, for example "lightmap".
         version: Version of the format.
-        settings: Settings of the fit; for a compact artifact only `name`, that of the file.
+        settings: Settings of the fit; for a compact artifact only `name`, the file's name without its ending.
         source: Hash of the input, as given by the writer; empty for a compact artifact.
         tensors: The parts by name, as read-only views of the mapped file.
         parts: Sizes of the parts by name, in bytes.
@@ -135,7 +135,7 @@ def encode_artifact(
         if not word or not word.isascii() or not word.isprintable() or " " in word:
             raise ValueError(f"{what}: expected one ASCII word, got {word!r}")
     if "__metadata__" in tensors:
-        raise ValueError("'__metadata__' is no name for a tensor: the format keeps it for itself")
+        raise ValueError("'__metadata__' is no name for a tensor: the format reserves it")
     # Wide types first, so that every tensor begins at a multiple of its item's size with no padding between.
     arrays = {
         name: _little_endian(name, array)
@@ -168,7 +168,7 @@ def encode_artifact(
 
 
 def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:
-    """Maps an artifact and compares all its bytes with its digest, except tensors that are read piece by piece.
+    """Maps an artifact into memory and checks all its bytes against its digest.
 
     `system` is the system that must have written it; None accepts any. The tensors stay valid while they are
     referenced, even if the file is replaced.
@@ -273,7 +273,7 @@ def _metadata(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[tup
 
 
 def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tuple[int, ...], int, int]:
-    """Checks one tensor's line of the header and gives its type, shape, begin and end."""
+    """Checks the header's entry of one tensor and returns its type, shape, and first and last offset."""
     try:
         kind, shape, (begin, end) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
         numbers = (*shape, begin, end)
@@ -296,7 +296,7 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
 def _check_extents(
     path: str | os.PathLike[str], entries: dict[str, tuple[str, tuple[int, ...], int, int]], payload: int
 ) -> None:
-    """Checks that the parts fill what follows the header, with no gap and no overlap."""
+    """Checks that the parts fill the file after the header, with no gap and no overlap."""
     reached = 0
     for name, (_, _, begin, end) in sorted(entries.items(), key=lambda item: item[1][2:]):
         if begin != reached:

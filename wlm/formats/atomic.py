@@ -78,7 +78,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
 
 @contextmanager
 def _as_wlm_error(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turns an `OSError` into a line that names the output file."""
+    """Turns an `OSError` in the block into a `WlmError` that names the output file."""
     try:
         yield
     except OSError as error:

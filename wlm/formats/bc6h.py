@@ -73,7 +73,7 @@ _PARTITION_BITS = 5
 
 
 def _fields(text: str) -> list[int]:
-    """Computes the code in `LAYOUT` of every bit that a mode's line names."""
+    """Returns the code of each bit, as in `LAYOUT`, from the text of a mode in `_MODES`, such as "rw0-9 gx4"."""
     codes = []
     for token in text.split():
         field = 4 * "rgb".index(token[0]) + "wxyz".index(token[1])
@@ -118,7 +118,7 @@ _RESERVED = -1
 
 
 def _rows() -> np.ndarray:
-    """Makes a table from the lowest five bits of a block to the row of `MODES`, or `_RESERVED` for four values."""
+    """Makes a table that maps the lowest five bits of a block to its row of `MODES`, or to `_RESERVED`."""
     rows = np.full(32, _RESERVED, np.int64)
     for row, (number, bits) in enumerate(MODES[:, :2]):
         rows[np.arange(number, 32, 1 << bits)] = row
@@ -149,7 +149,7 @@ def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
 
 
 def _decode_mode(blocks: np.ndarray, mode: int) -> np.ndarray:
-    """Decodes blocks of one mode, half [B, 16, 3]."""
+    """Decodes blocks of one mode, uint8 [B, 16], to texels, half [B, 16, 3]."""
     bits = np.unpackbits(blocks, axis=1, bitorder="little").astype(np.int32)
     fields = np.zeros((PARTITION + 1, len(blocks)), np.int32)
     for place in np.flatnonzero(LAYOUT[mode] >= 0):

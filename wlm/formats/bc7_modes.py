@@ -98,8 +98,8 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
     thread.
 
     Args:
-        extra: Name of the optional extra for the error message.
-        profile: One of `ENCODERS`.
+        extra: Name of this package's optional extra with the compressor, for the error message.
+        profile: Quality of the compressor, one of `ENCODERS`.
 
     Returns:
         The blocks, uint8 [H/4, W/4, 16].
@@ -151,7 +151,7 @@ def decode_blocks(blocks: np.ndarray) -> np.ndarray:
 
 
 def _texels(bits: np.ndarray, mode: int) -> np.ndarray:
-    """Decodes blocks of one mode, given as bits [n, 128], to texels [n, 16, 4]."""
+    """Decodes n blocks of one mode, given as bits [n, 128], to RGBA texels, uint8 [n, 16, 4]."""
     is_of = dict(zip(FIELDS, MODES[mode].tolist(), strict=True))
     subsets, at = is_of["subsets"], mode + 1
 
@@ -198,7 +198,7 @@ def _number(bits: np.ndarray) -> np.ndarray:
 
 
 def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.ndarray:
-    """Returns weights of endpoint 1, [n, 16], from indices of `count` bits that start at bit `at`; anchors [n, 2]."""
+    """Returns the weights of endpoint 1, [n, 16], from the blocks' indices of `count` bits from bit `at` on."""
     texel = np.arange(16)
     short = (texel == 0) | (texel == anchors[:, :1]) | (texel == anchors[:, 1:])
     start = at + count * texel - (np.cumsum(short, axis=1) - short)
@@ -210,7 +210,7 @@ def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.nd
 
 
 def _swapped(texels: np.ndarray, channel: int) -> np.ndarray:
-    """Swaps alpha with another channel."""
+    """Returns RGBA texels with alpha and one other channel swapped."""
     order = list(range(4))
     order[channel], order[3] = 3, channel
     return texels[..., order]

@@ -3,7 +3,7 @@
 A block codec's bytes hardly compress, since no two blocks are equal. Here a block is replaced by an earlier one that
 fits its texels nearly as well: zstd or LZMA then stores a match in place of 16 bytes. The block with the least error
 within a window is used (the nearest of equals) if its error exceeds that of the original by no more than a given
-amount. Memory and decoding are unchanged.
+amount. The size in GPU memory and the decoder stay the same.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ _WINDOW = 512  # blocks
 def reuse_blocks(
     data: bytes, decoded: np.ndarray, target: np.ndarray, weight: np.ndarray, allowed: np.ndarray
 ) -> bytes:
-    """Repeats blocks of a picture.
+    """Replaces blocks of a picture by earlier ones where that adds little error.
 
     Args:
         data: Blocks of 16 bytes, row by row.
@@ -40,11 +40,11 @@ def reuse_in_order(
     allowed: np.ndarray,
     window: int = _WINDOW,
 ) -> np.ndarray:
-    """Repeats blocks in the order in which a file stores them.
+    """Replaces blocks by earlier ones, like `reuse_blocks`, for blocks in the order of the file.
 
     Args:
         blocks: uint8 [n, 16].
-        decoded, target, weight, allowed: float32 [n, V], for the V values of a block, as for `reuse_blocks`.
+        decoded, target, weight, allowed: float32 [n, V], V values per block; see `reuse_blocks`.
         window: Number of preceding blocks that are tried.
 
     Returns:

@@ -1,9 +1,9 @@
-"""Pictures of any channels (light, directions, masks, data), and PNGs whose bytes encode light in a stated way.
+"""Reads pictures with any channels (light, directions, masks, data), and PNGs that encode light in one of five ways.
 
-With p the levels in [0, 1], a the alpha, and L the curve of IEC 61966-2-1 from sRGB to linear light:
+Here p is a stored colour value in [0, 1], a the stored alpha, and L the sRGB curve to linear light (IEC 61966-2-1):
 
 ========  ======================  =========================================================
-encoding  light                   where it is met
+encoding  light                   where it is used
 ========  ======================  =========================================================
 linear    p                       data textures
 srgb      L(p)                    pictures, lightmaps of low range
@@ -40,8 +40,8 @@ def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
     """Reads all channels of an EXR file, a PNG (8 bits, or grey of 16 bits) or another picture of light.
 
     Returns:
-        The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the
-        values are PNG levels, which are divided by the largest level.
+        The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the values
+        are integers of a PNG, scaled to [0, 1].
 
     Raises:
         WlmError: The file is missing, of another kind, cut short or damaged.

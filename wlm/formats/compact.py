@@ -1,4 +1,4 @@
-"""Compact artifacts: eight bytes before the body, for files that a JSON header would be most of.
+"""Compact artifacts: a header of eight bytes, for files so small that a JSON header would be most of the file.
 
 A file is "wlm", a byte that is 16 times the system's number (its index in `SYSTEMS`) plus the version, the first 4
 bytes of the BLAKE2b of everything else, and the body. The system defines the body. The file stores no name: a model is
@@ -25,12 +25,12 @@ _START = 4 + _DIGEST
 
 
 def is_compact(begin: bytes) -> bool:
-    """Whether a file that starts with these bytes is a compact artifact; no safetensors header is that long."""
+    """Whether a file that starts with these bytes is a compact artifact and not a safetensors file."""
     return begin[: len(_MAGIC)] == _MAGIC
 
 
 def digest(*pieces: bytes | np.ndarray) -> bytes:
-    """Returns the first bytes of the BLAKE2b of consecutive pieces."""
+    """Returns a BLAKE2b hash of 4 bytes over consecutive pieces."""
     hasher = hashlib.blake2b(digest_size=_DIGEST)
     for piece in pieces:
         hasher.update(piece)

@@ -1,4 +1,4 @@
-"""OpenEXR files of one flat part: pictures of RGB or RGBA, named planes with a JSON note, headers and raw parts."""
+"""OpenEXR files of one flat part: pictures of RGB or RGBA, single-channel images with a JSON note, and headers."""
 
 import contextlib
 import io
@@ -51,7 +51,7 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
 
 
 def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
-    """Returns the pixels of some channels of a part, float32 [H, W] each.
+    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W] each.
 
     Raises:
         WlmError: A channel is neither half nor float, or has another shape than the first.
@@ -75,7 +75,7 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
     stays.
 
     Raises:
-        ValueError: The shape is not that of a picture.
+        ValueError: The pixels' shape is not [H, W, 3 or 4].
         WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
@@ -93,13 +93,13 @@ def write_planes(
     *,
     whole: tuple[str, ...] = (),
 ) -> None:
-    """Writes planes as an EXR file of scan lines with lossless ZIP compression, atomically.
+    """Writes single-channel images (planes) as one EXR file with lossless ZIP compression, atomically.
 
     Args:
         path: The file to write; its folder must exist.
         planes: [H, W] each, linear, not empty; the keys name the channels.
-        note: JSON for the header.
-        whole: Planes that stay float32. The others become half floats, clamped to +-65504.
+        note: JSON object that is stored in the header.
+        whole: Names of the planes that stay float32. The others become half floats, clamped to +-65504.
 
     Raises:
         ValueError: The planes differ in shape.
@@ -144,7 +144,7 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     """Reads an EXR file of one flat part.
 
     Returns:
-        The part, with separate channels.
+        The part as an object of the OpenEXR module, with separate channels.
 
     Raises:
         WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data.
@@ -191,7 +191,7 @@ def write_part(
     Args:
         path: The file to write; its folder must exist.
         channels: half or float [H, W] each, contiguous, not empty.
-        read: Reads the file back before it replaces the old one; raises WlmError.
+        read: Called with the new file before it replaces an old one; raises WlmError if the file cannot be read.
         attributes: Further header attributes.
 
     Raises:
@@ -236,7 +236,7 @@ def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Par
 
 
 def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
-    """Opens a file. Returns the file, or None or a file without parts on failure, and the library's messages."""
+    """Returns the opened file and the library's messages; on failure the file is None or has no parts."""
     with _captured_chatter() as chatter:
         try:
             # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
@@ -250,14 +250,14 @@ def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None
 
 
 class _Chatter:
-    """Messages that OpenEXR printed in a block, on one line."""
+    """Collects the messages that OpenEXR prints in a block, joined to one line in `text`."""
 
     text = ""
 
 
 @contextlib.contextmanager
 def _captured_chatter() -> Iterator[_Chatter]:
-    """Captures messages: those of OpenEXR's C library on the process's stderr, of its Python module on sys.stdout."""
+    """Captures what OpenEXR prints in the block: its C library to the stderr, its Python module to sys.stdout."""
     chatter, printed = _Chatter(), io.StringIO()
     lines: list[bytes] = []
     try:

@@ -1,4 +1,4 @@
-"""Output folders: checked before long work, written beside their place, and moved in as a whole.
+"""Output folders: checked before long work, written to a temporary folder, and moved into place as a whole.
 
 An index file, JSON with its own `format`, identifies the folder. It is written last, so a folder with a complete index
 holds all files that the index lists.
@@ -122,7 +122,7 @@ def _move(made: Path, folder: Path, index: str, format_name: str) -> None:
 
 
 def _listed(folder: Path, index: str) -> list[str]:
-    """The files of an earlier output as its index lists them; only those in the folder or one folder below it."""
+    """Returns the files that the index of an earlier output lists, if they are at most one subfolder deep."""
     listed = read_index(folder / index).get("files")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
     safe = [name for name in names if _NAME.fullmatch(name) and not any(p.startswith(".") for p in name.split("/"))]
@@ -144,7 +144,7 @@ def write_index(path: Path, content: dict[str, Any]) -> int:
 
 
 def compact_json(content: Any) -> str:
-    """JSON with one key per line, and each list of numbers on one line.
+    """Returns JSON text with one key per line, and each list of numbers on one line.
 
     Raises:
         ValueError: A number is NaN or infinite.

@@ -20,7 +20,7 @@ class Geometry:
     Attributes:
         position: float32 [V, 3].
         triangle: uint32 [F, 3].
-        uv: float32 [V, 2], u right, v down; None: not needed.
+        uv: float32 [V, 2], u right, v down; None if UVs were not requested.
     """
 
     position: np.ndarray

@@ -66,7 +66,7 @@ class Replacement:
 def write_glb(
     path: str | os.PathLike[str], document: GltfDocument, replacements: Sequence[Replacement], uv_set: int
 ) -> int:
-    """Writes the file of `encode_glb` atomically and returns its number of bytes; errors as there, or it cannot be
+    """Writes the result of `encode_glb` atomically and returns its size in bytes; also raises if the file can't be
     written.
     """
     return atomic_write(path, encode_glb(document, replacements, uv_set, path))
@@ -89,7 +89,7 @@ def encode_glb(
         document: The document.
         replacements: At most one for each primitive.
         uv_set: n of the new `TEXCOORD_n`, the same for all replacements.
-        path: Name of the file in messages; None: that of the document.
+        path: Name of the file in messages; None: the document's path.
 
     Returns:
         The bytes of the file, in pieces.
@@ -184,7 +184,7 @@ class _Tree:
             self.payloads = [self.payloads[number] for number in numbers]
 
     def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
-        """Keeps the entries of a list that the slots refer to and renumbers them; returns their old indices."""
+        """Drops the entries of list `kind` that no reference in `slots` uses; returns the old indices of the others."""
         places = list(slots(self.content))
         numbers = sorted({holder[key] for holder, key in places})
         new = {old: number for number, old in enumerate(numbers)}
@@ -194,7 +194,7 @@ class _Tree:
         return numbers
 
     def _gathered(self, number: int, rows: np.ndarray, bounds: bool) -> int:
-        """Adds an accessor with some rows of another accessor, in the same encoding."""
+        """Adds an accessor with the given rows of another accessor, in its encoding; returns the new index."""
         old = self._document.content["accessors"][number]
         values = elements(self._document, number)[rows]
         extra = {"normalized": True} if old.get("normalized", False) else {}
@@ -204,7 +204,7 @@ class _Tree:
         return self._accessor(values, old["componentType"], old["type"], _VERTICES, **extra)
 
     def _accessor(self, values: np.ndarray, component: int, kind: str, target: int, **extra: object) -> int:
-        """Adds an accessor of encoded elements, uint8 [count, size], or returns an equal one."""
+        """Adds an accessor of encoded elements, uint8 [count, size], unless an equal one exists; returns its index."""
         head: dict[str, object] = {"target": target}
         if target == _VERTICES:  # each vertex begins at a multiple of 4 bytes
             values = np.pad(values, ((0, 0), (0, -values.shape[1] % 4)))
@@ -223,7 +223,7 @@ class _Tree:
         return self._known[key]
 
     def _view(self, data: bytes, head: dict) -> int:
-        """Adds a buffer view, or returns an added one with the same bytes."""
+        """Adds a buffer view, unless one with the same bytes was added before; returns its index."""
         key = (hashlib.blake2b(data).digest(), tuple(head.items()))
         if key not in self._known:
             self.content["bufferViews"].append({"buffer": 0, "byteLength": len(data), **head})
@@ -281,7 +281,7 @@ def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
 def _pack(
     path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]
 ) -> list[bytes | memoryview]:
-    """Places the views one after another in one buffer and returns the pieces of the file."""
+    """Places the buffer views' data (`payloads`) one after another in one buffer; returns the `.glb` file's pieces."""
     pieces: list[bytes | memoryview] = []
     start = 0
     for view, data in zip(content["bufferViews"], payloads, strict=True):

@@ -1,4 +1,4 @@
-"""BC6H and ASTC coding by optional packages: half-float RGB in and out, 16 bytes per block, row by row.
+"""BC6H and ASTC coding by optional packages: between half-float RGB images and blocks of 16 bytes, row by row.
 
 All work runs on the CPU; the ASTC encoder uses threads. The packages are imported when they are used.
 """
@@ -16,17 +16,12 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.workers import cores, each
 
-BC6H_PROFILES = ("veryfast", "fast", "basic", "slow", "veryslow")
 ASTC_BLOCKS = (
     (4, 4), (5, 4), (5, 5), (6, 5), (6, 6), (8, 5), (8, 6), (8, 8), (10, 5), (10, 6), (10, 8), (10, 10), (12, 10),
     (12, 12),
 )  # fmt: skip
 """Width and height of every 2D block size of the format, in texels."""
-# astcenc's presets "medium" and "thorough".
-ASTC_MEDIUM = 60.0
-ASTC_THOROUGH = 98.0
-# Above the PSNR of any block. In the LDR profile the presets stop the search of a block at 29 to 32 dB.
-_NO_LIMIT_DB = 999.0
+ASTC_MEDIUM = 60.0  # astcenc's preset "medium"
 _TEXELS_A_THREAD = 4096  # the least work of a thread, about 20 ms
 
 
@@ -42,22 +37,6 @@ def need(package: str, extra: str) -> ModuleType:
         raise WlmError(f"{extra}: {package} is missing; needs the extra: pip install 'wlm[{extra}]'") from error
 
 
-def encode_bc6h(texels: np.ndarray, profile: str, extra: str) -> bytes:
-    """Encodes texels, half [H, W, 3], finite and not negative, as unsigned BC6H by Intel's ISPC texture compressor.
-
-    H and W are multiples of 4, `profile` is one of `BC6H_PROFILES`, and `extra` is the optional extra for the error
-    message.
-
-    Raises:
-        WlmError: The package is missing.
-    """
-    texcomp = need("ispc_texcomp", extra)
-    rgba = _with_alpha(texels)
-    height, width = texels.shape[:2]
-    surface = texcomp.RGBASurface(rgba.tobytes(), width, height, rgba.strides[0])
-    return texcomp.compress_blocks_bc6h(surface, texcomp.BC6HEncSettings.from_profile(profile))
-
-
 def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:
     """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black.
 
@@ -68,18 +47,14 @@ def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool
 
 
 class Astc:
-    """An ASTC codec (astcenc) for one block size; created by `astc`."""
+    """An ASTC codec: the package astc_encoder with one configuration."""
 
-    def __init__(self, codec: ModuleType, block: tuple[int, int], quality: float, ldr: bool) -> None:
-        profile = codec.ASTCProfile.LDR if ldr else codec.ASTCProfile.HDR_RGB_LDR_A
-        config = codec.ASTCConfig(profile, *block, 1, quality)
-        if ldr:
-            config.tune_db_limit = _NO_LIMIT_DB  # the HDR profile has no such limit
-        self._codec, self._config, self._rows = codec, config, block[1]
+    def __init__(self, codec: ModuleType, config: Any) -> None:
+        self._codec, self._config, self._rows = codec, config, config.block_y
         self._idle: list[Any] = []  # idle contexts; a context serves one thread at a time
 
     def encode(self, texels: np.ndarray) -> bytes:
-        """Encodes half [H, W, 3], finite and not negative, in LDR at most 1; astcenc pads to whole blocks.
+        """Encodes half [H, W, 3], finite and at least 0, to blocks; astcenc pads to whole blocks.
 
         Each thread encodes some rows of blocks; the result does not depend on the number of threads.
         """
@@ -96,7 +71,7 @@ class Astc:
         return b"".join(each(strip, range(0, height, step)))
 
     def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
-        """Decodes to half [H, W, 3]; invalid blocks become NaN in HDR and magenta in LDR."""
+        """Decodes blocks to half [H, W, 3]; invalid blocks become NaN."""
         codec = self._codec
         target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
         with self._context() as context:
@@ -113,20 +88,20 @@ class Astc:
         self._idle.append(context)
 
 
-def astc(block: tuple[int, int], quality: float, extra: str, ldr: bool = False) -> Astc:
-    """Returns the codec of a setting, one for equal settings.
+def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
+    """Returns the ASTC codec of the HDR profile with the given settings; equal settings share one codec.
 
     Args:
-        block: One of `ASTC_BLOCKS`.
+        block: Width and height of a block in texels, one of `ASTC_BLOCKS`.
         quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
         extra: Name of the optional extra for the error message that the package is missing.
-        ldr: Whether to use the LDR profile, for values in [0, 1]; else HDR.
     """
-    return _astc(need("astc_encoder", extra), block, float(quality), ldr)
+    return _astc(need("astc_encoder", extra), block, quality)
 
 
-# Building the tables of a context takes 15 ms.
-_astc = functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))(Astc)
+@functools.cache  # building the tables of a context takes 15 ms
+def _astc(codec: ModuleType, block: tuple[int, int], quality: float) -> Astc:
+    return Astc(codec, codec.ASTCConfig(codec.ASTCProfile.HDR_RGB_LDR_A, *block, 1, quality))
 
 
 def _with_alpha(texels: np.ndarray) -> np.ndarray:

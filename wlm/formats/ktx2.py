@@ -90,11 +90,11 @@ def write_ktx2(
         path: The file to write; its folder must exist.
         data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
             blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
-        width: Texels, 1 to 16384.
-        height: Texels, 1 to 16384.
-        fmt: A key of `VK_FORMATS`.
+        width: Width in texels, 1 to 16384.
+        height: Height in texels, 1 to 16384.
+        fmt: Texel format, a key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
-        mips: Levels after the first of a 2D texture, each of half the size rounded down; they follow in `data`.
+        mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `data`.
 
     Returns:
         The number of bytes written.
@@ -207,7 +207,7 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
 
 
 def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest level of a KTX2 file of light, plain or compressed by zstd or zlib.
+    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
 
     The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
 
@@ -272,7 +272,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
 def _part(
     path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
 ) -> bytes:
-    """Reads a part of the file, at most its first `most` bytes."""
+    """Reads `size` bytes of the file from `start` on, but at most `most`; `what` names this part in messages."""
     if start + size > held:
         raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
     file.seek(start)
@@ -292,7 +292,7 @@ def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
-    """Returns whether columns go right and rows go down, the defaults, and checks the order of the channels."""
+    """Returns whether columns go right and whether rows go down, and checks the order of the channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
     while at < len(data):

@@ -29,7 +29,7 @@ _held: Counter[Path] = Counter()  # how many times this process has locked each 
 
 
 def is_passing(name: str) -> bool:
-    """Whether a file name is that of a lock or of a temporary file, which is no content of a folder."""
+    """Whether a file name is the name of a lock or of a temporary file, which don't count as content of a folder."""
     return _PASSING.fullmatch(name) is not None
 
 
@@ -103,7 +103,7 @@ def _stem(target: Path) -> str:
 
 
 def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
-    """Locks a file, which is made if it does not exist; returns None if that is impossible."""
+    """Locks a file, which is made if it does not exist; returns its handle, or None if it can't be locked."""
     while fcntl is not None:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

@@ -33,11 +33,11 @@ def read_npz(
     Args:
         path: The file.
         choose: Selects from the names of the arrays. It may raise WlmError.
-        numbers: Most numbers of an array.
+        numbers: Largest allowed number of values in an array.
         sure: Bytes of an array that are allowed for any compressed size; see `check_growth`.
 
     Returns:
-        The selected arrays by name. None of them has Python objects.
+        The selected arrays by name. None of them contains Python objects.
 
     Raises:
         WlmError: The file is missing, damaged or not a `.npz` file, or an array exceeds the limits.
@@ -86,7 +86,7 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
 
 
 def _header(where: str, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Returns the shape, whether the order is Fortran's, and the type."""
+    """Returns an array's shape, whether it is stored in Fortran order, and its type."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:

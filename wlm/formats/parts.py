@@ -20,7 +20,7 @@ class Part:
 
     Attributes:
         dtype: NumPy type, or the allowed types.
-        shape: Sizes; None for any size. A part with a size of 0 is left out of the file.
+        shape: Length of each axis; None allows any length. A part without elements is left out of the file.
         optional: Whether the file may lack the part, which is then empty along its first axis.
         least, most: Bounds of the numbers, or None. NaN violates any bound.
         finite: Whether floats must be finite.
@@ -54,7 +54,7 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
 
 
 def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.ndarray:
-    """Checks one tensor of a file like `check_parts`, for parts that determine the shapes of other parts."""
+    """Checks and returns one tensor of a file, before `check_parts` can check others whose shapes depend on it."""
     kinds = part.dtype if isinstance(part.dtype, tuple) else (part.dtype,)
     value = tensors.get(name)
     if value is None:

@@ -81,7 +81,7 @@ def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns exceptions that damaged data causes in the block into a one-line error of a message and the reason.
 
     Raises:
-        WlmError: One of the exceptions was raised, or a WlmError, which stays as it is.
+        WlmError: One of the exceptions was raised, or a WlmError, which is passed on unchanged.
     """
     try:
         yield

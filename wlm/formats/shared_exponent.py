@@ -1,6 +1,6 @@
 """RGB9E5: three mantissas of nine bits and one exponent in 32 bits, an HDR format that every GPU can filter.
 
-DXGI_FORMAT_R9G9B9E5_SHAREDEXP, VK_FORMAT_E5B9G9R9_UFLOAT_PACK32, GL_RGB9_E5. Twin: `wlm_kernels.shared_exponent`.
+DXGI_FORMAT_R9G9B9E5_SHAREDEXP, VK_FORMAT_E5B9G9R9_UFLOAT_PACK32, GL_RGB9_E5. On the GPU: `wlm_kernels.shared_exponent`.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ _SCALE = np.ldexp(np.float32(1), np.arange(32) - 24)
 
 
 def pack_rgb9e5(light: np.ndarray) -> np.ndarray:
-    """Packs light.
+    """Packs linear RGB into RGB9E5 words.
 
     Args:
         light: [..., 3], finite; clamped to [0, `LARGEST`].

@@ -83,7 +83,7 @@ class LightingData:
 
 
 def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
-    """Reads an asset.
+    """Reads the light probes and lightmap rectangles of an asset.
 
     Raises:
         WlmError: UnityPy is missing; or the file is missing, damaged, text, a bundle or without lighting data.
@@ -145,7 +145,7 @@ def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, A
 
 
 class _Walk:
-    """Walks through an object by its layout up to the requested arrays.
+    """Reads the values of a serialized object in order, by its layout, until all requested arrays are found.
 
     A stated length is compared with the remaining bytes before anything is allocated.
     """
@@ -196,7 +196,7 @@ class _Walk:
             self._step(element, path)
 
     def _fixed(self, node: Any) -> np.dtype | None:
-        """Returns the type of a value of fixed size, or None for one of variable size."""
+        """Returns the NumPy type of a layout's value, or None if its size varies."""
         kind, _, flags, children = node
         if flags & _ALIGNED or kind in ("Array", "TypelessData"):
             return None

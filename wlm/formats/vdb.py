@@ -39,7 +39,7 @@ class VdbGrid:
     Attributes:
         name: Name of the grid in the file.
         matrix: float64 [4, 4], from the indices of voxel centres to world space.
-        low: The first voxel of the bounding box.
+        low: Index of the lowest voxel of the bounding box, (x, y, z).
         values: float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0 if none is active.
     """
 
@@ -51,7 +51,7 @@ class VdbGrid:
 
 @dataclass(frozen=True)
 class _Entry:
-    """An entry in the list of grids: its offset, and the grid whose tree it shares."""
+    """An entry in the file's list of grids: its offset in bytes, and the name of a grid whose tree it shares."""
 
     name: str
     type: str
@@ -124,7 +124,7 @@ class VdbFile:
             cursor.at = end
 
     def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "_Cursor", int]:
-        """Returns the transform of a grid, a cursor before its tree, and its compression flags."""
+        """Returns a grid's transform, a cursor at the start of its tree, and its compression flags."""
         cursor = _Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
         if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
@@ -214,7 +214,7 @@ class _Tree:
             raise ValueError("expected nodes at different places, found two at one")
 
     def dense(self, most: int) -> tuple[tuple[int, int, int], np.ndarray]:
-        """Returns the first voxel of the bounding box of the active voxels, and the values in it, float32 [X, Y, Z]."""
+        """Returns the lowest voxel of the active voxels' bounding box, and the values in the box, float32 [X, Y, Z]."""
         corners = np.concatenate([np.zeros((0, 3), np.int64), *self._corners])
         masks = np.frombuffer(b"".join(self._masks), np.uint8).reshape(-1, _MASK_BYTES)
         low, high = self._box(corners, masks)
@@ -236,7 +236,7 @@ class _Tree:
         return tuple(low.tolist()), values[tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))]
 
     def _box(self, corners: np.ndarray, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the first active voxel along each axis, and the voxel after the last."""
+        """Returns the lowest corner of the box of the active voxels, [3], and its highest corner plus one, [3]."""
         lows, highs = [], []
         some = masks.any(1)
         corners, masks = corners[some], masks[some]
@@ -258,7 +258,7 @@ class _Tree:
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def _values(self, active: np.ndarray) -> np.ndarray:
-        """Reads the values of the voxels or children of a mask, float32 [count]."""
+        """Reads the values of a node's voxels or children, float32 [count]; `active` is the node's mask."""
         cursor = self._cursor
         (kind,) = cursor.unpack("<B")
         if kind > _ALL:
@@ -305,10 +305,10 @@ class _Tiles:
     """Children of a node with one constant value each (tiles).
 
     Attributes:
-        corner: The first voxel of the node, [3].
+        corner: Index of the lowest voxel of the node, [3].
         edge: Edge of a child, in voxels.
-        values, active: Value and active state of each child, [N, N, N].
-        seen: Whether each child is a tile that differs from the background; by default, all are.
+        values, active: Value and active state of each child, [N, N, N], N children along each edge.
+        seen: Whether each child is a tile that differs from the background, [N, N, N]; by default, all are.
     """
 
     corner: np.ndarray
@@ -318,7 +318,7 @@ class _Tiles:
     seen: np.ndarray = field(default_factory=lambda: np.ones((1, 1, 1), bool))
 
     def paste(self, values: np.ndarray, first: np.ndarray) -> None:
-        """Writes the tiles into the values of a box whose first voxel is `first`."""
+        """Writes the tiles into the values of a box of voxels, whose lowest voxel is `first`."""
         place = np.asarray(self.corner) - first
         begin = np.maximum(place, 0)
         end = np.minimum(place + self.edge * len(self.values), values.shape)

@@ -19,7 +19,7 @@ Shapes = dict[str, list[int]]
 
 
 def compress(*pieces: bytes) -> bytes:
-    """Packs pieces of data, one after another, into one frame that states its size.
+    """Compresses consecutive pieces of data into one Zstandard frame that states its size.
 
     Each piece has blocks of its own, so that zstd models pieces with different statistics separately.
     """
@@ -32,8 +32,7 @@ def compress(*pieces: bytes) -> bytes:
 
 
 def decompress(frame: bytes, size: int, name: str) -> bytes:
-    """Unpacks one frame with nothing behind it to `size` bytes, and never allocates more; `name` describes it in
-    messages.
+    """Decompresses data of exactly one frame to `size` bytes, and never allocates more; `name` is for messages.
 
     Raises:
         ValueError: The frame is damaged or has another size.
@@ -52,11 +51,11 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
 
 
 def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Shapes]:
-    """Packs the parts of an artifact.
+    """Compresses each part of an artifact, unless that would make it larger.
 
     Returns:
-        Each part as a frame, uint8 [bytes]; a part stays as it is if its frame would be larger, or so much smaller
-        that `unpack_parts` would refuse it. And the shapes of the parts that became frames.
+        The parts, compressed ones as frames, uint8 [bytes], and the shapes of the compressed parts. A part that
+        compresses so well that `unpack_parts` would refuse it stays uncompressed too.
     """
     result, shapes = dict(parts), {}
     for name, part in parts.items():
@@ -67,7 +66,7 @@ def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], 
 
 
 def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Unpacks parts that `pack_parts` packed, of the types in `table`. `check_parts` still has to check their values.
+    """Decompresses the parts that `pack_parts` compressed; `check_parts` still has to check their values.
 
     Raises:
         ValueError: A frame is damaged, is not in the table, or claims far more bytes than it can hold.
@@ -87,5 +86,5 @@ def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mappi
 
 
 def _limit(size: int) -> int:
-    """The most bytes that a frame of some bytes may unpack to."""
+    """Returns the largest decompressed size in bytes that is accepted for a frame of `size` bytes."""
     return _FREE + _MOST * size

@@ -39,9 +39,6 @@ _EXPORTS = {
     "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
     "wlm-bake": BAKED,
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
-    "wlm-probe-export": "light probes: buffers and a shader",
-    "wlm-probe-volume": "a cascaded volume of probes: buffers and shaders",
-    "wlm-godot-light": "light probes for Godot",
     "wlm-smoke-frames": FRAMES,
 }
 _MODELS = {

@@ -175,7 +175,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         paths = [one[atlas.name, "light"].path for one in listing.states]
         heads = [picture_of(path) for path in paths]
         sizes += sorted({head.size for head in heads if head is not None})
-        problems += [f"{atlas.name}: {text}" for text in together(paths, heads).problems]
+        problems += [f"{atlas.name}: {text}" for text in together(paths, heads)[0]]
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"

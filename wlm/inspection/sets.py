@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from wlm.errors import WlmError
 from wlm.inspection.finding import Finding, compress_command
@@ -46,46 +45,38 @@ def _checked(folder: Path, listing: Listing) -> Finding:
     files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
     heads = [picture_of(file) for file in files]
     size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
-    problems += together(files, heads).problems
+    problems += together(files, heads)[0]
     what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
     return Finding(folder, what, compress_command(folder), tuple(problems))
 
 
-class Together(NamedTuple):
-    """The result of comparing pictures.
+def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], bool]:
+    """Checks whether pictures are one lightmap at several times, from all headers and the texels of at most eight.
 
-    Attributes:
-        problems: Problems, one line each.
-        alike: Whether the pictures may be one lightmap at several times.
+    Returns:
+        The problems, one line each, and whether the pictures may be one lightmap.
     """
-
-    problems: list[str]
-    alike: bool
-
-
-def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> Together:
-    """Checks whether pictures are one lightmap at several times, from all headers and the texels of at most eight."""
     problems = []
     for file, head in zip(files, heads, strict=True):
         if head is None or head.kind == "PNG":
-            return Together([f"{file.name} has no radiance"], True)
+            return [f"{file.name} has no radiance"], True
     sized = [(file, head) for file, head in zip(files, heads, strict=True) if head is not None and head.width]
     for file, head in sized[1:]:
         if head.size != sized[0][1].size:
-            return Together([f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"], False)
+            return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"], False
     chosen = [files[i] for i in spread(len(files), PICTURES)]
     lit = []
     for file in chosen:
         try:
             one, found = read_lit(file)
         except WlmError as error:
-            return Together([*problems, f"{file.name}: {said(error, file)}"], True)
+            return [*problems, f"{file.name}: {said(error, file)}"], True
         lit.append(one)
         problems += [f"{file.name}: {text}" for text in found]
     if len({one.shape for one in lit}) > 1:
-        return Together([*problems, "their sizes differ"], False)
+        return [*problems, "their sizes differ"], False
     odd = odd_layout(len(lit), lit.__getitem__)
     if odd is None:
-        return Together(problems, True)
+        return problems, True
     first, second = (chosen[i].name for i in odd)
-    return Together([*problems, f"{first} and {second} have different charts"], False)
+    return [*problems, f"{first} and {second} have different charts"], False

@@ -17,7 +17,7 @@ class LostLight:
 
     Attributes:
         count: Number of such points among the brightest of their group.
-        worst: The largest of them: its value, its decoded value and its location; None if there is none.
+        worst: The brightest counted point: its value, decoded value and location; None if `count` is 0.
         hidden: Number of such points in groups where most points have an error of more than half of their own light
             and the maximum is at least ten times the median.
     """

@@ -100,7 +100,7 @@ def march(
 
 
 class _March(torch.autograd.Function):
-    """Computes, per ray, the scattered light of each light of colour 1 without phase function, emission and depth."""
+    """Computes each ray's light scattered from each light (colour 1, no phase function), emission and optical depth."""
 
     @staticmethod
     def forward(ctx, density, emission, toward, origin, direction, step):

@@ -84,5 +84,5 @@ def _arrays(network: MlpKernels, x: torch.Tensor, hidden: torch.Tensor, output: 
 
 
 def _weights(h: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Returns the gradient of a layer's matrix with the gradient of its bias as the last row."""
+    """Returns the gradient of a layer's weight matrix, with the gradient of its bias as the last row."""
     return torch.cat([h.transpose(1, 2) @ d, d.sum(1, keepdim=True)], 1)

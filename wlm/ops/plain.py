@@ -22,12 +22,12 @@ def straight_through(value: Tensor, used: Tensor) -> Tensor:
 
 
 def bc7_map(endpoints, weights, uv, *, layer=None, quantised: bool = False) -> Tensor:
-    """Samples a map of blocks bilinearly at `uv` [..., 2]: [..., 4]."""
+    """Samples a map of blocks bilinearly at `uv` [..., 2]; returns [..., 4]."""
     return plane(bc7_texels(endpoints, weights, quantised=quantised), uv, layer=layer)
 
 
 def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -> Tensor:
-    """Decodes whole maps: [..., H/4, W/4, 2, 4] and [..., H, W] -> [..., H, W, 4]."""
+    """Decodes whole maps with endpoints [..., H/4, W/4, 2, 4] and weights [..., H, W] to [..., H, W, 4]."""
     e, w = endpoints.clamp(0.0, 1.0), weights.clamp(0.0, 1.0)
     if quantised:
         stored = _endpoint_bytes(e.detach())
@@ -43,7 +43,7 @@ def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -
 
 
 def _endpoint_bytes(e: Tensor) -> Tensor:
-    """Returns the nearest bytes, int64 [..., 4], with equal lowest bits; even bytes if both bits are equally near."""
+    """Rounds e [..., 4] to the nearest bytes with equal lowest bits, int64 [..., 4]; even bytes in a tie."""
     v = e * 255.0
     even, odd = (torch.floor((v - bit) / 2.0 + 0.5).clamp(0.0, 127.0) * 2.0 + bit for bit in (0.0, 1.0))
     nearer = ((odd - v) ** 2).sum(-1, keepdim=True) < ((even - v) ** 2).sum(-1, keepdim=True)
@@ -51,7 +51,7 @@ def _endpoint_bytes(e: Tensor) -> Tensor:
 
 
 def _per_texel(blocks: Tensor) -> Tensor:
-    """[..., h, w, C] -> [..., 4 h, 4 w, C]: repeats each block's value at its 4 x 4 texels."""
+    """Repeats each block's value at its 4 x 4 texels: [..., h, w, C] becomes [..., 4 h, 4 w, C]."""
     return blocks.repeat_interleave(4, -3).repeat_interleave(4, -2)
 
 
@@ -59,12 +59,12 @@ def _per_texel(blocks: Tensor) -> Tensor:
 
 
 def plane(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [H, W, C], or plane `layer` of [L, H, W, C], at (u, v): [..., 2] -> [..., C]."""
+    """Samples [H, W, C], or plane `layer` of [L, H, W, C], at points (u, v) [..., 2]; returns [..., C]."""
     return _sample(values, points, layer, periodic, 2)
 
 
 def volume(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [D, H, W, C], or volume `layer` of [L, D, H, W, C], at (u, v, w): [..., 3] -> [..., C]."""
+    """Samples [D, H, W, C], or volume `layer` of [L, D, H, W, C], at points (u, v, w) [..., 3]; returns [..., C]."""
     return _sample(values, points, layer, periodic, 3)
 
 
@@ -103,7 +103,7 @@ def _sample(values: Tensor, points: Tensor, layer: Tensor | None, periodic: bool
 
 
 def mlp(x: Tensor, hidden: Tensor, output: Tensor, *, gelu: str = "exact") -> Tensor:
-    """Evaluates gelu(gelu(x W1 + b1) W2 + b2) W3 + b3: x [..., B, I] -> [..., B, O]."""
+    """Evaluates gelu(gelu(x W1 + b1) W2 + b2) W3 + b3 for x [..., B, I]; returns [..., B, O]."""
     form = "none" if gelu == "exact" else "tanh"
     first, bias_1, second, bias_2 = hidden.split([x.shape[-1], 1, hidden.shape[-1], 1], -2)
     third, bias_3 = output.split([hidden.shape[-1], 1], -2)
@@ -116,7 +116,7 @@ def mlp(x: Tensor, hidden: Tensor, output: Tensor, *, gelu: str = "exact") -> Te
 
 
 def gaussian_sum(rows: Tensor, points: Tensor, *, cut: float = 3.0, support: str = "ellipsoid") -> Tensor:
-    """Sums rows [K, 10 + L] of centre, log of the scale, quaternion and latent at points [..., 3]: [..., L]."""
+    """Sums K Gaussians, rows of centre, log scale, quaternion and latent, at points [..., 3]; returns [..., L]."""
     scale = rows[:, 3:6].exp()
     d = points[..., None, :] - rows[:, :3]
     u = torch.einsum("kij,...kj->...ki", rotations(rows[:, 6:10]).transpose(1, 2), d) / scale
@@ -153,7 +153,7 @@ def pixel_centres(height: int, width: int) -> Tensor:
 
 
 def corner_weights(position: Tensor, triangle: Tensor, pixels: Tensor, height: int, width: int) -> Tensor:
-    """Computes b of triangles at pixel positions, broadcast: triangle [..., 3], pixels [..., 2], result [..., 3].
+    """Computes barycentrics [..., 3] of triangles [..., 3] at pixel positions [..., 2], with broadcasting.
 
     `position` is [V, 4] in clip space or [V, 2] in UV space.
     """
@@ -186,7 +186,7 @@ def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster
 
 
 def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
-    """Rasterizes like `rasterize`, for corners [V, 2] in a texture; the first of overlapping triangles is visible."""
+    """Rasterizes like `rasterize`, for corners [V, 2] in UV space; the first of overlapping triangles is visible."""
     return rasterize(uv, triangle, height, width)
 
 
@@ -198,7 +198,7 @@ def interpolate(attribute: Tensor, triangle: Tensor, raster: Raster) -> Tensor:
 
 
 def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str = "clamp") -> Tensor:
-    """Reads [H, W, C] at uv [..., 2]: [..., C]."""
+    """Samples an image [H, W, C] at uv [..., 2]; returns [..., C]."""
     padding = "reflection" if boundary == "mirror" else "border"
     if boundary == "wrap":
         # Each side is padded with a texel of the opposite side, and coordinates are rescaled accordingly.
@@ -220,7 +220,7 @@ _SLACK = 1.0001  # tolerance on the step length, so that rounding adds no extra 
 def march(
     density, origin, direction, *, toward=None, colour=None, emission=None, step: float = 1.0, g: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Computes radiance [..., 3] and transmittance [...] of rays [..., 3] through a grid [X, Y, Z], in voxels."""
+    """Computes radiance [..., 3] and transmittance [...] along rays through a grid [X, Y, Z]; lengths in voxels."""
     size = torch.tensor(density.shape, dtype=density.dtype, device=density.device)
     if toward is None:
         toward = colour = density.new_zeros(0, 3)
@@ -279,7 +279,7 @@ def _optical_depth(density: Tensor, p: Tensor, toward: Tensor, step: float) -> T
 
 
 def _trilinear(grid: Tensor, p: Tensor) -> Tensor:
-    """Samples [X, Y, Z] or [X, Y, Z, C] at points [..., 3]: [...] or [..., C]; the centre of voxel i is at i + 1/2."""
+    """Samples [X, Y, Z] or [X, Y, Z, C] at points [..., 3] in voxels; the centre of voxel i is at i + 1/2."""
     values = pad(grid.reshape(*grid.shape[:3], -1), (0, 0, 1, 1, 1, 1, 1, 1))
     shape = values.shape[:3]
     q = p + 0.5

@@ -25,10 +25,10 @@ class Raster:
     Attributes:
         triangle: int32 [H, W], index of the visible triangle, -1 for none.
         barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the visible point;
-            corner 2 has the rest. It and all attributes below are 0 in uncovered pixels. It has a gradient.
-        depth: float [H, W], z / w; 0 everywhere in UV space. It has no gradient.
+            corner 2 has 1 minus their sum. Has a gradient. 0 in uncovered pixels, like all attributes below.
+        depth: float [H, W], z / w; 0 everywhere in UV space. Has no gradient.
         derivative: float [H, W, 4], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right
-            and y down; None if not requested. It has no gradient.
+            and y down; None if not requested. Has no gradient.
         coverage: int32 [H, W], number of triangles that cover the pixel's centre, including hidden ones; None if not
             requested.
     """
@@ -92,7 +92,7 @@ def rasterize_uv(
         derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
-        ValueError: As for `rasterize`.
+        ValueError: See `rasterize`.
     """
     return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
 
@@ -110,7 +110,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
         float [H, W, C].
 
     Raises:
-        ValueError: As for `rasterize`.
+        ValueError: See `rasterize`.
     """
     check("attribute", attribute, (None, None))
     triangle = _checked_triangles(triangle, attribute)
@@ -119,7 +119,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
 
 
 def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", boundary: str = "clamp") -> torch.Tensor:
-    """Samples a texture.
+    """Samples a texture at any coordinates, with the given filter and addressing.
 
     A coordinate that is NaN, or infinite and not clamped, reads NaN; it neither has nor passes on a gradient.
 

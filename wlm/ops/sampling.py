@@ -54,7 +54,7 @@ def volume(
         float [..., C].
 
     Raises:
-        ValueError: As for `plane`.
+        ValueError: See `plane`.
     """
     return sample(values, points, layer, periodic, axes=3)
 
@@ -77,7 +77,7 @@ def triplane(
         float [..., C], or [..., the sum of the three C].
 
     Raises:
-        ValueError: As for `plane`, or there is no such reduction.
+        ValueError: See `plane`; or there is no such reduction.
     """
     if reduce not in REDUCTIONS:
         raise ValueError(f"reduce: expected one of {', '.join(REDUCTIONS)}, got {reduce!r}")
@@ -107,7 +107,7 @@ def sample(
     axes: int,
     names: tuple[str, str] = ("values", "points"),
 ) -> torch.Tensor:
-    """`plane` for 2 axes, `volume` for 3; `names` are the names of the values and the points in messages."""
+    """Implements `plane` (`axes` = 2) and `volume` (3); `names`: names of the values and the points in messages."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
         raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")

@@ -14,7 +14,7 @@ Shape = tuple[int | None, ...]
 
 
 def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
-    """Checks that a float32 tensor has a shape and is on a device; None allows any device that Warp supports.
+    """Checks that a tensor is float32 and has the given shape and device; None allows any device of Warp.
 
     Raises:
         ValueError: Its shape, type or device doesn't fit.
@@ -63,7 +63,7 @@ def check_finite(ranges: dict[str, tuple[float, float]] | None = None, **tensors
 
 
 def on_stream(device: torch.device) -> AbstractContextManager:
-    """Puts Warp's work on torch's current stream."""
+    """Runs Warp's work inside the block on torch's current stream."""
     # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()
     if device.type == "cpu":
@@ -83,7 +83,7 @@ def zeros_for(tensor: torch.Tensor, needed: bool = True) -> torch.Tensor | None:
 
 
 def optional_array(tensor: torch.Tensor | None, dimensions: int, dtype: Any, device: torch.device) -> wp.array:
-    """Wraps a buffer as a Warp array; None becomes the empty array, which tells a kernel that there is no buffer."""
+    """Wraps a buffer as a Warp array; None becomes an empty array, by which a kernel knows there is no buffer."""
     if tensor is None:
         return wp.empty((0,) * dimensions, dtype=dtype, device=wp.device_from_torch(device))
     return to_warp(tensor, dtype)

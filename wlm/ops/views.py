@@ -186,8 +186,8 @@ def visible_points(
 
     Yields:
         For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
-        of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the UVs there. The latter two are 0 in
-        uncovered pixels.
+        of its corners 0 and 1; float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered
+        pixels.
 
     Raises:
         WlmError: There is no such device.
@@ -204,7 +204,7 @@ def visible_points(
 
 
 class _Drawing:
-    """Draws a mesh repeatedly; checks and allocations happen once, and on CUDA a draw is one graph."""
+    """Draws a mesh repeatedly; checks and allocations happen once, and on CUDA each draw replays a CUDA graph."""
 
     def __init__(self, triangle: np.ndarray, uv: np.ndarray, resolution: int, cull: bool, device: str) -> None:
         corner = torch.tensor(triangle.astype(np.int32), device=device)

@@ -1,4 +1,4 @@
-"""The bundle of a flip book: its textures in 8 bits, and the shader that shows it on a billboard."""
+"""Exports a flip book as a bundle: 8-bit textures, and a shader that shows them on a billboard."""
 
 import numpy as np
 
@@ -32,10 +32,10 @@ def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
         device: Not used: a flip book is already on the CPU.
 
     Raises:
-        WlmError: There is no opacity, or light is not finite.
+        WlmError: The flip book has no opacity, or its light is not finite.
     """
     if not any(ALPHA in names for names in book.channels.values()):
-        raise WlmError(f"{name}: has no opacity: expected an alpha channel, or a texture of it")
+        raise WlmError(f"{name}: has no opacity: expected an alpha channel or a separate texture")
     textures, clipped = {}, 0
     for key, page in book.pages.items():
         if not np.isfinite(page).all():

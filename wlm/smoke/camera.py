@@ -46,7 +46,7 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
     """Returns a direction scaled to length 1, float64 [3].
 
     Raises:
-        ValueError: It has no length, or is not three finite numbers.
+        ValueError: The direction has length 0, or is not three finite numbers.
     """
     vector = np.asarray(vector, np.float64)
     length = np.linalg.norm(vector)
@@ -58,7 +58,8 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
     """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
-    The weights |w| of the paper's eq. 5 sum to up to 1.73 for oblique lights; the squares, as in engines, sum to 1.
+    The paper's weights (eq. 5) are the absolute components of the unit direction and sum to 1.73 for the most oblique
+    lights; their squares, which engines use, sum to 1.
 
     Args:
         toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.
@@ -68,7 +69,7 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
         float64 [..., 6], not negative.
 
     Raises:
-        ValueError: The rule is unknown, or a direction has no length or is not finite.
+        ValueError: The rule is unknown, or a direction has length 0 or is not finite.
     """
     if rule not in RULES:
         raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")
@@ -91,9 +92,9 @@ class Camera:
             visible.
         right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
             points from the smoke to the camera.
-        extent: Height of the image in the world's unit; in perspective at distance 1.
+        extent: Height of the image in the world's unit; in perspective, at distance 1 from the eye.
         height, width: H and W in pixels, which are square.
-        perspective: Whether rays meet in the eye; six-way lightmaps are always orthographic.
+        perspective: Whether all rays start at the eye; six-way lightmaps are always orthographic.
     """
 
     position: tuple[float, float, float]
@@ -167,13 +168,13 @@ class Camera:
         Args:
             smoke: A volume, or a box in the world: its corner [3] and its edges [3].
             toward: Direction from the smoke to the camera, of any length except 0.
-            pixels: H.
-            aspect: W over H.
+            pixels: Height of the image in pixels.
+            aspect: Width of the image divided by its height.
             target: Point in the middle of the image; None: the box's centre.
-            extent: Height of the image in the world's unit, in perspective at distance 1; None: the box fits.
-            distance: Distance of the camera from its target; None: outside the box.
+            extent: As in `Camera`; None: such that the image shows the whole box.
+            distance: Distance of the camera from its target; None: such that the camera is outside the box.
             up: Direction that is upwards in the image.
-            perspective: Whether rays meet in the eye; six-way lightmaps are always orthographic.
+            perspective: Whether all rays start at the eye; six-way lightmaps are always orthographic.
 
         Raises:
             ValueError: A direction has no length, or a size is wrong.
@@ -207,7 +208,7 @@ class Camera:
 
     @property
     def pitch(self) -> float:
-        """Edge of a pixel in the world's unit, in perspective at distance 1."""
+        """Edge of a pixel in the world's unit; for a perspective camera, at distance 1 from the eye."""
         return self.extent / self.height
 
     def finer(self, factor: int) -> "Camera":
@@ -228,15 +229,15 @@ class Camera:
         return across + position, (-toward).expand_as(across)
 
     def in_world(self) -> View:
-        """Returns the camera in the world, as kernels take it."""
+        """Returns the camera in world coordinates, as an argument of kernels."""
         right, up, toward = self.axes
         return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
 
     def view(self, volume: DensityVolume) -> View:
-        """Returns the camera in a volume's voxels, as kernels take it.
+        """Returns the camera in the voxel coordinates of a volume, as an argument of kernels.
 
         An orthographic camera far from the grid is moved along its axis to just in front of it, which changes only
-        rounding.
+        rounding errors.
         """
         position = (np.asarray(self.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel
         right, up, toward = self.axes

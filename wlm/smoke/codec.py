@@ -1,4 +1,4 @@
-"""File of a trained network: settings, weights as half floats, and a summary of the training."""
+"""The file of a trained network: settings, weights as half floats, and a summary of the training."""
 
 import hashlib
 import os
@@ -22,17 +22,17 @@ _SHIPPED = Path(__file__).resolve().parents[1] / "data" / "smoke-six-fast.safete
 
 
 class _Header(Header):
-    """Settings in the header of a file."""
+    """Settings in the header of a network's file."""
 
     network: NetworkSettings
     summary: dict[str, JsonValue]
 
 
 def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Rounds the weights to half floats.
+    """Converts a network to the contents of a file, with weights rounded to half floats.
 
     Returns:
-        Settings and parts of the file, and a hash of the parts as its source.
+        The settings, the weights by name, and a hash of the weights, by which the file's source is recorded.
 
     Raises:
         WlmError: A weight is not a finite half float.
@@ -50,7 +50,7 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> SmokeModel:
-    """Makes a network from the parts of a file, in float32 on the CPU.
+    """Makes a network from a file's settings and weights, in float32 on the CPU.
 
     Raises:
         WlmError: A setting is wrong.
@@ -72,7 +72,7 @@ def shipped() -> Path:
     """Returns the file of the trained network that ships with wlm.
 
     Raises:
-        WlmError: It is missing.
+        WlmError: The file is missing.
     """
     if not _SHIPPED.is_file():
         raise WlmError(f"{_SHIPPED}: expected the network that comes with wlm, found none: install wlm anew")
@@ -80,13 +80,13 @@ def shipped() -> Path:
 
 
 def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
-    """Loads a network for use on smoke, which requires the settings of its guiding maps.
+    """Loads a network that can be applied to smoke, whose file has the settings of the guiding maps it was trained on.
 
     Args:
         path: The file; None: the network that ships with wlm.
 
     Raises:
-        WlmError: The file is missing or damaged, or lacks the settings of the network's samples.
+        WlmError: The file is missing or damaged, or lacks the settings of the guiding maps.
     """
     path = shipped() if path is None else path
     model = load(path, SmokeModel.SYSTEM)

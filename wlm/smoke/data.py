@@ -53,7 +53,7 @@ class Frames:
         scene: Scene of a folder that `simulate` wrote; None: a single volume, or another program's frames.
         files: Existing files by number, in rising order; a single volume has number 1.
         device: Device of the volumes.
-        extinction, emission: Replace the scene's values, or 1; None: not replaced.
+        extinction, emission: Used instead of the scene's values (without a scene: instead of 1); None: not replaced.
         options: Options of `load` for files of other programs: trust, up, density, temperature.
     """
 
@@ -81,7 +81,7 @@ class Frames:
         return CameraSettings() if self.scene is None else self.scene.camera
 
     def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
-        """Places a camera in front of a frame; for a sequence in front of the boxes of all frames, where it stays.
+        """Places a camera in front of a frame; in a sequence it does not move and faces the bounding box of all frames.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -91,7 +91,7 @@ class Frames:
 
     @functools.cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corner and edges of the bounding box of all frames, which are read for it."""
+        """Corner and edges of the bounding box of all frames, for which each frame's file is read."""
         boxes = []
         for number in self.files:
             volume = replace(self, device="cpu").load(number)
@@ -111,14 +111,14 @@ class Frames:
         return 0.0 if self.scene is None else self.scene.time(number)
 
     def looks(self, number: int) -> Looks | None:
-        """Returns lights, colours and obstacles of a frame's picture; None without a scene."""
+        """Returns the lights, colours and obstacles with which a frame is rendered; None without a scene."""
         return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
         """Reads a frame.
 
         Raises:
-            WlmError: It is missing or damaged.
+            WlmError: The file is missing or damaged.
         """
         smoke = None if self.scene is None else self.scene.smoke
         factors = {}
@@ -177,7 +177,7 @@ def load_frames(
 
 
 def _sequence(folder: Path) -> dict[int, Path]:
-    """Returns the volumes of a folder by the last number in their names, which otherwise must be equal."""
+    """Returns a folder's volumes by the last number in their file names, which must differ in nothing else."""
     found: dict[tuple[str, str], dict[int, Path]] = {}
     for path in sorted(folder.iterdir()):
         match = _NUMBERED.fullmatch(path.name)
@@ -243,8 +243,8 @@ def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
 class NumberedFiles:
     """Results of a run in a folder, one file per frame, which replace those of an earlier run.
 
-    The earlier files are removed when the first new file is about to be written, so that a run that fails before keeps
-    them. Each file is useful separately, so there is no index and no staging. While a resumable run is not finished,
+    The earlier files are removed when the first new file is about to be written, so that a run that fails earlier keeps
+    them. Each file is useful on its own, so there is no index file. While a resumable run is not finished,
     `STEM.partial` describes it.
 
     Attributes:
@@ -262,12 +262,12 @@ class NumberedFiles:
         run: Mapping[str, Any] | None = None,
         resume: bool = False,
     ) -> None:
-        """Creates the folder, or checks that it contains only files of an earlier run.
+        """Creates the folder, or checks that an existing one contains only files of an earlier run.
 
         Args:
             folder: The folder; created if its parent exists.
             stem, suffix: Stem and suffix of the files, as for `numbered`.
-            others: Names of further files of such a run.
+            others: Names of further files that a run may write into the folder.
             run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
             resume: Whether to keep the files of an interrupted run.
 
@@ -321,7 +321,7 @@ class NumberedFiles:
 
 def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
     """Writes lightmaps as an EXR of half floats: a channel per direction, `transparency`, `emission` of hot smoke, and
-    `depth` as float32 if it is known; the camera and the looks are in the header.
+    `depth` as float32 if it is known; the header stores the camera and the looks (lights, colours and obstacles).
 
     Raises:
         ValueError: The camera is unknown.
@@ -372,15 +372,15 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
 
 
 def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
-    """Reads the lightmaps and, if present, the looks of a file of `write_six_way`.
+    """Reads the lightmaps and, if present, the looks (lights, colours, obstacles) from a file of `write_six_way`.
 
     Raises:
-        WlmError: As `read_six_way`, or the looks are wrong.
+        WlmError: As for `read_six_way`, or the looks are invalid.
     """
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
         if name not in planes:
-            raise WlmError(f"{path}: channel {name}: expected it beside {', '.join(planes)}; is it of bake?")
+            raise WlmError(f"{path}: channel {name}: missing beside {', '.join(planes)}; did bake write it?")
     for name, plane in planes.items():
         if not np.isfinite(plane).all():
             raise WlmError(f"{path}: channel {name}: expected finite numbers, found NaN or infinity")

@@ -1,9 +1,9 @@
 """A trained network at run time: one image at a time, on a GPU in half floats and as a CUDA graph, on a CPU in float32.
 
-The adapters' weights are folded, which changes only rounding: a norm's scale and shift are merged into the following
-1 x 1 convolution, beta and gamma into the preceding one; the channel attention multiplies the weights of the following
-convolution. The adapters run in one batch, and their heads as one convolution. Pixels are rows of channels, so that
-1 x 1 convolutions are matrix products.
+Layers of the adapters are merged, which changes only rounding: a norm's scale and shift into the weights of the
+following 1 x 1 convolution, a block's factors beta and gamma into those of the preceding one; the channel attention
+multiplies the weights of the following convolution. The adapters run in one batch, and their heads as one convolution.
+An image is a matrix with a row of channels per pixel, so that 1 x 1 convolutions are matrix products.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Decoder:
     """
 
     def __init__(self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True) -> None:
-        """Folds the current weights and allocates buffers.
+        """Merges layers of the network with its current weights, and allocates buffers.
 
         Args:
             model: The network; it is not changed.
@@ -90,23 +90,10 @@ class Decoder:
 
 
 class _Adapters:
-    """G NAFBlocks in one batch on an image of H x W pixels and c channels.
-
-    Constants that a block adds to all pixels are separate: the norm's kernel adds those of the first correction, the
-    caller adds `shift`.
-
-    Attributes:
-        shift: [G, c], must be added to the outputs.
-    """
+    """G NAFBlocks in one batch on an image with c channels; the caller must add the constants `shift` [G, c]."""
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
-        """Folds the weights and allocates buffers.
-
-        Args:
-            blocks: The G blocks.
-            height, width: H and W.
-            device, dtype: Device and type of the computation.
-        """
+        """Merges the layers of the blocks and allocates buffers."""
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
         self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)
@@ -188,7 +175,7 @@ class _Body:
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """Returns all heads' outputs for each adapter, [G, N, H / stem, W / stem], of a guide [1, C, H, W]."""
+        """Maps a guide [1, C, H, W] to the N outputs of the heads for G adapters, [G, N, H / stem, W / stem]."""
         settings, stem = self.settings, self.settings.stem
         padded = F.pad(guide, self.padding)
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
@@ -215,7 +202,7 @@ class _Body:
 
 
 class _Tail:
-    """Combines the heads' outputs with the filter of the guide, which runs in float32; planes are 0 far from smoke."""
+    """Adds the heads' outputs and the filtered guide, in float32, and sets the planes to 0 far from smoke."""
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
@@ -255,11 +242,11 @@ def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.T
 
 
 def _halves(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Concatenates G groups so that all first halves come before all second halves."""
+    """Concatenates tensors so that the first halves of all come before the second halves of all."""
     return torch.cat([half for side in (0, 1) for half in (part.chunk(2)[side] for part in parts)])
 
 
 def _after_norm(norm: nn.Module, conv: nn.Conv2d) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns weights and biases of a 1 x 1 convolution into which the preceding norm is folded."""
+    """Returns weights and biases of a 1 x 1 convolution into which the preceding norm's scale and shift are merged."""
     weight = conv.weight[:, :, 0, 0]
     return weight * norm.weight[:, 0, 0], conv.bias + weight @ norm.bias[:, 0, 0]

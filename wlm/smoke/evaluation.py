@@ -1,13 +1,6 @@
 """Scores of lightmaps of a network, and of other methods on the same samples.
 
-All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5). Special cases:
-
-=====================================  =====================================================
-an exact prediction                    120 dB, as everywhere (`wlm.metrics`)
-no visible smoke                       the flicker is NaN
-a target that does not change          the ratio of flickers is NaN
-no samples, or planes of another size  error
-=====================================  =====================================================
+All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5).
 """
 
 import copy
@@ -49,11 +42,11 @@ _STILL = 1e-4  # a flicker up to this, a fortieth of a level of 8 bits, counts a
 
 @dataclass(frozen=True)
 class Score(system.Report):
-    """Scores of predicted planes on a pool; decibels in sRGB with a peak of 1, over whole images.
+    """Scores of predicted planes on a pool of samples; PSNRs are in dB, in sRGB with a peak of 1, over whole images.
 
     Attributes:
         psnr: Mean over the images of the PSNR of their six lightmaps, as in the paper.
-        lowest, highest: Range over the images.
+        lowest, highest: Lowest and highest PSNR of an image.
         planes: PSNR of each of `PLANES`, from the mean square error over all images.
         flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
             earlier frame by the smoke's motion. It includes shadows that move differently, and new smoke.
@@ -134,7 +127,7 @@ def evaluate(
 
 
 def of_network(network: torch.nn.Module) -> Method:
-    """Returns the method of a network in float32 on several images at once, as in validation."""
+    """Returns a `Method` that runs a network in float32 on several images at once, as validation does."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -144,7 +137,7 @@ def of_network(network: torch.nn.Module) -> Method:
 
 
 def of_decoder(decoder: Decoder) -> Method:
-    """Returns the method of a network at run time."""
+    """Returns a `Method` that runs a decoder on one image at a time."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -201,8 +194,8 @@ class Comparison:
 
     Attributes:
         name: Name of the test set.
-        samples: Number of frame pairs and views.
-        methods: Scores by name.
+        samples: Number of samples, each a pair of frames in one view.
+        methods: Scores by name of the method.
     """
 
     name: str
@@ -211,7 +204,7 @@ class Comparison:
 
     @property
     def half_loss(self) -> float | None:
-        """Decibels lost by half floats; None if they were not scored."""
+        """PSNR in dB that is lost by computing in half floats; None if they were not scored."""
         half = self.methods.get(HALF)
         return None if half is None else self.methods[NETWORK].psnr - half.psnr
 
@@ -230,7 +223,7 @@ def compare(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> list[Comparison]:
-    """Scores a network, and the coarse march if that is its guide, on the test set at several densities and on volumes.
+    """Scores a network (and a coarse march that is its guide) on a test set at several densities and on volumes.
 
     Args:
         model: The network.
@@ -277,7 +270,7 @@ def compare(
 
 
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """Returns the coarse march of six lights, which is a pool's guide of kind "six"; a `Method`.
+    """A `Method` that returns the guides themselves, which must be of kind "six", a coarse march of six lights.
 
     Raises:
         ValueError: The pool's guides are of another kind.
@@ -289,7 +282,7 @@ def coarse(pool: Pool, part: slice) -> torch.Tensor:
 
 
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:
-    """Returns the method of the network's decoder for images of the pool's size."""
+    """Returns a `Method` that runs the network's decoder, for images of the pool's size."""
     height, width = pool.guides.shape[-2:]
     return of_decoder(Decoder(model, device, height=height, width=width, half=half))
 

@@ -2,19 +2,7 @@
 
 A training has rounds. Each round simulates a pool of samples, from sequences that no other round uses, and trains on
 it. A step depends only on the seed, the round and the number of the step. A training that was stopped and resumed
-therefore gives the same weights and curves, to the bit on one device, as one that was not. Special cases:
-
-===============================================  ========================================================
-NaN or infinity in a pool                        error that names the round, the tensor and the first sample
-a step whose gradient is not finite              skipped and counted; error if a tenth of a round's steps are
-3 dB below the untrained network                 error at the end of the round; the best network so far is kept
-an empty pool, or one of another size            error
-out of time, or stopped                          a checkpoint is written first
-stopped before the first step                    a checkpoint of step 0 replaces any older checkpoint
-resumed beside a network that is not the         the network of the next validation is saved
-checkpoint's best
-resumed after the end                            error
-===============================================  ========================================================
+therefore gives the same weights and curves, to the bit on one device, as one that was not.
 """
 
 import csv
@@ -58,7 +46,7 @@ class Training:
     """Result of a training.
 
     Attributes:
-        finished: Whether it is finished; otherwise it ran out of time and can be resumed.
+        finished: Whether all rounds are done; otherwise the time ran out and the training can be resumed.
         best: Validation PSNR of the saved network; NaN if none has been validated.
         score: The last validation, or None.
         steps, skipped: Numbers of steps, and of steps without an update.
@@ -190,7 +178,7 @@ class _Run:
 
     @property
     def late(self) -> bool:
-        """Whether the time is up."""
+        """Whether the time limit of the training has passed."""
         return self.meter.seconds > self.limit
 
     @property
@@ -275,7 +263,7 @@ class _Run:
         return Training(finished, self.best, self.score, step, skipped, self.seconds, self._saved())
 
     def _saved(self) -> SmokeModel | None:
-        """Loads the output; None if it is missing or damaged: the next best network replaces it."""
+        """Loads the network of the output file; None if the file is missing or damaged, and will be replaced."""
         try:
             return load(self.output, SmokeModel.SYSTEM)
         except WlmError:

@@ -1,8 +1,8 @@
 """Six-way lightmaps of one frame, the result of each march and of the network, and their shading.
 
 A lightmap stores the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from the map's
-direction: with g = 0 at most 1/2 from the front and 1 from a side. All values are linear. Lightmaps are orthographic,
-the only view of a flat billboard.
+direction: with isotropic scattering at most 1/2 under the front light and 1 under the others. All values are linear.
+Lightmaps are orthographic, the only view of a flat billboard.
 """
 
 import math
@@ -79,10 +79,10 @@ class SixWay:
         ramp: Ramp | None = None,
         albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
-        """Lights the smoke; a light of irradiance E adds E / (4 pi) times its weight of each lightmap (eq. 4 and 5).
+        """Lights the smoke: each light adds irradiance / (4 pi) times a weighted sum of lightmaps (eq. 4 and 5).
 
         Args:
-            lights: Any number.
+            lights: Any number of directional lights.
             background: Linear light behind the smoke, [H, W, 3] or one colour; None: only the smoke's light, to which
                 the background times the transparency must be added.
             rule: Rule for the weights of the lightmaps, one of `wlm.smoke.camera.RULES`.

@@ -1,11 +1,8 @@
 """Settings of a scene to simulate and render, a YAML file: box, air, smoke, inlets, obstacles, camera, lights.
 
 Lengths are in metres, times in seconds, directions in the world, with +y up by default. A class is named `...Settings`
-if the object that is made from it has the plain name. Special cases:
-
-=======================================  =============================================================
 a cell not of 1e-9 to 1e9 metres         error
-more than 1,000,000 steps a frame        error that says what asks for them
+more than 1,000,000 steps a frame        error that names the cause
 a path whose times do not increase       error
 no inlet, no source                      valid: the box stays empty
 an obstacle over an inlet                valid: no inflow through the covered part
@@ -13,6 +10,8 @@ a camera or a light along an axis        valid, also along the vertical
 an obstacle or an inlet too fast for     error in the simulation, which names the obstacle or the inlet
 the time step
 =======================================  =============================================================
+=======
+if the object that is made from it has the plain name.
 """
 
 from __future__ import annotations
@@ -88,8 +87,8 @@ class Grid(_Settings):
         refine: Voxels of density along the edge of a cell; 4 in the paper.
         origin: Corner of the box.
         faces: Boundary condition of each face: "wall", "slip" (a wall without friction), "open" (the default), or
-            "periodic", which the opposite face must then be too. Around an inlet its face is a wall for the air, and
-            entirely open for the smoke.
+            "periodic", which the opposite face must then be too. A face with an inlet is a wall for the air around the
+            inlet, and is open as a whole for the smoke.
     """
 
     cells: tuple[_Count, _Count, _Count]
@@ -156,7 +155,7 @@ class Smoke(_Settings):
         weight: Downward acceleration at density 1, metres per second squared.
         up: Direction opposite to gravity.
         scheme, storage, bricks, substeps: Advection, as for `wlm.fluid.solver.Solver`.
-        glow: Colours of the emission, as stops of emission, R, G, B; empty: grey.
+        glow: Colour ramp of the emission, a list of stops (emission, R, G, B); empty: grey.
     """
 
     extinction: _Positive = 10.0
@@ -317,7 +316,7 @@ class LightSettings(_Settings):
 
 
 class Looks(_Settings):
-    """Settings of a frame's picture other than the smoke itself.
+    """Settings with which a frame's smoke is rendered: lights, colours and obstacles.
 
     Attributes:
         lights, background, obstacles: As in a scene.
@@ -347,7 +346,7 @@ class Scene(_Settings):
         inlets, sources, obstacles: Objects in the box.
         camera, lights, background: Settings of pictures; the background is a linear colour.
         frames: Number of frames.
-        rate: Frames per second; the first is one interval after the start.
+        rate: Frames per second; the first frame is one interval after the start.
     """
 
     name: str
@@ -414,18 +413,18 @@ class Scene(_Settings):
 
     @property
     def _speed_of_one_step(self) -> float:
-        """Greatest speed in metres per second with one step per frame."""
+        """Speed in metres per second that equals `air.lattice_speed` with one air step per frame."""
         return self.rate * self.air.lattice_speed * self.grid.cell
 
     @property
     def steps(self) -> int:
-        """Steps of the air per frame: the fewest for `fastest`, in multiples of the substeps."""
+        """Air steps per frame: the smallest multiple of the substeps limiting `fastest` to `air.lattice_speed`."""
         least = self.fastest / self._speed_of_one_step
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
     @property
     def step(self) -> float:
-        """Duration of a step in seconds."""
+        """Duration of an air step in seconds."""
         return 1.0 / (self.rate * self.steps)
 
 
@@ -442,12 +441,7 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
 def make_camera(
     settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
 ) -> Camera:
-    """Places a camera in front of a box.
-
-    Args:
-        settings: The camera.
-        origin, size: Corner and edges of the box in the world, [3].
-    """
+    """Places a camera in front of a box in the world, of the corner `origin` [3] and the edges `size` [3]."""
     values = settings.model_dump()
     return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 

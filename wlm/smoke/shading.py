@@ -51,5 +51,5 @@ class Ramp:
 
 
 def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
-    """Returns the rows of three axes, 9 numbers, of which the third points to a light."""
+    """Returns three orthogonal unit axes, the third of which points to a light, as 9 numbers, axis by axis."""
     return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()

@@ -29,11 +29,7 @@ _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene.
-
-    Args:
-        scene: The scene.
-        device: Result of `wlm.interop.check_device`.
+    """Builds the solver of a scene on a device, a result of `wlm.interop.check_device`.
 
     Raises:
         WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
@@ -82,7 +78,7 @@ def simulate(
 
     The state is saved in the folder every `checkpoint_every` seconds, also within a frame, and when `progress` raises
     KeyboardInterrupt. A resumed simulation gives the same frames: on the CPU to the bit, on a GPU up to the order of
-    atomic sums, and with smoke in bricks up to their threshold.
+    atomic sums, and with the setting `bricks` up to the threshold below which a brick counts as empty.
 
     Args:
         frames: The folder, prepared by `wlm.smoke.data.open_frames`.
@@ -165,7 +161,7 @@ def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
 
 
 def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
-    """Does one step of the smoke, which begins at a time in frames, with the sources that are active then."""
+    """Does the smoke's step that begins at time `frames`, in frame intervals, with the sources that are active then."""
     solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
     solver.step()
 
@@ -188,6 +184,7 @@ def _require_memory(scene: Scene, device: str) -> None:
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
+    """Builds the lattice with the conditions at its faces."""
     grid, air = scene.grid, scene.air
     domain = Domain(grid.cell, scene.step)
     lattice = Lattice(
@@ -199,21 +196,6 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
         device=device,
         ramp=_RAMP * max(grid.cells),
     )
-    _set_faces(lattice, scene, domain)
-    return lattice
-
-
-def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
-    smoke, domain = scene.smoke, Domain(scene.grid.cell, scene.step)
-    if not (smoke.buoyancy or smoke.weight):
-        return None
-    up = np.array(smoke.up) / np.linalg.norm(smoke.up)
-    lift, weight = (domain.acceleration(value) for value in (smoke.buoyancy, smoke.weight))
-    return fluid.Buoyancy(lift, weight, tuple(map(float, up)))
-
-
-def _set_faces(lattice: Lattice, scene: Scene, domain: Domain) -> None:
-    grid = scene.grid
     for name in FACES:
         inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
         kind = grid.face(name)
@@ -224,6 +206,16 @@ def _set_faces(lattice: Lattice, scene: Scene, domain: Domain) -> None:
         elif kind == "open":
             # With inlets, the outflow equals the inflow; without, the outside is at rest.
             lattice.set_outlet(name, density=None if scene.inlets else 1.0)
+    return lattice
+
+
+def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
+    smoke, domain = scene.smoke, Domain(scene.grid.cell, scene.step)
+    if not (smoke.buoyancy or smoke.weight):
+        return None
+    up = np.array(smoke.up) / np.linalg.norm(smoke.up)
+    lift, weight = (domain.acceleration(value) for value in (smoke.buoyancy, smoke.weight))
+    return fluid.Buoyancy(lift, weight, tuple(map(float, up)))
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
@@ -245,8 +237,7 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
 
 
 def _sources(scene: Scene) -> list[_Timed]:
-    """Returns the solver's sources at inlets and within the box, in cells, each with a function of time: whether it is
-    active."""
+    """Returns the sources at inlets and within the box, in cells, each with a test whether it is active at a time."""
     sources: list[_Timed] = []
 
     def add(

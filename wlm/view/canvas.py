@@ -211,12 +211,9 @@ def _world(renderer: Any, x: int, y: int, depth: float) -> np.ndarray:
 
 
 def _front_hits(mesh: Any, origin: np.ndarray, direction: np.ndarray) -> list[tuple[float, int, np.ndarray]]:
-    """Finds the nearest triangle whose front face a ray hits: distance, index and barycentric weights; or nothing.
-
-    Distances are in lengths of `direction` (Möller and Trumbore 1997).
-    """
+    """Finds the nearest front face that a ray hits: distance in lengths of `direction`, index, barycentric weights."""
     a, b, c = np.asarray(mesh.points, np.float64)[mesh.regular_faces].transpose(1, 0, 2)
-    across, along = b - a, c - a
+    across, along = b - a, c - a  # as Möller and Trumbore 1997
     turned = np.cross(direction, along)
     scale = np.einsum("fk,fk->f", across, turned)
     front = np.flatnonzero(scale > 0.0)  # the others face away or are edge-on

@@ -51,11 +51,6 @@ class Lighting:
         """Name of the stage in the table of durations."""
         return "lightmaps" if self.albedo is None else "light of all orders"
 
-    @property
-    def in_graph(self) -> bool:
-        """Whether the lighting never waits for the device, so that a graph can capture it."""
-        return self.network is None
-
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
         """Lights the smoke on its device; the result has the depth of its surface."""
         if self.albedo is not None:
@@ -112,7 +107,8 @@ def run(
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
     graph = None
-    if lighting.in_graph and device != "cpu":
+    # A network waits for the device, which a graph cannot capture.
+    if lighting.network is None and device != "cpu":
         # The frames before have loaded the kernels.
         graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
     meter = Meter(progress, "run", scene.frames)

@@ -168,7 +168,8 @@ class _LightmapScene(SurfaceScene):
             self._frames = fill_gaps(given.frames, given.mask)
 
     def lights(self, state: State) -> dict[str, np.ndarray]:
-        hour = self._hour(state)
+        first = self.model if self.model is not None else self.lightmaps
+        hour = state.values.get("hour", float(first.times[0]))
         if self._shown is None or self._shown[0] != hour:
             lights, note = {}, ""
             if self._decoder is not None:
@@ -215,10 +216,6 @@ class _LightmapScene(SurfaceScene):
         kinds = [(kind.name.lower(), _COLOURS[kind][0]) for kind in TileKind if counts[kind.name.lower()]]
         told = (f"{counts[name]} {name}{f' ({colour})' * (state.view == 'tiles')}" for name, colour in kinds)
         return f"{size}, tiles: {', '.join(told)}{note}"
-
-    def _hour(self, state: State) -> float:
-        first = self.model if self.model is not None else self.lightmaps
-        return state.values.get("hour", float(first.times[0]))
 
 
 def atlas_scene(

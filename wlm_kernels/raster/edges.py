@@ -26,7 +26,7 @@ vec12d = wp.types.vector(length=12, dtype=wp.float64)
 
 @wp.struct
 class Frame:
-    """Pixel centres: column i, row j has its centre at ((x + 2 i) H, (y + y_step j) W, scale W H), all integers.
+    """Pixel centres: that of column i, row j is (x, y, w) = ((x + 2 i) H, (y + y_step j) W, scale W H), in integers.
 
     Attributes:
         height, width: H, W.
@@ -69,7 +69,7 @@ class Edges:
 
     Attributes:
         x, y, c: Coefficients; component i belongs to the edge opposite corner i.
-        limit: Bound of the rounding error; set by `edges_of`.
+        limit: Bound of the rounding error of each edge function; set by `edges_of`.
         sign: Sign of the determinant of the corners; 0: covers nothing.
     """
 
@@ -115,7 +115,7 @@ def finite(k: Corners) -> bool:
 
 @wp.func
 def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
-    """Sign of det[p, v, w], for p of integers up to 2^29 or of float32s, and v, w of float32s.
+    """Returns the exact sign of det[p, v, w], for p of integers up to 2^29 or of float32s, and v, w of float32s.
 
     A product v_a w_b fits 48 bits, each half of it times p_c fits 53: twelve exact terms. They are added as an
     expansion, a sum of float64s that don't overlap; its last component that isn't zero has the sign.
@@ -159,7 +159,7 @@ def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
 
 @wp.func
 def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
-    """Computes the edge functions. Products of float32s are exact: coefficients have the right sign, one rounding."""
+    """Computes the edge functions in float64; products of float32s are exact, so a coefficient is rounded once."""
     out = Edges()
     n0 = sign * wp.cross(k.b, k.c)
     n1 = sign * wp.cross(k.c, k.a)
@@ -194,7 +194,7 @@ def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
 
 @wp.func
 def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
-    """Returns whether P, moved by the infinitesimal step of the top-left rule, lies inside; exact."""
+    """Returns whether a pixel's centre lies inside the triangle; exact, with the top-left rule on edges."""
     p = centre(frame, row, column)
     v = k.b
     w = k.c
@@ -214,9 +214,9 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
 
 @wp.func
 def _extent(k: Corners, axis: int):
-    """Returns the range of x / w, or y / w, of the part in front of the viewer; least > greatest if there is none.
+    """Returns the least and greatest x / w (axis 0) or y / w of the triangle's part in front of the viewer.
 
-    An edge that crosses w = 0 goes to an infinity whose sign is the same along all of it.
+    An edge that crosses w = 0 goes to an infinity of one sign. Without such a part the least is above the greatest.
     """
     low = wp.float64(wp.inf)
     high = wp.float64(-wp.inf)
@@ -251,7 +251,7 @@ def last_pixel(place: wp.float64, count: int) -> int:
 
 @wp.func
 def box_of(k: Corners, frame: Frame) -> Box:
-    """Returns the bounding box of the part in front of the viewer."""
+    """Returns the bounding box, in pixels, of the triangle's part in front of the viewer."""
     out = Box()
     x_low, x_high = _extent(k, 0)
     y_low, y_high = _extent(k, 1)
@@ -289,7 +289,7 @@ def total_of(v: wp.vec3d) -> wp.float64:
 
 
 def frame(height: int, width: int, space: str) -> Frame:
-    """Creates the frame of an image.
+    """Creates the `Frame` of an image of the given size in pixels, in `space` "clip" or "uv".
 
     Raises:
         ValueError: A size is out of range.

@@ -75,7 +75,7 @@ def _draw(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
-    """Draws the part of a triangle in a box: lowers the keys and counts the coverage of its pixels."""
+    """Draws the part of a triangle in a box: updates the depth keys and coverage counts of its pixels."""
     e = edges_of(k, frame, cull)
     if e.sign == _ZERO:
         return
@@ -147,10 +147,10 @@ def _draw_small(
     queue: wp.array1d[int],
     starts: wp.array1d[wp.int64],
 ):
-    """One triangle per thread: draws small ones and queues the others.
+    """Handles one triangle per thread: draws a small one, and queues a larger one as tiles for `_draw_tiles`.
 
-    `queued` counts triangles in multiples of `unit` and tiles below that, in one atomic addition, so that the
-    queue's starts rise.
+    `queued` is unit * (number of triangles) + (number of tiles). One atomic addition changes both, so that `starts`,
+    the first tile of each queued triangle, is ascending.
     """
     t = wp.tid()
     if not has_corners(triangle, t, position.shape[0]):
@@ -188,7 +188,7 @@ def _draw_tiles(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
-    """One tile of a queued triangle per thread and round."""
+    """Draws the tiles of queued triangles, one per thread at a time; thread i takes tiles i, i + sharers, ..."""
     item = wp.int64(wp.tid())
     count = int(queued[0] / unit)
     items = queued[0] % unit
@@ -228,7 +228,7 @@ def _resolve(
     depth: wp.array2d[float],
     derivative: wp.array2d[wp.vec4],
 ):
-    """One pixel per thread."""
+    """Computes one pixel of the results from its depth key; one pixel per thread."""
     row, column = wp.tid()
     key = keys[row, column]
     if key == _EMPTY:
@@ -271,8 +271,8 @@ class Raster:
 
     Attributes:
         triangle: int [H, W], number of the visible triangle, -1: none.
-        barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has the rest.
-            0 where there is no triangle, as all below.
+        barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has 1 minus
+            their sum. 0 where there is no triangle, like the attributes below.
         depth: float [H, W], z / w.
         derivative: vec4 [H, W], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right and y
             down; None: not computed.
@@ -296,7 +296,7 @@ class Rasterizer:
         height, width: Size of the image, 1 to `MOST_PIXELS`.
         space: "clip" or "uv", see the module.
         cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
-        derivative, coverage: Whether to compute these of `Raster`.
+        derivative, coverage: Whether to compute these attributes of `Raster`.
         split: Maximum pixels in the box of a triangle drawn by one thread; None: 64 on CUDA, no limit on the CPU.
         empty: Allocates a buffer, `empty(shape, dtype=...)` on the triangles' device; default Warp's.
 
@@ -354,7 +354,7 @@ class Rasterizer:
         )
 
     def run(self, position) -> Raster:
-        """Draws the triangles.
+        """Draws the triangles with their corners at the given positions.
 
         Args:
             position: float [V, 4], clip coordinates x, y, z, w; or in UV space float [V, 2], u and v.

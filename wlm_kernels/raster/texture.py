@@ -33,8 +33,8 @@ class Axis:
     """A coordinate's two texels along one axis, and their weights.
 
     Attributes:
-        low, high: The texels on its two sides, equal at a border; always in the texture.
-        weight: Weight of `high`, in [0, 1]; `low` has the rest. NaN: the coordinate reads NaN.
+        low, high: Indices of the texels on both sides of the coordinate, equal at a border; always in the texture.
+        weight: Weight of texel `high`, in [0, 1]; `low` has 1 - weight. NaN if the coordinate reads NaN.
         slope: Derivative of `weight` by the coordinate.
     """
 
@@ -46,7 +46,7 @@ class Axis:
 
 @wp.func
 def triangle_wave(x: float) -> float:
-    """Eq. 8: |x| for x in [-1, 1], of period 2; exact. NaN for NaN and infinity."""
+    """Evaluates the triangle wave of the boundary "mirror" exactly: |x| in [-1, 1], period 2. NaN if x isn't finite."""
     t = wp.float64(x)
     half = wp.float64(0.5)
     return float(wp.abs(t - wp.float64(2.0) * wp.floor(half * t + half)))
@@ -54,7 +54,7 @@ def triangle_wave(x: float) -> float:
 
 @wp.func
 def triangle_wave_slope(x: float) -> float:
-    """1 where the wave rises and in its valleys, -1 where it falls and on its peaks; 0 for NaN and infinity."""
+    """Returns the wave's slope: 1 where it rises and in valleys, -1 where it falls and on peaks; 0 for NaN."""
     if not wp.isfinite(x):
         return 0.0
     t = wp.float64(x)
@@ -64,12 +64,12 @@ def triangle_wave_slope(x: float) -> float:
 
 @wp.func
 def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
-    """Finds the texels and weights of a coordinate.
+    """Finds the two texels next to a coordinate along one axis, and their weights.
 
     Args:
         x: u or v.
         size: Texels along the axis, at least 1.
-        filter, boundary: Numbers by `codes`.
+        filter, boundary: Integer codes, returned by `codes`.
     """
     out = Axis()
     n = wp.float64(size)
@@ -108,7 +108,7 @@ def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
 
 @wp.func
 def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
-    """Samples channel c at a coordinate."""
+    """Samples channel c of a texture at the coordinates (x, y)."""
     top = texture[y.low, x.low, c]
     # A neighbour with weight 0 isn't read: it may be infinite.
     if x.weight != 0.0:
@@ -123,7 +123,7 @@ def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
 
 @wp.func
 def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
-    """Returns the derivatives of channel c by u and by v."""
+    """Returns the derivatives of the sampled channel c by u and by v."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return wp.vec2()
     top_left = texture[y.low, x.low, c]
@@ -137,7 +137,7 @@ def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
 
 @wp.func
 def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
-    """Adds the gradient of a value of `read` to the gradients of its texels."""
+    """Adds the gradient g of a result of `read` to the gradients of the texels that it read."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return
     top = (1.0 - y.weight) * g
@@ -161,7 +161,7 @@ def _sample(
     # out:
     out: wp.array2d[float],
 ):
-    """One point per thread."""
+    """Samples the texture at one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -181,7 +181,7 @@ def _sample_backward(
     grad_texture: wp.array3d[float],
     grad_uv: wp.array1d[wp.vec2],
 ):
-    """One point per thread."""
+    """Adds one point's gradient to the texture and writes the gradient of uv; one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -200,7 +200,7 @@ def _sample_backward(
 
 
 def codes(filter: str, boundary: str) -> tuple[int, int]:
-    """Returns the kernels' codes of a filter and a boundary.
+    """Returns the integer codes by which kernels know a filter and a boundary mode.
 
     Args:
         filter: "linear", between the four nearest texels, or "nearest".
@@ -227,7 +227,7 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
         texture: float [H, W, C].
         uv: vec2 [N].
         out: float [N, C], written.
-        filter, boundary: As for `codes`.
+        filter, boundary: Names, see `codes`.
     """
     _check(texture)
     inputs = [texture, uv, *codes(filter, boundary)]
@@ -242,7 +242,7 @@ def sample_backward(
     On CUDA samples are added to `grad_texture` in any order, so that the last bits change from run to run.
 
     Args:
-        texture, uv, filter, boundary: As for `sample`.
+        texture, uv, filter, boundary: Arguments of `sample`.
         grad_out: float [N, C].
         grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not computed.
         grad_uv: vec2 [N], written; of shape [0]: not computed.

@@ -73,7 +73,7 @@ def _add_up(
     # out:
     nodes: wp.array4d[wp.vec2],
 ):
-    """Sums depths from each node of a line to both of its ends; the light is at the last node."""
+    """Sums optical depths from each node of a line to both of its ends; the light is beyond the last node."""
     pair, line, k = wp.tid()
     first = pair == 0  # whether the line runs along the first axis
     last = wp.where(first, nodes.shape[0], nodes.shape[1]) - 1
@@ -164,7 +164,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
 
 
 def parts_of(length: float, step: float) -> int:
-    """Returns the number of equal parts, no longer than a step, of a length; at least 1."""
+    """Returns the number of equal parts into which a length is divided so that none exceeds a step; at least 1."""
     return max(math.ceil(length / step - _ROUNDING), 1)
 
 
@@ -182,7 +182,7 @@ def make_lattice(
         axes: The three axes, orthogonal and of length 1.
         spacing: Largest distance between nodes in voxels; at least a quarter of a voxel is used.
         origin: Origin of the lattice's coordinates, in voxels.
-        most: Largest number of gaps; the spacing grows until it suffices.
+        most: Largest number of gaps between nodes; the spacing grows until there are no more.
 
     Returns:
         The lattice, and its nodes along each axis.
@@ -203,7 +203,7 @@ def make_lattice(
 
 
 def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
-    """Computes the depths of lights at infinity.
+    """Computes the optical depths from the nodes to pairs of lights at infinity.
 
     Args:
         medium: The smoke.
@@ -235,7 +235,7 @@ def reach(medium: Medium, place: Sequence[float], radius: float | None, march: M
         medium: The smoke.
         place: Direction to a light at infinity, of length 1, or position of a point light in voxels.
         radius: Radius of a point light in voxels, within which its irradiance is constant; None: light at infinity.
-        march: Its spacing and light_step; a point light has at most 2^24 nodes.
+        march: Only its spacing and light_step are used; the lattice of a point light has at most 2^24 nodes.
 
     Returns:
         A lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light. A point light has no

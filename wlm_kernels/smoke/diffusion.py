@@ -1,10 +1,10 @@
-"""Multiple scattering by diffusion on a coarse grid: light that cells stop, its fluence, and its image in a camera.
+"""Multiple scattering by diffusion on a coarse grid: extinguished light, its fluence, and a camera's image of it.
 
-In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the light
-that the cell stops directly from a light source, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half
-of the fluence leaves at the box's faces (Marshak's condition). Rounds of red-black successive over-relaxation solve it,
+In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the
+direct light that the cell absorbs or scatters, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half of
+the fluence leaves at the box's faces (Marshak's condition). Rounds of red-black successive over-relaxation solve it,
 each with D computed from the previous fluence. Grids go from coarse to fine: the coarsest has a few cells, between
-which light spreads within the sweeps of a round; each finer grid starts from the interpolated result of the one before.
+which light spreads within one round; each finer grid starts from the interpolated result of the coarser one.
 
 Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
@@ -54,7 +54,7 @@ def _reach(
     # out:
     reach: wp.array4d[float],
 ):
-    """Computes D by central differences; cells beyond the box have the value of the nearest cell."""
+    """Computes D of a cell by central differences of the fluence; beyond the box it is that of the nearest cell."""
     n, i, j, k = wp.tid()
     nx = light.shape[1]
     ny = light.shape[2]
@@ -71,13 +71,13 @@ def _reach(
 
 @wp.func
 def _flow(one: float, other: float, size: float) -> float:
-    """Computes the flow between two neighbours of given D, per volume and difference of fluence."""
+    """Computes the flow between two cells with the given D, per volume and per difference of their fluences."""
     return 2.0 * one * other / ((one + other) * size * size)
 
 
 @wp.func
 def _exchange(own: float, reach: wp.array4d[float], n: int, i: int, j: int, k: int, size: float) -> float:
-    """Computes the flow to a neighbour, or the loss through a face of the box, per volume and unit of fluence."""
+    """Computes the flow to a neighbouring cell, or the loss through a face of the box, per volume and fluence."""
     if i < 0 or i >= reach.shape[1] or j < 0 or j >= reach.shape[2] or k < 0 or k >= reach.shape[3]:
         return 1.0 / (size * (2.0 + 0.5 * size / own))
     return _flow(own, reach[n, i, j, k], size)
@@ -94,7 +94,7 @@ def _couple(
     # out:
     flows: wp.array4d[wp.vec4],
 ):
-    """Computes flows to the next cells along the axes, 0 at the box's faces, and 1 over the total loss of a cell."""
+    """Computes a cell's flows to the next cells along x, y and z (0 at the box's faces) and 1 over its total loss."""
     n, i, j, k = wp.tid()
     own = reach[n, i, j, k]
     x = _exchange(own, reach, n, i + 1, j, k, cell[0])
@@ -122,7 +122,7 @@ def _relax(
     # out:
     light: wp.array4d[float],
 ):
-    """Relaxes the cells of one colour; the `each` albedos of a source follow one another in the light."""
+    """Relaxes the cells of one colour, red or black; in `light` the `each` albedos of a source are adjacent."""
     n, i, j, half = wp.tid()
     k = 2 * half + ((i + j + colour) & 1)
     if k >= light.shape[3]:
@@ -203,10 +203,10 @@ def spread(
     Args:
         medium: The smoke, which allocates buffers.
         extinction: float [X, Y, Z], per voxel.
-        source: float [L, X, Y, Z], q.
+        source: float [L, X, Y, Z], the source q of each of L lights.
         cell: Edges of a cell.
         albedos, each: Each source is solved for the first `each` of the albedos.
-        light: float [L * each, X, Y, Z], written: f.
+        light: float [L * each, X, Y, Z], written: the fluence f.
     """
     device = light.device
     grids = [(extinction.reshape((1, *extinction.shape)), source, cell)]
@@ -239,7 +239,7 @@ def _relax_rounds(
     light: wp.array,
     rounds: int,
 ) -> None:
-    """Runs rounds on one grid, beginning with `light`."""
+    """Runs rounds of over-relaxation on one grid, which start from the fluence in `light` and overwrite it."""
     reach, flows = medium.buffer(light.shape, float), medium.buffer(light.shape, wp.vec4)
     halves = (*light.shape[:3], (light.shape[3] + 1) // 2)
     extinction = thickness.reshape(thickness.shape[1:])
@@ -254,7 +254,7 @@ def _relax_rounds(
 
 @wp.func
 def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
-    """Adds light to the eight cells around a position; beyond the outermost centres to the outermost cells."""
+    """Adds light to the eight cells around a position, or to the outermost cells for a position near a face."""
     q = wp.cw_div(place, cell) - wp.vec3(0.5, 0.5, 0.5)
     i = int(wp.floor(q[0]))
     j = int(wp.floor(q[1]))
@@ -286,7 +286,7 @@ def _shoot(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Traces one ray from a point light and adds the light that smoke stops to the cells around."""
+        """Traces one ray from a point light and adds the light that smoke extinguishes to the cells along it."""
         n = wp.tid()
         height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
@@ -338,7 +338,7 @@ def _stop(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Computes the light from a light at infinity that a cell stops, per volume."""
+        """Computes the direct light that a cell extinguishes from a light at infinity, per volume."""
         i, j, k = wp.tid()
         total = float(0.0)
         for x in range(parts[0]):
@@ -397,22 +397,22 @@ def _gather(smoke_type: Any) -> wp.Kernel:
 def shoot(
     medium: Medium, place: wp.vec3, radius: float, step: float, cell: wp.vec3, power: float, out: wp.array
 ) -> None:
-    """Adds to each cell the light that it stops directly from a point light.
+    """Adds to each cell the direct light that it extinguishes from a point light.
 
     Args:
         medium: The smoke.
-        place: Position of the light.
-        radius: Distance within which the irradiance is constant.
+        place: Position of the light, in voxels.
+        radius: Distance in voxels within which the irradiance is constant.
         step: Longest step along the light's rays.
         cell: Edges of a cell.
         power: Power of the light.
-        out: float [X, Y, Z], cells.
+        out: float [X, Y, Z], a number per cell, added to.
     """
     _shoot(medium, _RAYS, [place, radius, step, cell, power / _RAYS], [out])
 
 
 def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array) -> None:
-    """Computes the light that each cell stops directly from a light at infinity of irradiance 4 pi.
+    """Computes the direct light that each cell extinguishes from a light at infinity of irradiance 4 pi.
 
     Args:
         medium: The smoke.
@@ -437,7 +437,7 @@ def gather(
         cell: Edges of a cell.
         light: float [N, X, Y, Z], fluences; at least one.
         out: float [2, N, H, W], written: all light, and the light from thin smoke, where each sample is weighted by the
-            transparency of a cell of smoke of its density.
-        thin: float [H, W], written: the opacity of thin smoke, weighted alike.
+            transparency that a cell of its density has.
+        thin: float [H, W], written: the opacity of thin smoke, weighted in the same way.
     """
     _gather(medium, out.shape[1:], [view, parameters(march), cell, light], [out, thin])

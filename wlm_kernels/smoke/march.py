@@ -74,7 +74,7 @@ class Medium:
         extinction: Extinction per voxel at density 1.
         temperature: Array of the density's shape and type; None: the smoke emits no light.
         emission: Light emitted per voxel at temperature 1.
-        empty: Allocates buffers on the density's device; None: Warp's own allocator.
+        empty: Function that allocates buffers on the density's device; None: Warp's own allocator.
         bricks: Occupancy of bricks, from `in_bricks`; None: marches sample every voxel.
     """
 
@@ -237,7 +237,7 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
 
 @wp.func
 def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float) -> Ray:
-    """Divides a ray's way through all smoke in front of the origin into equal steps up to `step`; none if it misses."""
+    """Divides the part of a ray in front of the origin and within the smoke into equal steps up to `step`."""
     r = Ray()
     r.origin = origin
     r.direction = direction
@@ -404,7 +404,7 @@ def pass_step(r: Ray, cutoff: float) -> Ray:
 
 @wp.func
 def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
-    """Finds the distance to the first sample above the threshold; `depth` is the result so far, 0: none."""
+    """Finds the distance to the first sample above the density threshold; `depth` is the result so far, 0: none."""
     if depth == 0.0 and r.sigma > threshold:
         return (r.distance + view.moved) * view.voxel
     return depth
@@ -437,7 +437,7 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Computes the numbers of nodes over the smoke for a spacing of at most the larger of a step and a voxel."""
+    """Computes the number of nodes along each axis for a spacing of at most a step, or a voxel if that is more."""
     # Each node marches to its lights separately, so the work grows with the fourth power of the resolution.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 

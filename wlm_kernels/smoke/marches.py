@@ -394,7 +394,7 @@ def _motion(smoke_type: Any) -> wp.Kernel:
 def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: March, out: wp.array) -> None:
     """Computes by how many pixels the smoke of each pixel has moved since the frame before.
 
-    A step is weighted by the light that it absorbs, T (1 - exp(-sigma h)), so that hidden smoke has little weight.
+    A step's weight is the opacity that it adds, (1 - exp(-sigma h)) times the transparency of the smoke in front of it.
 
     Args:
         medium: The smoke of the later frame.
@@ -402,7 +402,7 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         velocity: vec3 [A, B, C], velocity of the air over the same box, with any number of cells: trilinear between
             their centres, constant beyond the outermost centres.
         reach: Voxels that a velocity of 1 moves between the frames.
-        march: Its step and cutoff; samples lie in the middles of the steps.
+        march: Only its step and cutoff are used; samples lie in the middles of the steps.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
 
     Raises:

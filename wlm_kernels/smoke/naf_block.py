@@ -43,7 +43,7 @@ def lanes(channels: int, cuda: bool) -> int:
 
 @dataclass(frozen=True)
 class NafKernels:
-    """The kernels of a number type T; L threads share a row of channels.
+    """The kernels of a number type T. Each entry begins with the launch size; L threads share a row of C or c channels.
 
     Attributes:
         norm: [P L]: adds a shift to each row, subtracts the mean and divides by the standard deviation. In: x T [P, C],

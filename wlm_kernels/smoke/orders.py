@@ -104,7 +104,7 @@ def _write_mixes(
     # out:
     out: wp.array[float],
 ):
-    """Runs in one thread and scales the depth from the range of the fit to -1 to 1."""
+    """Computes the result of `mixes` in one thread; the depth is scaled from the range of the fit to -1 to 1."""
     at = (2.0 * depth[0] - known[0] - known[1]) / (known[1] - known[0])
     m = _mixes(cosine, wp.clamp(at, -1.0, 1.0))
     for n in range(MIXES):
@@ -222,7 +222,7 @@ def light(
         weights: float [N, MIXES, FEATURES], at N albedos.
         mixed: float [L, MIXES], results of `mixes`.
         albedos: The A albedos.
-        nodes: For each albedo the fitted albedo before it, and its share of the way to the next.
+        nodes: For each albedo the index of the fitted albedo below it, and the fraction of the way to the next one.
         places: Index of the albedo of each colour channel.
         buffer: float [L, A, FEATURES], written.
         out: float [L, H, W, 3], written.

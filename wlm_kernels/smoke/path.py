@@ -1,12 +1,12 @@
 """A path tracer of volumes: light of every order of scattering in a density grid, without bias.
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick, and spend an optical depth
-that is drawn once over the bricks of a ray. Where a density is needed, one of the eight voxels around the position is
+volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick; a ray draws an optical
+depth once and uses it up brick by brick. Where a density is needed, one of the eight voxels around the position is
 drawn by its weight: both kinds of tracking need only the mean, which is that of `density_at`. At each scattering every
-light is sampled (next event estimation). The sky is sampled too, and is also reached by paths that leave the smoke;
-the balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts
-for e / majorant.
+light is sampled (next event estimation). The sky is sampled too, and is also reached by paths that leave the smoke; the
+balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts for e /
+majorant.
 
 Units are those of `march`. Random numbers belong to a pixel, so that the result depends on the seed alone. Read
 `scattered_twice` of `tests/reference/transport.py` first: the second order by quadrature.
@@ -373,7 +373,7 @@ def _coarser(
 
 @for_smoke
 def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
-    """Builds the kernel; `solid`: with obstacles."""
+    """Builds the kernel for a type of smoke; `solid` tells whether there are obstacles."""
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
@@ -572,7 +572,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
 
 
 def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
-    """Finds the smallest box of true cells: first and one past the last along each axis; one cell if none is true."""
+    """Finds the smallest box around the true cells: its first cell, and one past its last; one cell if none is true."""
     begin, end = [], []
     for axis in range(3):
         found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))
@@ -592,7 +592,7 @@ def trace(
     parts: int,
     out: wp.array,
 ) -> None:
-    """Traces some of the parts into which the samples are divided.
+    """Traces some of the equal parts into which the paths of each pixel are divided.
 
     Args:
         medium: The smoke.
@@ -601,7 +601,7 @@ def trace(
         lights: `PathLight` [L]; L may be 0.
         mesh: Mesh of obstacles in voxels, which absorb all light; 0: none.
         settings: Settings of the paths.
-        first: First part to trace.
+        first: Index of the first part to trace.
         parts: Number of parts in total.
         out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], added to: for each of P parts each light, the sky and the
             emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above

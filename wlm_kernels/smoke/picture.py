@@ -113,7 +113,7 @@ def _light_solids(
 
 @wp.func
 def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
-    """Computes the colour of an emission: linear between the stops, constant beyond them; grey without stops."""
+    """Computes the colour of an emission by a ramp: linear between stops, constant beyond them; grey without stops."""
     if count == 0:
         return wp.vec3(emission, emission, emission)
     colour = colours[0]
@@ -206,7 +206,7 @@ def light_solids(
     Args:
         solids: The obstacles.
         lamps: The lights.
-        ambient: Ambient light.
+        ambient: Ambient light, added to each colour channel before the albedo is applied.
         view: The camera in the world.
         drawn, barycentric: int32 [H, W] and vec2 [H, W], results of the rasteriser.
         light: vec3 [H, W], written; 0 where there is no obstacle.
@@ -246,7 +246,7 @@ def compose(
         transparency: float [H, W].
         glow: vec3 [H, W], light that the smoke emits; None: it is cold.
         lamps: The lights.
-        background: A colour.
+        background: R, G, B of the background, linear.
         solids: The smoke's surface float [H, W], and the light and depth from `light_solids`; None: no obstacles.
         image: vec3 [H, W], written.
     """

@@ -51,7 +51,7 @@ _TRANSPARENCY, _EMISSION = (marches.PLANES.index(name) for name in ("transparenc
 #endif
 """)
 def _load(weights: wp.array1d[Taps], i: int) -> Taps:
-    """Loads weights; the array begins at a multiple of 16 bytes."""
+    """Loads the weights at an index; the array must begin at a multiple of 16 bytes."""
     ...
 
 
@@ -150,7 +150,7 @@ def decode(planes: wp.array, out: wp.array) -> None:
 
 @dataclass(frozen=True)
 class PlaneKernels:
-    """The kernels of a number type T; the guide is T [C, H, W], its last planes opacity and depth.
+    """The kernels of a number type T, each with its launch size. The guide is T [C, H, W]; opacity and depth are last.
 
     Attributes:
         lanes: L, threads of `near` that share a block.

@@ -43,7 +43,7 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """Finds the values around q, in the grid's units: value i is at i."""
+    """Finds the eight grid values around q; value (i, j, k) is at q = (i, j, k)."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from builders.lit_cube import HEIGHT, WIDTH, lit_cube, waves
 
-from benchmarks.rivals.atlas import RIVALS, best_astc, block_codec, downsampling, share_of
+from benchmarks.rivals.atlas import RIVALS, block_codec, downsampling, share_of
 from wlm.atlas.data import from_arrays
 from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import resized
@@ -143,18 +143,6 @@ def test_downsampling_keeps_the_shape_and_never_enlarges():
     assert errors == sorted(errors, reverse=True)
 
 
-def test_gaps_cost_nothing():
-    """Texels and blocks that charts don't read; what is paid for them gives the charts more."""
-    mask = FULL.copy()
-    mask[HEIGHT // 2 :] = False
-    mesh, whole = _sheet(waves(), mask), _sheet(waves())
-    for name in ("downsampling", "bc6h own"):
-        with_gaps, all_charts = RIVALS[name](mesh, 0.05), RIVALS[name](whole, 0.05)
-        assert 1.25 < with_gaps.size[0] / all_charts.size[0] < 1.5
-        assert share_of(with_gaps, mesh) <= 0.05
-    assert block_codec(mesh, 1.0, "bc6h own").bytes == HEIGHT // 8 * WIDTH // 4 * 16
-
-
 @pytest.mark.parametrize("codec", ["bc6h", *(f"astc{w}x{h}" for w, h in ASTC_BLOCKS)])
 def test_blocks(codec):
     light = waves()[..., :1] * np.array([1.0, 0.8, 0.5], np.float32)
@@ -176,15 +164,9 @@ def test_what_is_refused(monkeypatch):
     mesh = _sheet(waves())
     makers = (downsampling, lambda mesh, share: block_codec(mesh, share, "astc12x12"))
     tiny = 0.5 / (HEIGHT * WIDTH)
-    for share, message in (
-        (0.0, "share"),
-        (-1.0, "share"),
-        (math.nan, "share"),
-        (math.inf, "share"),
-        (tiny, "no room"),
-    ):
+    for share in (0.0, -1.0, math.nan, math.inf, tiny):
         for make in makers:
-            with pytest.raises(ValueError, match=message):
+            with pytest.raises(ValueError, match="no room" if share == tiny else "share"):
                 make(mesh, share)
     for codec in ("bc7", "astc7x7", "astc"):
         with pytest.raises(ValueError, match=f"'{codec}'"):
@@ -193,10 +175,3 @@ def test_what_is_refused(monkeypatch):
         monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
         with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
             block_codec(mesh, 0.5, codec)
-
-
-def test_astc_keeps_the_lightmaps_size_where_it_can():
-    mesh = lit_cube(2)
-    rivals = {share: best_astc(mesh, share) for share in (0.17, 0.14, 0.12, 0.09, 0.02)}
-    assert [rival.name for rival in rivals.values()] == ["astc4x4", "astc5x4", "astc5x5", "astc6x6", "astc12x12"]
-    assert all(rival.size == mesh.sheets[0].mask.shape for share, rival in rivals.items() if share > 0.02)

@@ -5,19 +5,10 @@ import pytest
 from builders.small_sets import moving_light
 from builders.small_sets import sheet_from_arrays as from_arrays
 
-from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set
+from benchmarks.rivals.lightmap import encode_set
+from benchmarks.rivals.rival import disk_size, measure
 from wlm.errors import WlmError
 from wlm.metrics import psnr
-
-
-def test_names_and_labels():
-    assert set(FEW) < RIVALS.keys()
-    labels = [method.label for method in RIVALS.values()]
-    assert len(set(labels)) == len(labels)
-    assert RIVALS["astc6"].label == "ASTC 6x6" and RIVALS["bc7"].label == "BC7"
-    assert [name for name, method in RIVALS.items() if not method.random_access] == [
-        name for name in RIVALS if name.startswith("av1")
-    ]
 
 
 def test_a_set_goes_through_a_method_time_by_time():
@@ -52,3 +43,16 @@ def test_the_profiles_that_astc_chose_are_told():
     mixed = from_arrays(frames, plain.times, period=24.0)
     assert encode_set("astc12", plain, lambda i, decoded: None)[0].option == "LDR"
     assert encode_set("astc12", mixed, lambda i, decoded: None)[0].option == "HDR and LDR"
+
+
+def test_disk_size_is_the_shorter_of_two():
+    noise = np.random.default_rng(0).bytes(500)
+    assert disk_size(noise) == 500 and disk_size(b"") == 0
+    assert disk_size(noise * 20) < 600
+
+
+def test_what_is_measured():
+    rival = measure("plain", lambda: b"ab" * 400, lambda data: data[:1], option=lambda data: data[:2].decode())
+    assert (rival.bytes, rival.disk_bytes, rival.decoded, rival.option) == (800, None, b"a", "ab")
+    assert measure("plain", lambda: b"ab" * 400, len, disk_bytes=disk_size).disk_bytes < 40
+    assert rival.encode_seconds >= 0.0 and rival.decode_seconds >= 0.0

@@ -73,19 +73,6 @@ def test_what_lies_in_the_gaps_changes_nothing():
     assert part.bytes == full.bytes and part.disk_bytes < full.disk_bytes
 
 
-def test_a_network_for_each_region(monkeypatch):
-    frames = moving_light(20, 40).light.frames
-    whole = encode(frames, steps=20)
-    monkeypatch.setattr("benchmarks.rivals.lightmap_ntc.NETWORK_TEXELS", 20)
-    halves = encode(frames, steps=20)
-    networks = 2 * (NETWORK + 65 * 15)
-    assert whole.bytes == bytes_of(20, 40, 5) and halves.bytes == 2 * bytes_of(20, 20, 5) - 12
-    assert halves.bytes - whole.bytes > 0.9 * networks
-    alone = encode(frames[:, :, :20], steps=20)
-    # The first half is fitted as it would be alone, but for the ranges of the tile.
-    assert abs(psnr(frames[:, :, :20], halves.decoded[:, :, :20]) - psnr(frames[:, :, :20], alone.decoded)) < 2.0
-
-
 def test_it_is_a_method_that_takes_a_device(monkeypatch):
     moving = moving_light(24, 24).light
     names = [name for name, method in RIVALS.items() if method.fitted]

@@ -59,25 +59,6 @@ def test_all_components_reproduce_the_values(name, width):
     assert result.encode_seconds > 0.0 and result.decode_seconds > 0.0
 
 
-@pytest.mark.parametrize("name", ["global_pca", "clustered_pca"])
-def test_weights_make_up_for_rounded_means_and_bases(name):
-    position, values = _probes()
-    result = _make(name, position, values, 12, bits=16)
-    np.testing.assert_allclose(result.decoded, values, rtol=0, atol=0.2 * HALF * np.abs(values).max())
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_error_falls_with_components_and_bits(name):
-    position, values = _probes()
-    errors = [_error(values, _make(name, position, values, k).decoded) for k in (1, 2, 4, 8)]
-    assert errors == sorted(errors, reverse=True) and errors[-1] < 0.1 * errors[0]
-    rounded = [_make(name, position, values, 6, bits=bits) for bits in (3, 5, 8, 12, None)]
-    assert [result.bytes for result in rounded] == sorted(result.bytes for result in rounded)
-    errors = [_error(values, result.decoded) for result in rounded]
-    assert errors[0] > errors[1] > errors[2] >= errors[3] * 0.999
-    assert errors[3] == pytest.approx(errors[4], rel=0.05)
-
-
 def test_global_pca_is_a_truncated_svd():
     position, values = _probes()
     wide = values.astype(np.float64)
@@ -101,14 +82,6 @@ def test_sizes_by_hand():
     corners, cells = probe_mbd.grid_parts(position, 2)
     expected = 13 + corners * (k + 1) * d * 2 + cells * k * 4 + -(-n * k * 8 // 8)
     assert moving_basis(position, values, k, 2, bits=8).bytes == expected
-
-
-def test_grid_corners_by_hand():
-    # Two cells of 4 along x: the first probe lies on a corner, the second on the far face, between 4 corners.
-    assert probe_mbd.grid_parts(np.array([[0.0, 0, 0], [8, 1, 3]]), 2) == (1 + 4, 2)
-    # One more between all 8 of the second cell, of which 4 are taken already.
-    assert probe_mbd.grid_parts(np.array([[0.0, 0, 0], [8, 1, 3], [7, 1, 3]]), 2) == (1 + 4 + 4, 2)
-    assert probe_mbd.grid_parts(np.ones((5, 3)), 7) == (1, 1)
 
 
 @pytest.mark.parametrize("bits", [None, 8, 10])
@@ -138,24 +111,6 @@ def test_bytes_and_positions_are_all_that_decoding_needs(bits):
             probe_mbd.decode(wrong, position)
 
 
-def test_weights_keep_the_ends_of_each_range():
-    weight = np.array([[0.0, 5.0], [1.0, 5.0], [-4.0, 0.25], [4.0, 0.5], [0.1, 0.375]])
-    part = np.array([0, 0, 1, 1, 1])
-    read = probe_pca.read_weights(probe_pca.write_weights(weight, part, 2, 4), part, 2, 2, 4)
-    np.testing.assert_array_equal(read[:4], weight[:4])  # a range of zero too
-    np.testing.assert_allclose(read[4], weight[4], atol=8.0 / 15 / 2)
-    wild = probe_pca.read_weights(probe_pca.write_weights(weight * 1e6, part, 2, None), part, 2, 2, None)
-    assert np.isfinite(wild).all() and wild.max() == 65504.0
-
-
-def test_clusters_by_place_are_nearest_centres():
-    random = np.random.default_rng(3)
-    centre = 10.0 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
-    truth = random.integers(0, 5, 300)
-    partition = probe_pca.by_place(centre[truth] + random.normal(size=(300, 3)), 5, 0)
-    assert partition.count == 5 and len(set(zip(truth, partition.label, strict=True))) == 5
-
-
 def test_clusters_by_signal_find_lines_that_share_one_place():
     random = np.random.default_rng(4)
     truth = random.integers(0, 4, 400)
@@ -167,25 +122,6 @@ def test_clusters_by_signal_find_lines_that_share_one_place():
     assert _error(values, clustered_pca(position, values, 1, 4).decoded) > 0.1
     again = [SIGNAL(position, values, 1, 4, seed).decoded for seed in (7, 7)]
     np.testing.assert_array_equal(*again)
-
-
-def test_parts_are_those_of_the_centres_as_stored(monkeypatch):
-    monkeypatch.setattr(probe_pca, "_CENTRE_LEVELS", 9)
-    position, values = _probes()
-    decoded = clustered_pca(position, values, 12, 12).decoded
-    np.testing.assert_allclose(decoded, values, rtol=0, atol=4 * HALF * np.abs(values).max())
-
-
-def test_closest_subspace_is_found():
-    random = np.random.default_rng(6)
-    values, mean = random.normal(size=(50, 7)), random.normal(size=(4, 7))
-    basis = np.stack([np.linalg.qr(random.normal(size=(7, 3)))[0].T for _ in range(4)])
-    away = values[:, None] - mean
-    left = away - np.einsum("nck,ckd->ncd", np.einsum("ncd,ckd->nck", away, basis), basis)
-    error = np.square(left).sum(2)
-    label, total = probe_pca._closest(values, mean, basis)
-    np.testing.assert_array_equal(label, error.argmin(1))
-    assert total == pytest.approx(error.min(1).sum())
 
 
 @pytest.mark.parametrize("grid", [1, 4])
@@ -293,38 +229,6 @@ def test_unreal_by_hand():
     assert not decoded[:, 2].any()
 
 
-def test_unreal_ambient_is_rounded_to_nearest():
-    def through(ambient: np.ndarray) -> np.ndarray:
-        return unpack_unreal(pack_unreal(np.repeat(ambient[:, None], 3, 1), 1), 3, 1)
-
-    codes = np.arange(0x7C0, dtype=np.uint32)  # every finite number with 6 bits of mantissa
-    exact = (codes << 4).astype(np.uint16).view(np.float16).astype(np.float64)
-    np.testing.assert_array_equal(through(exact)[:, 0], exact)
-    np.testing.assert_array_equal(through(exact[::2])[:, 2], exact[::2])
-    value = np.random.default_rng(0).uniform(0.001, 60000.0, 1000)
-    relative = np.abs(through(value) / value[:, None] - 1.0)
-    assert relative[:, :2].max() <= 2.0**-7 and relative[:, 2].max() <= 2.0**-6
-    np.testing.assert_array_equal(through(np.array([1e9, -3.0])), [[65024, 65024, 64512], [0, 0, 0]])
-
-
-def test_unreal_keeps_all_light_and_clamps_what_is_none():
-    random = np.random.default_rng(1)
-    direction = random.normal(size=(200, 4, 3))
-    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
-    colour = random.uniform(0.0, 3.0, (200, 4, 3))
-    light = np.einsum("nlk,nlc->nkc", np.apply_along_axis(_sh, 2, direction), colour)
-    values = light.reshape(200, 27).astype(np.float32)
-    result = unreal_packing(np.zeros((200, 3)), values)
-    assert result.bytes == 200 * 28 and result.option == "L2"
-    step = np.sqrt([0, 3, 3, 3, 15, 15, 20, 15, 15])[:, None] / 255
-    # Half a step, and blue's 2**-6 where the ambient was rounded down and L1 is at its end.
-    bound = light[:, :1] * (step * 1.02 + 2.0**-6)
-    assert (np.abs(result.decoded.reshape(200, 9, 3) - light) <= bound).all()
-    beyond = values.reshape(200, 9, 3) * np.where(np.arange(9) == 2, 50.0, 1.0)[:, None]
-    decoded = unreal_packing(np.zeros((200, 3)), beyond.reshape(200, 27)).decoded.reshape(200, 9, 3)
-    assert (np.abs(decoded[:, 2]) <= np.sqrt(3.0) * decoded[:, 0] * 1.000001).all()
-
-
 def test_unreal_refuses():
     position, values = _probes(count=20)
     assert unreal_packing(position, values).bytes == 20 * 13
@@ -346,23 +250,6 @@ def test_at_bytes_keeps_the_size_and_uses_it(name):
     assert errors[0] > errors[1] >= errors[2]
     with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 150 probes"):
         at_bytes(name, position, values, 20)
-
-
-def test_at_bytes_finds_the_best_of_all_settings():
-    position, values = _probes(count=300)
-    budget = int(0.15 * values.nbytes)
-    tried = [
-        result
-        for bits in (8, None)
-        for k in range(1, 13)
-        for clusters in range(1, 40, 6)
-        if (result := clustered_pca(position, values, k, clusters, bits=bits)).bytes <= budget
-    ]
-    best = min(_error(values, result.decoded) for result in tried)
-    found = at_bytes("clustered_pca", position, values, budget, (8, None))
-    assert _error(values, found.decoded) <= best * 1.1
-    half = at_bytes("clustered_pca", position, values, budget, (None,))
-    assert "half floats" in half.option and _error(values, half.decoded) >= _error(values, found.decoded)
 
 
 def test_at_bytes_with_little_and_wrong_input():

@@ -1,4 +1,4 @@
-"""Functions that the kits of all systems share."""
+"""Functions that write parts of an engine kit, for the kits of all kinds of models."""
 
 import re
 from importlib import resources
@@ -34,13 +34,13 @@ def filled(asset: str, **parts: str) -> str:
 
 
 def write_texts(folder: Path, texts: dict[str, str]) -> None:
-    """Writes text files by name."""
+    """Writes text files into a folder; `texts` maps each file name to its text."""
     for name, text in texts.items():
         (folder / name).write_bytes(text.encode())
 
 
 def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
-    """Checks that an engine accepts the size of a picture [H, W, C] of a model of some name.
+    """Checks that an engine accepts the size of a picture [H, W, C]; `name` is the model's name for messages.
 
     Raises:
         WlmError: It is too large.
@@ -52,22 +52,22 @@ def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
 
 
 def picture_entry(file: str, pixels: np.ndarray, layers: int = 0) -> dict[str, Any]:
-    """Describes a picture [H, W, C] that replaces a texture; layers of an array are stacked from top to bottom."""
+    """Returns the index entry of a picture [H, W, C] in place of a texture; array layers are stacked vertically."""
     return {"file": file, "width": pixels.shape[1], "height": pixels.shape[0], "layers": layers}
 
 
 def stacked(images: np.ndarray) -> np.ndarray:
-    """Stacks the layers of an array [L, H, W, C] from top to bottom: [L H, W, C]; a picture stays as it is."""
+    """Stacks the layers of an array [L, H, W, C] vertically to [L * H, W, C]; a picture [H, W, C] is unchanged."""
     return images.reshape(-1, *images.shape[-2:])
 
 
 def label(name: str) -> str:
-    """A model's name as Unity's shaders may have one."""
+    """Converts a model's name to one that is valid in a Unity shader."""
     return re.sub(r"[^\w .-]", "_", name)
 
 
 def asset_name(name: str) -> str:
-    """A model's name as Unreal's assets may have one."""
+    """Converts a model's name to one that is valid for an Unreal asset."""
     return re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
 
 

@@ -27,18 +27,18 @@ _NO_MIPS = "The shader reads no mips of the textures; `--mips 3` of the export m
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of a flip book; its textures become PNGs.
+    """Writes the kit of a flip book, with its textures as PNGs.
 
     Args:
         bundle: The bundle of a flip book in the layout "unity".
-        folder: The folder; it must exist.
+        folder: The kit's folder, which must exist.
         engine: One of `wlm.export.ENGINES`.
 
     Returns:
-        Entries of the index: shader and textures.
+        Entries for the folder's index: shader and textures.
 
     Raises:
-        WlmError: Another layout, or a texture that is larger than the engine accepts.
+        WlmError: The flip book has another layout, or a texture is larger than the engine accepts.
     """
     if bundle.document["layout"] != _LAYOUT:
         raise WlmError(f"layout: expected {_LAYOUT} for {engine}, got {bundle.document['layout']}")
@@ -55,7 +55,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def _facts(bundle: Bundle) -> dict[str, str]:
-    """Returns the parts of the READMEs that describe the flip book."""
+    """Returns the texts that describe the flip book in a README, by the names of their marks in the template."""
     book = bundle.document
     width, height = book["frame_size"]
     cells = f"{book['rows']} x {book['columns']} cells of {width} x {height} pixels, padded by {book['padding']}"

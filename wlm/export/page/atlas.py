@@ -1,4 +1,4 @@
-"""The page of a compressed lightmap on its mesh."""
+"""The HTML page that shows a compressed lightmap on its mesh."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wlm.atlas import codec
-from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS, AtlasModel
+from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS
 from wlm.atlas.shader import glsl
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, pack_triangles
@@ -26,7 +26,7 @@ _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "
 def atlas_page(
     paths: Sequence[Path], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
-    """Makes the page of a model with one lightmap.
+    """Makes the HTML page of a model with one lightmap.
 
     Args:
         paths: The model's file.
@@ -59,7 +59,7 @@ def atlas_page(
         "width": width,
         "height": height,
         "shader": glsl(model),
-        "exposure": exposure(_all_texels(model)),
+        "exposure": exposure(np.concatenate([model.texels.ravel(), model.block_texels.ravel()]).astype(np.float32)),
         "atlas": {
             "method": model.method,
             "colour": texels.shape[1::-1],
@@ -95,8 +95,3 @@ def atlas_page(
         rows, columns = model.block_texels.shape[1:3]
         figures.insert(4, ("its blocks", f"{columns} × {rows}, BC6H"))
     return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)
-
-
-def _all_texels(model: AtlasModel) -> np.ndarray:
-    """The texels of T_p, of "mixed" those of both its textures, float32 [1, N, 3]."""
-    return np.concatenate([model.texels.reshape(1, -1, 3), model.block_texels.reshape(1, -1, 3)], 1).astype(np.float32)

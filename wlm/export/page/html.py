@@ -27,13 +27,13 @@ class Page:
     """The content of a page.
 
     Attributes:
-        kind: `lightmap`, `atlas`, `probe` or `smoke`; selects the script.
+        kind: `lightmap`, `atlas`, `probe` or `smoke`; selects the page's main script.
         title: Title of the panel and of the browser's window.
-        note: Sentence below the title; may be empty.
-        figures: Names and texts of the panel's table.
+        note: A sentence that the page shows below its title; may be empty.
+        figures: Rows of the panel's table: a name and a text each.
         manifest: JSON values for the script.
-        arrays: Arrays for the script by name, stored byte by byte.
-        scripts: Further scripts that the script of the kind needs.
+        arrays: Arrays for the script by name.
+        scripts: Further scripts that the main script needs.
     """
 
     kind: str
@@ -87,7 +87,7 @@ class Page:
 
 
 def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns the arrays of a mesh by the script's names, and the manifest's entries about its bounding box."""
+    """Returns a mesh's arrays by their names in the script, and its bounding box as entries of the manifest."""
     parts = {"position": geometry.position, "triangles": geometry.triangle, "uv": geometry.uv}
     low, high = geometry.box
     box = {"low": low.tolist(), "high": high.tolist(), "up": "xyz".index(up), "inward": geometry.is_room}

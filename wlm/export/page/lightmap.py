@@ -1,4 +1,4 @@
-"""The page of lightmaps over time."""
+"""The HTML page that shows lightmaps over time."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def lightmap_page(
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
-    """Makes the page of the first sheet of light of a lightmap model; for the arguments see `make_page`.
+    """Makes the HTML page of a lightmap model's first layer of light; for the arguments see `make_page`.
 
     Raises:
-        WlmError: The mesh or the set cannot be read, or the set has another size.
+        WlmError: The mesh or the original lightmap set cannot be read, or the set has another size.
     """
     whole, file_bytes = load_model(paths[0], "lightmap"), paths[0].stat().st_size
     sheet, others = first_light(whole.sheets), len(whole.sheets) - 1
@@ -101,7 +101,7 @@ def _originals(
     hours: int,
     progress: OnProgress | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns evenly spread frames of the set with filled gaps, and their scores."""
+    """Returns original lightmaps at up to `hours` evenly spread times, and the scores of the compressed ones."""
     if hours < 1:
         raise WlmError(f"--hours: expected at least 1, got {hours}")
     size = lightmaps.mask.shape

@@ -26,7 +26,7 @@ def write_page(path: str | os.PathLike[str], files: Sequence[str | os.PathLike[s
 
     Args:
         path: The page, `.html`; its folder must exist.
-        files, options: As for `make_page`.
+        files, options: See `make_page`.
 
     Raises:
         WlmError: A file is missing, damaged, or of a kind that no page shows; or an option has no meaning for it.
@@ -45,21 +45,21 @@ def make_page(
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
-    """Makes the page of a file.
+    """Makes the HTML page of one model or of a smoke animation.
 
     Args:
         files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; or six-way lightmaps of smoke, one EXR
             a frame, or their folder.
-        mesh: The scene; for lightmaps over time with their UVs.
+        mesh: Mesh file of the scene; for lightmaps over time it needs their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
-        key: Array of a probe file with several.
-        hours: Most frames of original lightmaps in the page, evenly spread.
-        rate: Frames a second of smoke.
+        key: Name of the array to read from an original probe file with several arrays.
+        hours: Largest number of original lightmaps in the page, at evenly spread times.
+        rate: Playback speed of smoke, in frames per second.
         up: The axis that points up in the scene.
         progress: Called about twice a second while originals or frames of smoke are read.
 
     Raises:
-        WlmError: As `write_page`.
+        WlmError: A file is missing, damaged, or of a kind that no page shows; or an option has no meaning for it.
     """
     kind, paths = content_of(files)
     if kind == "smoke":

@@ -1,4 +1,4 @@
-"""The page of light probes."""
+"""The HTML page that shows light probes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def probe_page(
     key: str | None = None,
     up: Literal["y", "z"] = "y",
 ) -> Page:
-    """Makes the page of a probe model: spheres at its positions or at those of the original.
+    """Makes the HTML page of a probe model, which shows spheres at the positions of the model or the original.
 
     Raises:
         WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the

@@ -1,4 +1,4 @@
-"""The page of six-way lightmaps of smoke."""
+"""The HTML page that plays six-way lightmaps of smoke."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _WHITE = 0.8  # screen value of the brightest lightmap
 
 
 def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
-    """Makes the page of six-way lightmaps.
+    """Makes the HTML page that plays six-way lightmaps of smoke.
 
     Args:
-        paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
-        rate: Frames a second.
-        progress: Called about twice a second.
+        paths: One EXR per frame, written by `wlm smoke bake` or `predict`, all of one size.
+        rate: Playback speed in frames per second.
+        progress: Called about twice a second while the frames are read.
 
     Raises:
         WlmError: A file cannot be read or has another size, or the rate is not above 0.
@@ -66,7 +66,7 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
 
 
 def _planes(frame: SixWay) -> tuple[np.ndarray, list[float]]:
-    """Returns the eight planes in [0, 1], and the factors of the lightmaps, the opacity and the emission."""
+    """Returns the frame's eight channels scaled to [0, 1], and the scale factors of lightmaps, opacity and emission."""
     lightmaps = frame.lightmaps.numpy().clip(0.0, None)
     opacity = np.ones_like(lightmaps[0]) if frame.transparency is None else 1.0 - frame.transparency.numpy()
     glow = np.zeros_like(lightmaps[0]) if frame.emission is None else frame.emission.numpy().clip(0.0, None)

@@ -1,4 +1,4 @@
-"""HLSL of shader model 5 and later."""
+"""Writes HLSL of shader model 5 and later."""
 
 from wlm.export.shading.tree import VECTORS, Node, Variable
 from wlm.export.shading.writer import Writer
@@ -25,7 +25,7 @@ int2 wlm_size_of_{name}()
 
 
 class HlslWriter(Writer):
-    """Writes HLSL functions to be included. One sampler reads all textures; Unity creates it from its name."""
+    """Writes HLSL functions for an include file. One sampler reads all textures; Unity creates it from its name."""
 
     names = {
         **{name: f"{kind}{n}" for name, (kind, n) in VECTORS.items()},

@@ -1,4 +1,4 @@
-"""Metal shading language: a structure with textures and buffers as members and the functions as methods."""
+"""Writes the Metal shading language: a structure with textures and buffers as members and functions as methods."""
 
 from wlm.export.shading.tree import VECTORS, Function, Node, Variable
 from wlm.export.shading.writer import Writer

@@ -1,12 +1,12 @@
 """HLSL for Custom nodes of Unreal's materials: one function, with its textures as parameters."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 from wlm.export.shading.hlsl import HlslWriter
 from wlm.export.shading.source import read_words
-from wlm.export.shading.tree import Function, Node, Statement, Variable, read_shader
+from wlm.export.shading.tree import Function, Node, Variable, read_shader
+from wlm.export.shading.writer import FILTERS, nodes_of
 
-_FILTERS = {"textureLod", "textureGrad"}
 _SIZE = """\
     int2 wlm_size(Texture2D<float4> image)
     {
@@ -30,7 +30,7 @@ def custom_node(
         text: GLSL of this package; its uniforms are inputs of the node, too.
         function: Name of the function whose value the node returns.
         arguments: HLSL of the function's arguments, in terms of the node's other inputs.
-        layers: By name of a texture array: rows of a layer, and number of layers.
+        layers: For each texture array, by name: the height of a layer in texels, and the number of layers.
 
     Returns:
         The code, and the names of the textures and uniforms that must be inputs of the node.
@@ -53,8 +53,7 @@ class _NodeWriter(HlslWriter):
         self._drop_all_but(function)
         inputs = self.used(function)
         # All filtered textures share the sampler of one of them, linear and clamped.
-        filtered = [name for each in self.functions.values() for name in _textures(each.body, _FILTERS)]
-        given = [f"{filtered[0]}Sampler" if each == self.linear else each for each in inputs]
+        given = [f"{self.filters[0]}Sampler" if each == self.linear else each for each in inputs]
         constants = [item.name for item, _ in self.shader.items if _is_constant(item)]
         lines = [
             self.text(),
@@ -65,12 +64,12 @@ class _NodeWriter(HlslWriter):
         return "".join(lines), [each for each in inputs if each != self.linear]
 
     def _drop_all_but(self, function: str) -> None:
-        """Removes the head comment and, with their comments, the functions that this one does not call."""
+        """Removes the comment at the top, and all functions that `function` does not call, with their comments."""
         needed, found = set(), {function}
         while found - needed:
             needed |= found
-            found = {each.text for name in needed for each in _nodes(self.functions[name].body) if each.kind == "call"}
-            found &= set(self.functions)
+            nodes = (node for name in needed for node in nodes_of(self.functions[name].body))
+            found = {node.text for node in nodes if node.kind == "call"} & set(self.functions)
         kept, comments = [], []
         first = next(i for i, item in enumerate(self.shader.items) if not isinstance(item[0], str))
         for item in self.shader.items[first:]:
@@ -87,19 +86,19 @@ class _NodeWriter(HlslWriter):
         self.functions = self.shader.functions
 
     def used(self, name: str) -> list[str]:
-        """Names of the bound variables that a function reads, directly or through others; the sampler if it filters."""
+        """Returns the names of textures and uniforms that a function and its callees read, and of the used sampler."""
         if name not in self.uses:
-            nodes = list(_nodes(self.functions[name].body))
+            nodes = list(nodes_of(self.functions[name].body))
             names = {each.text for each in nodes if each.kind == "name"}
             called = {each.text for each in nodes if each.kind == "call"}
-            found = names & set(self.bound) | ({self.linear} if called & _FILTERS else set())
+            found = names & set(self.bound) | ({self.linear} if called & FILTERS else set())
             for each in called & set(self.functions):
                 found |= set(self.used(each))
             self.uses[name] = [each for each in (*self.bound, self.linear) if each in found]
         return self.uses[name]
 
     def head(self) -> list[str]:
-        measured = any(each.text == "textureSize" for own in self.functions.values() for each in _nodes(own.body))
+        measured = any(each.text == "textureSize" for own in self.functions.values() for each in nodes_of(own.body))
         return ["struct WlmNode", "{", *(_SIZE.splitlines() if measured else [])]
 
     def foot(self) -> list[str]:
@@ -146,25 +145,3 @@ class _NodeWriter(HlslWriter):
 
 def _is_constant(item: object) -> bool:
     return isinstance(item, Variable) and item.way == "const"
-
-
-def _nodes(body: tuple[Statement, ...]) -> Iterator[Node]:
-    """Iterates over all nodes of all expressions."""
-
-    def within(node: Node) -> Iterator[Node]:
-        yield node
-        for part in node.parts:
-            yield from within(part)
-
-    for statement in body:
-        for part in statement.parts:
-            yield from within(part)
-        if statement.variable is not None and statement.variable.value is not None:
-            yield from within(statement.variable.value)
-        for inner in statement.bodies:
-            yield from _nodes(inner)
-
-
-def _textures(body: tuple[Statement, ...], calls: set[str]) -> list[str]:
-    """Names of the textures that calls of these functions read."""
-    return [each.parts[0].text for each in _nodes(body) if each.kind == "call" and each.text in calls]

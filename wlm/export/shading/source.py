@@ -1,4 +1,4 @@
-"""Lexer and preprocessor of our GLSL; `wlm.export.shading.tree` parses its words."""
+"""Lexer and preprocessor of our GLSL; `wlm.export.shading.tree` parses the tokens."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,8 +17,8 @@ class Word:
     Attributes:
         kind: `comment`, `number`, `name` or `mark` (an operator or bracket).
         text: Text as written.
-        alone: Whether it is the first token of its line.
-        blank: Whether a blank line precedes it.
+        alone: Whether the token is the first on its line.
+        blank: Whether a blank line precedes the token.
     """
 
     kind: str
@@ -91,7 +91,7 @@ def _split(line: str, blank: bool) -> Iterator[Word]:
 
 
 def _expand(words: Sequence[Word], macros: dict[str, _Macro]) -> list[Word]:
-    """Expands the macros of one line; a call must end in its line."""
+    """Expands the macros in the tokens of one line; a macro's arguments must end on that line."""
     out: list[Word] = []
     i = 0
     while i < len(words):

@@ -10,7 +10,7 @@ VECTORS = {
 SCALARS = ("float", "int", "uint", "bool", "void")
 SAMPLERS = ("sampler2D", "usampler2D", "sampler2DArray")
 _TYPES = {*VECTORS, *SCALARS, *SAMPLERS}
-_LEVELS = (
+LEVELS = (
     ("||",),
     ("&&",),
     ("|",),
@@ -30,7 +30,7 @@ class Node:
     """A node of an expression tree.
 
     Attributes:
-        kind: `number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice`, `assign` or `step`.
+        kind: `number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice` (?:), `assign` or `step` (++).
         text: The number, name, member or operator.
         parts: Operands.
     """
@@ -69,8 +69,8 @@ class Statement:
         parts: Expressions.
         variable: Variable of a declaration or a loop.
         bodies: Blocks: one or two of `if`, one of `for` and `block`.
-        tail: Comment at the end of its line.
-        blank: Whether a blank line precedes it.
+        tail: Comment at the end of the statement's line.
+        blank: Whether a blank line precedes the statement.
     """
 
     kind: str
@@ -84,7 +84,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class Function:
-    """A function."""
+    """A function of a shader."""
 
     type: str
     name: str
@@ -97,7 +97,7 @@ class Shader:
     """The declarations of a shader.
 
     Attributes:
-        items: Comments (text), variables and functions in order, each with whether a blank line precedes it.
+        items: Comments (text), variables and functions in order, each with a flag: whether a blank line precedes it.
     """
 
     items: list[tuple[str | Variable | Function, bool]] = field(default_factory=list)
@@ -136,7 +136,7 @@ class _Reader:
         return True
 
     def quiet(self) -> None:
-        """Skips comments within an expression."""
+        """Skips the comments before the next token of an expression."""
         while self.word.kind == "comment":
             self.at += 1
 
@@ -260,11 +260,11 @@ class _Reader:
         return Node("choice", "?", (condition, chosen, self.expression()))
 
     def _binary(self, level: int) -> Node:
-        if level == len(_LEVELS):
+        if level == len(LEVELS):
             return self._unary()
         left = self._binary(level + 1)
         self.quiet()
-        while self.word.text in _LEVELS[level]:
+        while self.word.text in LEVELS[level]:
             mark = self.take().text
             left = Node("binary", mark, (left, self._binary(level + 1)))
             self.quiet()

@@ -1,4 +1,4 @@
-"""WGSL: functions, and declarations of textures and buffers in bind group 0."""
+"""Writes WGSL: functions, and declarations of textures and buffers in bind group 0."""
 
 from wlm.export.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
 from wlm.export.shading.writer import Writer
@@ -24,7 +24,7 @@ class WgslWriter(Writer):
         return ["", f"{self._bind(self.linear)} {self.linear}: sampler;"] if self.filters else []
 
     def type_of(self, variable: Variable) -> str:
-        """Type of a variable; an array's type includes its size."""
+        """Returns the WGSL type of a variable; an array's type includes its size."""
         kind = self.kind(variable.type)
         return kind if variable.size is None else f"array<{kind}, {self.write(variable.size)}>"
 
@@ -114,7 +114,7 @@ class WgslWriter(Writer):
 
 
 def _assigned(body: tuple[Statement, ...]) -> list[str]:
-    """Names of variables that are assigned."""
+    """Returns the names of the variables that the statements assign to."""
     found = []
 
     def look(node: Node) -> None:

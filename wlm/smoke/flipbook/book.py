@@ -85,9 +85,9 @@ class Book:
         rows, columns, count: Numbers of rows and columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
         padding: Pixels around a frame.
-        gain: Factor of the light in the textures.
-        hot: Whether there is a channel of emission.
-        scale: Range of the motion in shares of a frame; None: no motion.
+        gain: Factor by which light is multiplied in the textures.
+        hot: Whether a texture has a channel of emission.
+        scale: Largest motion that the texture can store, as a share of a frame's size; None: no motion.
         rate: Frames per second.
         extent: Height of the view in the world's unit.
         ramp: Colour of the emission; None: grey.
@@ -124,7 +124,7 @@ class Book:
 
     @property
     def levels(self) -> int:
-        """Smallest mip level at which frames do not show their neighbours."""
+        """Index of the coarsest mip level at which frames do not show their neighbours."""
         return mip_levels(*self.size, self.padding)
 
 
@@ -141,14 +141,14 @@ def pack_book(
 ) -> Book:
     """Packs frames into textures.
 
-    A last channel that no frame has is omitted: the second texture of cold smoke has three. Cells without a frame are
-    black, with alpha 0.
+    The last channel is omitted if no frame has it: without emission the second texture has three channels. Cells
+    without a frame are black, with alpha 0.
 
     Args:
         shots: The frames, at least one, of one size.
         layout: One of `wlm.smoke.camera.LAYOUTS`.
-        columns: Largest number of columns; None: nearest to a square.
-        gain: Factor of the light; None: the largest without clipping in 8 bits.
+        columns: Largest number of columns; None: such that the texture is nearest to a square.
+        gain: Factor of the light; None: the largest with which 8 bits clip no light.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not show neighbours.
         air: Frames from `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: no motion.
         rate: Frames per second; None: that of the scene, or `RATE`.
@@ -216,7 +216,7 @@ def _brightest_gain(frames: Sequence[SixWay]) -> float:
 
 
 def _channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
-    """Returns the channels of the two textures, without a last channel that no frame has."""
+    """Returns the channels of the two textures; the last channel is omitted if no frame has it."""
     planes = {ALPHA: "transparency", EMISSION: "emission"}
     absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
     return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])
@@ -294,7 +294,7 @@ def read_flipbook(
         device: Device of the frames.
 
     Returns:
-        The frames, float32; None for a plane without a channel.
+        The frames, float32; transparency and emission are None if no channel stores them.
 
     Raises:
         WlmError: There are not two or three files; one is missing, damaged, of another kind or size, has numbers that
@@ -326,7 +326,7 @@ def read_flipbook(
     alpha, glow = planes.get(ALPHA), planes.get(EMISSION)
     if straight:
         if alpha is None:
-            raise WlmError(f"{where}: expected opacity, in an alpha or a third texture, for light without it")
+            raise WlmError(f"{where}: expected opacity, in an alpha channel or a third texture, for straight alpha")
         maps, glow = maps * alpha[:, None], None if glow is None else glow * alpha
     absent = [None] * len(maps)
     parts = (maps, absent if alpha is None else 1.0 - alpha, absent if glow is None else glow)

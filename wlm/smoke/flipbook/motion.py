@@ -52,14 +52,15 @@ def frames_motion(
 ) -> torch.Tensor:
     """Computes the motion of the smoke from each frame of a flip book to the next.
 
-    Not everything in a picture moves with the air: the smoke's edge at an inlet stays, as do light and shadow. At each
-    pixel the air's motion is therefore multiplied by the share for which the next frame is most similar there.
+    Not everything in a picture moves with the air: the smoke's edge at an inlet stays, as do light and shadow. The
+    air's motion at each pixel is therefore multiplied by the factor, 0 to 1, with which it maps the frame to the most
+    similar part of the next.
 
     Args:
         frames: Frames from `open_motion`.
         numbers: Numbers of the flip book's frames, increasing.
         book: These frames, with transparency and orthographic cameras.
-        progress: Called after each.
+        progress: Called after each frame.
 
     Returns:
         float32 [N, 2, H, W] on the CPU: to the right and down, in shares of the frame's width and height. The last
@@ -102,7 +103,7 @@ def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
-    """Multiplies a motion [2, H, W] by the share, at each pixel, for which the two frames are most similar."""
+    """Multiplies a motion [2, H, W], at each pixel, by the factor with which it maps one frame best to the other."""
     before, after = _planes(one).cpu(), _planes(other).cpu()
     off = []
     for share in _SHARES:
@@ -115,7 +116,7 @@ def _agreeing(moved: torch.Tensor, one: SixWay, other: SixWay) -> torch.Tensor:
 
 
 def _smooth(plane: torch.Tensor) -> torch.Tensor:
-    """Returns means over squares, [H, W]."""
+    """Returns the mean over a square around each pixel, [H, W]."""
     return F.avg_pool2d(plane[None], _ABOUT, 1, _ABOUT // 2, count_include_pad=False)[0]
 
 
@@ -150,7 +151,7 @@ def _read(planes: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
 
 
 def mip_padding(height: int, width: int, levels: int) -> int:
-    """Returns the least padding with which frames do not show their neighbours in mips down to a level.
+    """Returns the least padding in pixels with which frames do not show their neighbours in mips down to a level.
 
     A texel of a level must not span two cells, and the half texel beyond a frame's border that a filter reads must be
     within the frame's padding.
@@ -166,7 +167,7 @@ def mip_padding(height: int, width: int, levels: int) -> int:
 
 
 def mip_levels(height: int, width: int, padding: int) -> int:
-    """Returns the smallest mip level at which padded frames do not show their neighbours; 0: no mips."""
+    """Returns the index of the coarsest mip level at which padded frames do not show their neighbours; 0: no mips."""
     level = 0
     while 2**level <= padding and not any((n + 2 * padding) % 2 ** (level + 1) for n in (height, width)):
         level += 1

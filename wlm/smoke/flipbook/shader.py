@@ -87,7 +87,7 @@ vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
 
 
 def smoke_shader(book: Book) -> str:
-    """Writes the functions that read a flip book's textures."""
+    """Returns the shader code of functions that read a flip book's textures."""
     places = {
         name: f"{texture}.{letter}"
         for texture, names in zip(("first", "second"), LAYOUTS[book.layout], strict=True)
@@ -178,12 +178,9 @@ _MOVE = """\
 
 
 def billboard_shader(book: Book) -> str:
-    """Writes the shader of a flip book on a billboard.
+    """Returns the code of a shader that plays and lights a flip book on a billboard.
 
     Its textures are `wlm_smoke_first_map`, `wlm_smoke_second_map` and, with motion, `wlm_smoke_motion_map`.
-
-    Args:
-        book: The flip book.
     """
     textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
     text = _READ.format(
@@ -196,7 +193,7 @@ def billboard_shader(book: Book) -> str:
 
 
 def _glow(ramp: Ramp | None) -> str:
-    """Writes the colour of an emission as a chain of mixes between stops."""
+    """Returns the code of an emission's colour, a chain of mixes between the stops of a ramp."""
     lines = ["float emission = wlm_smoke_emission(first, second);"]
     if ramp is None:
         lines.append("return vec3(emission, emission, emission);")

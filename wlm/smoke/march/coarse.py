@@ -28,9 +28,9 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
     Args:
         volume: The smoke.
         camera: Orthographic.
-        march: Settings. Steps below 8 voxels skip empty bricks, which changes no result. Nodes are at least a quarter
-            of a voxel apart, and farther where there would be more than 2^28 of them; a node takes 24 bytes. The
-            jitter is gradient noise with 64 different seeds.
+        march: Settings. Steps below 8 voxels skip empty bricks, which changes no result. Nodes of the light lattice are
+            at least a quarter of a voxel apart, and farther where there would be more than 2^28 of them; a node takes
+            24 bytes. The jitter is gradient noise with 64 different seeds.
 
     Returns:
         Lightmaps, transparency, emission of hot smoke, and depth, on the smoke's device.
@@ -49,7 +49,7 @@ def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:
-    """Returns `bake_coarse` as float32 [9, H, W], the planes of `wlm_kernels.smoke.marches.PLANES`."""
+    """Returns the result of `bake_coarse` as one tensor, float32 [9, H, W], see `wlm_kernels.smoke.marches.PLANES`."""
     return run(marches.coarse_six_way, volume, camera, (len(marches.PLANES),), march)
 
 
@@ -86,7 +86,7 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
 
     Args:
         volume: The smoke.
-        camera: Orthographic or in perspective; inside the smoke, the light from the front is at the camera.
+        camera: Orthographic or in perspective. If it is inside the smoke, the light from the front starts there.
         march: Settings without `spacing` and `light_step`, which equal the step.
         shared: Whether pixels share marches to the lights, on a lattice with a node per step, which is much faster;
             light is then interpolated between nodes.

@@ -32,7 +32,7 @@ def bake(
         step: Longest step, in voxels, along rays and to the lights. Samples lie in the middles of the steps.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
         supersample: Number of rays along a pixel's edge, which are averaged; 1: the ray through the centre.
-        estimate: Whether to estimate the error by a second march with twice the step, half as much work again.
+        estimate: Whether to estimate the error by a second march with twice the step, which adds half of the work.
 
     Returns:
         The lightmaps on the smoke's device.

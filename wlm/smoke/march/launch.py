@@ -33,7 +33,7 @@ def run(
 
 
 def medium_of(volume: DensityVolume) -> Medium:
-    """Returns the smoke as kernels take it; to be called inside `wlm.interop.stream`."""
+    """Returns the smoke as an argument of kernels; must be called inside `wlm.interop.stream`."""
     density, temperature = volume.arrays()
     factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
     return Medium(density, *factors, empty=torch_memory(volume.device))
@@ -45,18 +45,12 @@ _Made = TypeVar("_Made")
 class VolumeGraph(Generic[_Made]):
     """A function of smoke that is captured as a CUDA graph and replayed; on the CPU it is called.
 
-    The function reads a copy of the smoke, since a solver's buffers swap. Each call overwrites the results of the last.
+    The function reads a copy of the smoke, since a solver alternates between two buffers. Each call overwrites the
+    result of the previous call.
     """
 
     def __init__(self, work: Callable[[DensityVolume], _Made], device: str, warmup: int = 2) -> None:
-        """Prepares the function.
-
-        Args:
-            work: Function that does not wait for the device, such as `bake_coarse`, `transport.light_smoke` and
-                `transport.scatter` with directional lights.
-            device: Result of `wlm.interop.check_device`.
-            warmup: Calls before the capture, in which kernels are loaded.
-        """
+        """Prepares a function that does not wait for the device; it is called `warmup` times before the capture."""
         self._work = work
         self._device = device
         self._volume: DensityVolume | None = None
@@ -64,10 +58,10 @@ class VolumeGraph(Generic[_Made]):
         self._step = StepGraph(self._make, device, warmup=warmup)
 
     def __call__(self, volume: DensityVolume) -> _Made:
-        """Returns the result for smoke.
+        """Returns the function's result for a volume.
 
         Raises:
-            ValueError: Its shape, position or factors differ from those of the first call.
+            ValueError: The volume's shape, position or factors differ from those of the first call.
         """
         with stream(self._device):
             if self._volume is None:
@@ -86,6 +80,6 @@ class VolumeGraph(Generic[_Made]):
 
 
 def _kind(volume: DensityVolume) -> tuple:
-    """Returns the properties that are fixed in a graph."""
+    """Returns the properties of a volume that a captured graph cannot change."""
     place = (volume.voxel, tuple(volume.origin), volume.extinction, volume.emission)
     return (volume.shape, volume.density.dtype, volume.temperature is not None, *place)

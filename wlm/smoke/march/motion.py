@@ -67,12 +67,7 @@ def velocity_file(folder: Path, number: int) -> Path:
 
 
 def write_velocity(path: Path, velocity: wp.array, reach: float) -> None:
-    """Writes a velocity, atomically.
-
-    Args:
-        path: The file.
-        velocity: vec3 [A, B, C].
-        reach: Lengths of the world per frame of a velocity of 1.
+    """Writes a velocity, vec3 [A, B, C], atomically; `reach` is in lengths of the world per frame of a velocity of 1.
 
     Raises:
         WlmError: The file cannot be written, or there are more cells than `read_velocity` accepts.

@@ -6,13 +6,7 @@ frames, each with its guiding map and its lightmaps, and the motion between them
 shape it but are not rendered (section 5).
 
 Lengths are shares of the box, so that a smaller grid gives the same images. A trained network's guiding maps must be
-made with its own `DatasetSettings.look`. Special cases:
-
-=======================================  =============================================================
-an unstable flow, NaN or infinity        the scene is skipped and counted; another is drawn instead
-`ATTEMPTS` such scenes in a row          error
-a frame with almost no smoke             only a small random share of these is used
-=======================================  =============================================================
+made with its own `DatasetSettings.look`.
 """
 
 import os
@@ -106,7 +100,7 @@ def pool_of_volume(
         path: A `.npz`, `.nvdb` or `.vdb` volume for `load_volume`.
         settings: Views and march; the volume's longest edge counts as the box's edge.
         device: "cpu", "cuda" or "cuda:N".
-        extinction: Extinction at density 1 per unit of length; None: dense smoke becomes as opaque as in a scene.
+        extinction: Extinction at density 1 per unit of length; None: such that dense smoke is as opaque as in training.
         emission: Emission at temperature 1 per unit of length.
 
     Returns:
@@ -119,7 +113,7 @@ def pool_of_volume(
     if extinction is None:
         density = volume.density[volume.density > 0]
         if not len(density):
-            raise WlmError(f"{path}: density: expected smoke to choose an extinction by, found none")
+            raise WlmError(f"{path}: density: is zero everywhere, so that no extinction can be chosen")
         edge = volume.voxel * max(volume.shape)
         extinction = settings.extinction / (edge * float(np.quantile(density.float().cpu().numpy(), _BRIGHT)))
     volume = replace(volume, extinction=extinction)
@@ -134,7 +128,7 @@ def pool_of_volume(
 
 
 def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
-    """Returns the fixed views of a box, all of one extent."""
+    """Returns the cameras of the fixed views of a box, all of one extent."""
     first = CameraSettings(extent=_EXTENT * float(np.max(size)), resolution=settings.resolution)
     turns = settings.arc / settings.views * np.arange(settings.views)
     return [make_camera(first.turned(float(turn)), origin, size) for turn in turns]
@@ -169,7 +163,7 @@ class _Maker:
         return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
 
     def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """Returns a sequence's samples, the number of unstable scenes before it, and of dropped samples."""
+        """Returns a sequence's samples, and the numbers of unstable scenes skipped for it and of samples dropped."""
         for attempt in range(ATTEMPTS):
             index = number * ATTEMPTS + attempt
             settings = self._sequence_settings(index)
@@ -272,7 +266,7 @@ class _Simulation:
         self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:
-        """Advances by a number of air steps, a multiple of the steps in a graph."""
+        """Advances by a number of air steps, which must be a multiple of the steps in one CUDA graph."""
         for _ in range(steps // self._period):
             now = self._done * self._seconds
             active = tuple(source for source, is_active in self._sources if is_active(now))

@@ -37,8 +37,8 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
     """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
 
-    A camera that turns about the box's centre has the same span in all positions, so that depths are comparable. For an
-    orthographic camera distances are along its axis, in perspective from the eye.
+    A camera that turns about the box's centre has the same span in all positions, so that depths are comparable.
+    Distances are measured along the axis of an orthographic camera, or from the eye of a perspective camera.
 
     Returns:
         Near and far in the world's unit, near < far; near is below 0 where the camera is within the sphere.
@@ -128,7 +128,7 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
 
     Args:
         planes: [8, H, W].
-        hot: Whether the smoke emits light; False leaves that plane out.
+        hot: Whether the smoke emits light; False: the result has no emission.
         camera: The view of the lightmaps; None: unknown.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Training samples."""
+"""The samples of a training round, a validation or a test."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Pool:
         return self.guides.device
 
     def covered(self) -> torch.Tensor:
-        """Returns the share of the image that shows smoke, [N], the smaller of the two frames."""
+        """Returns for each sample the share of the image that shows smoke, [N], in the frame where it is smaller."""
         return (self.targets[:, :, OPACITY_PLANE] > VISIBLE).float().mean((-2, -1)).amin(1)
 
     def take(self, which: torch.Tensor) -> Pool:

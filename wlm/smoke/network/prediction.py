@@ -1,10 +1,10 @@
 """Six-way lightmaps of smoke by a trained network: guiding map, network, gate and decoding in one call.
 
 A network may be worse than its guiding map: for smoke that is smoother, coarser or finer than in its training, the map
-has little noise to remove. Each image therefore has a gate, which is computed from a second map of a ninth of the
-pixels with other noise. For guide A, network N and second guide B, the share s for which A + s (N - A) is nearest to B
-is also nearest to the truth, since neither A nor N contains the noise of B: s = <N - A, B - A> / |N - A|^2. This is the
-principle of Noise2Noise (Lehtinen et al. 2018) at run time.
+has little noise to remove. Each image therefore has a gate, which is computed from a second guiding map with a ninth of
+the pixels and different noise. For guide A, network N and second guide B, the share s for which A + s (N - A) is
+nearest to B is also nearest to the truth, since neither A nor N contains the noise of B: s = <N - A, B - A> / |N -
+A|^2. This is the principle of Noise2Noise (Lehtinen et al. 2018) at run time.
 """
 
 import functools
@@ -92,7 +92,7 @@ class SmokePredictor:
     def _gated(
         self, guide: torch.Tensor, planes: torch.Tensor, smoke: DensityVolume, camera: Camera, march: March
     ) -> torch.Tensor:
-        """Returns planes [8, H, W] and guide blended by the gate, all encoded."""
+        """Blends the predicted planes [8, H, W] with the guide by the gate; returns encoded planes [8, H, W]."""
         size = [n // _APART - (n - n // _APART) % 2 for n in (camera.height, camera.width)]
         if min(size) < 1:
             self.share = torch.zeros((), device=guide.device)

@@ -1,16 +1,7 @@
 """Random scenes: jets, plumes, flames and bursts past obstacles (neural-six-way-lightmaps, section 5).
 
-The paper has 14 jets past cylinders. A scene here is of one of four kinds, in a box of 1 m in which the fastest air
-moves at 1 m/s, so that it crosses the box in a second:
-
-=======  =====================================================  ====================
-kind     smoke                                                  obstacles
-=======  =====================================================  ====================
-jet      one or two inlets in the floor, sometimes in wind      1 to 3
-plume    a sphere that emits warm, rising smoke                 0 to 3
-flame    a hot jet that glows and cools                         0 to 2
-burst    one to three spheres, hot for a moment, that glow      0 to 2
-=======  =====================================================  ====================
+The paper has 14 jets past cylinders. A scene here is a jet, a plume, a flame or a burst, in a box of 1 m in which the
+fastest air moves at 1 m/s, so that it crosses the box in a second.
 """
 
 from typing import Any
@@ -48,7 +39,7 @@ class Tilted(ObstacleSettings):
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
-    """Returns the random generator for a part of a sequence; validation and training have different ones."""
+    """Returns the random generator that the numbers identify; validation and training have different ones."""
     return np.random.default_rng([int(validation), *numbers])
 
 

@@ -50,7 +50,7 @@ class NetworkSettings(BaseModel):
 
     @property
     def multiple(self) -> int:
-        """Images are padded with zeros to multiples of this number of pixels."""
+        """Number of pixels: images are padded with zeros to a width and height that are multiples of it."""
         return self.stem * 2 ** (self.levels - 1)
 
 
@@ -137,7 +137,7 @@ class DatasetSettings(BaseModel):
 
     @property
     def steps(self) -> int:
-        """Air steps between the two frames of a pair, at least one CUDA graph's."""
+        """Number of air steps between the two frames of a pair, at least as many as one CUDA graph has."""
         return max(self.lattice_steps(self.interval), PERIOD * self.substeps)
 
     @property
@@ -152,12 +152,7 @@ class DatasetSettings(BaseModel):
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 
     def look(self, shape: Sequence[int], seed: int = 0) -> March:
-        """Returns the march of a guiding map through a grid.
-
-        Args:
-            shape: Voxels along x, y, z.
-            seed: Seed of the jitter.
-        """
+        """Returns the settings of a guiding map's march through X, Y, Z voxels, with a seed for its jitter."""
         longest = max(shape)
         spacing = None if self.guide_spacing is None else self.guide_spacing * longest
         threshold = self.surface / longest

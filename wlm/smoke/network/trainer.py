@@ -67,7 +67,7 @@ class Trainer:
         return self._sums.tolist()
 
     def clear_losses(self) -> None:
-        """Starts new sums."""
+        """Resets the sums of the losses to 0."""
         self._sums.zero_()
 
     def run(self, pool: Pool, plan: Plan) -> None:
@@ -147,7 +147,7 @@ class Trainer:
         return {name: np.array(value.detach().cpu().numpy(), order="C") for name, value in tensors.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """Returns the table of the parts of a `state` after a number of steps."""
+        """Returns the type, shape and range of each array of a `state` after a number of steps."""
         table = {
             "step": Part(np.int64, (), least=step, most=step),
             "sums": Part(np.float32, tuple(self._sums.shape)),
@@ -189,7 +189,7 @@ class Trainer:
 
 
 def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
-    """Returns the index of the plane that replaces each plane in a mirrored image."""
+    """Returns for each plane the index of the plane that takes its place when the image is mirrored."""
     return torch.tensor([planes.index(_MIRRORED.get(name, name)) for name in planes], device=device)
 
 
@@ -244,15 +244,7 @@ def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) ->
 
 
 def _corners(pool: Pool, samples: np.ndarray, draws: np.ndarray, image: np.ndarray, crop: int) -> np.ndarray:
-    """Returns corners int [..., 2] of crops that contain a block with smoke, drawn uniformly.
-
-    Args:
-        pool: All samples.
-        samples: int [...], indices of the pool.
-        draws: [..., 3], uniform in [0, 1): the block, and its place in the crop.
-        image: Rows and columns of a sample.
-        crop: Edge of a crop, pixels.
-    """
+    """Returns corners int [..., 2] of crops around a random block with smoke; `draws` [..., 3] are in [0, 1)."""
     blocks = []
     for targets in pool.targets:
         opacity = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()

@@ -40,19 +40,13 @@ class Spreading:
     """Diffusion of several lights, whose sources are added during a march."""
 
     def __init__(self, scene: Marching, volume: DensityVolume, lights: Sequence[AnyLight]) -> None:
-        """Begins without light.
-
-        Args:
-            scene: A march through the smoke.
-            volume: The smoke.
-            lights: Any number of lights.
-        """
+        """Averages the smoke to the coarse grid; no light has been added yet."""
         self._scene, self._volume, self._lights = scene, volume, tuple(lights)
         self._coarse = CoarseSmoke(volume)
         self._source = torch.zeros(len(lights), *self._coarse.extinction.shape, device=volume.device)
 
     def add(self, number: int, depths: Depths) -> None:
-        """Adds the direct light that cells stop as the source of a light."""
+        """Adds a light: the direct light that each coarse cell extinguishes becomes the source of its diffusion."""
         light, out = self._lights[number], self._source[number]
         if isinstance(light, PointLight):
             place, _, radius = in_voxels(light, self._volume)
@@ -67,8 +61,9 @@ class Spreading:
             albedos: Any number of albedos.
 
         Returns:
-            Light that was scattered more than once, divided by the squared albedo, float32 [2, L, A, H, W]: all of it,
-            and the part from thin smoke; and the opacity of thin smoke, float32 [H, W], see `CoarseSmoke.render`.
+            Light of L lights that was scattered more than once, divided by the squared albedo, for A albedos, float32
+            [2, L, A, H, W]: all light, and its part from thin smoke; and the opacity of thin smoke, float32 [H, W]. See
+            `CoarseSmoke.render`.
         """
         size = (self._scene.view.height, self._scene.view.width)
         made = torch.empty(2, len(self._lights), len(albedos), *size, device=self._source.device)
@@ -86,7 +81,7 @@ class Spreading:
 
 
 def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:
-    """Computes the emitted light that hot smoke scatters to a camera, [A, H, W].
+    """Computes the emitted light that hot smoke scatters to a camera, [A, H, W] for A albedos.
 
     Args:
         scene: A march through the smoke.
@@ -109,12 +104,7 @@ class CoarseSmoke:
     """
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
-        """Averages the smoke; to be called inside `wlm.interop.stream`.
-
-        Args:
-            volume: The smoke.
-            cells: Cells along the longest edge.
-        """
+        """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
         self.medium = medium_of(volume)
         longest = max(volume.shape)
         self._counts = [max(1, round(cells * n / longest)) for n in volume.shape]
@@ -133,11 +123,11 @@ class CoarseSmoke:
         """Solves for the fluence of light that was scattered at least once.
 
         Args:
-            source: float32 tensor [L, X, Y, Z], direct light that each cell stops, per volume.
+            source: float32 tensor [L, X, Y, Z], direct light of L lights that each cell extinguishes, per volume.
             albedos: One to three albedos.
 
         Returns:
-            float32 tensor [L * A, X, Y, Z], with the albedos of each source adjacent.
+            float32 tensor [L * A, X, Y, Z], for A albedos; the albedos of each source are adjacent.
         """
         light = torch.empty(len(source) * len(albedos), *self.extinction.shape, device=source.device)
         if not len(light):
@@ -155,8 +145,8 @@ class CoarseSmoke:
             light: float32 tensor [N, X, Y, Z], fluences.
 
         Returns:
-            float32 [2, N, H, W], all light and the light from thin smoke, where each sample is weighted by the
-            transparency of a cell of smoke of its density; and the opacity of thin smoke, float32 [H, W].
+            float32 [2, N, H, W], all light and the light from thin smoke, where a sample is weighted by the
+            transparency that a cell of its density has; and the opacity of thin smoke, float32 [H, W].
         """
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
@@ -166,7 +156,7 @@ class CoarseSmoke:
         return out, thin
 
     def lit(self, scene: Marching, depths: Depths, out: torch.Tensor) -> None:
-        """Computes the direct light of irradiance 4 pi from a light at infinity that cells stop.
+        """Computes the direct light that each cell extinguishes from a light at infinity of irradiance 4 pi.
 
         Args:
             scene: A march through the smoke.
@@ -177,7 +167,7 @@ class CoarseSmoke:
         diffusion.stop(scene.medium, depths, cell, scene.march.step, to_warp(out))
 
     def around(self, scene: Marching, place: Sequence[float], radius: float, out: torch.Tensor) -> None:
-        """Adds the direct light of a point light that cells stop.
+        """Adds the direct light of a point light that each cell extinguishes.
 
         Args:
             scene: A march through the smoke.

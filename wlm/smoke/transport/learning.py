@@ -57,7 +57,7 @@ def draw_view(
 
 
 def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolume, Camera, tuple]:
-    """Draws a view for the fit, with more kinds of smoke than `draw_view`; arguments as there."""
+    """Draws a view for the fit, with more kinds of smoke than `draw_view`; arguments as for `draw_view`."""
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THINNEST), np.log(_THICKEST))))
     n, pixels = int(random.choice(_ALL_SIZES)), int(random.choice(_PIXELS))
@@ -83,7 +83,7 @@ def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
 def _seen(
     volume: DensityVolume, random: np.random.Generator, pixels: int, lights: int
 ) -> tuple[DensityVolume, Camera, tuple]:
-    """Returns the smoke rotated at random, with a random camera and lights."""
+    """Returns a volume rotated at random, a random camera, and random lights."""
     density = volume.density.permute(tuple(int(i) for i in random.permutation(3)))
     density = density.flip([axis for axis in range(3) if random.random() < 0.5]).contiguous()
     volume = replace(volume, density=density)
@@ -94,13 +94,13 @@ def _seen(
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A light of a view: the inputs, and its path-traced light of all orders at each of `ALBEDOS`, [A, H, W]."""
+    """One light of a view: inputs of the prediction, and path-traced light at each of `ALBEDOS`, [A, H, W]."""
 
     inputs: Inputs
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """Returns R, light scattered more than once over the squared albedo, [A, H, W]."""
+        """Returns R, light scattered more than once divided by the squared albedo, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 

@@ -34,14 +34,14 @@ class LitSmoke:
         lights: The lights.
         planes: float32 tensor [L, H, W], light scattered once, of a light of irradiance 4 pi or a point light of
             intensity 4 pi.
-        opposite: As the planes, under a light from the opposite direction; 0 for a point light.
+        opposite: Like `planes`, but under a light from the opposite direction; 0 for a point light.
         transparency: float32 tensor [H, W].
         emission: float32 tensor [H, W]; None: the smoke is cold.
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0: none.
         camera: The view.
         march: Settings of the march.
-        thrown: float32 tensor [H, W, 3], emitted light that the smoke scatters to the camera, grey except for the
-            albedo; None: the smoke is cold, or only light scattered once is computed.
+        thrown: float32 tensor [H, W, 3], emitted light that the smoke scatters to the camera, before the emission's
+            colour is applied; None: the smoke is cold, or only light scattered once is computed.
     """
 
     lights: tuple[AnyLight, ...]
@@ -61,7 +61,7 @@ class LitSmoke:
         background: torch.Tensor | Sequence[float] | None = None,
         ramp: Ramp | None = None,
     ) -> torch.Tensor:
-        """Returns the picture with light scattered once of all lights, and emission.
+        """Returns the picture: the light of all lights, scattered once, plus the emission.
 
         Args:
             albedo: R, G, B, share of light that survives a scattering, 0 to 1.
@@ -72,7 +72,7 @@ class LitSmoke:
             float32 [H, W, 3].
 
         Raises:
-            ValueError: The albedo is wrong.
+            ValueError: The albedo is not three numbers from 0 to 1.
         """
         planes = torch.stack([float(value) * self.planes for value in checked_albedo(albedo)], -1)
         return self.compose(planes, background=background, ramp=ramp)
@@ -113,10 +113,6 @@ def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
     """Returns a march with an error of about 0.5%: in steps of a voxel or of a tenth of optical depth in the densest
     smoke, but at least a quarter of a voxel.
-
-    Args:
-        volume: The smoke.
-        g: Mean cosine of the Henyey-Greenstein phase function.
     """
     densest = float(volume.density.max()) * volume.extinction * volume.voxel
     return March(step=min(max(_CLOSE / max(densest, 1e-30), _FINEST), 1.0), jitter=0.0, g=g)
@@ -137,8 +133,8 @@ def light_smoke(
         camera: Any camera, outside the smoke or inside.
         lights: Any number of lights.
         march: Settings of the march; None: `fine_march`.
-        shadow: Extinction on the ways to the lights relative to that along the camera's rays; 1 is physical, less
-            approximates an octave of multiple scattering.
+        shadow: Extinction on the ways to the lights relative to that along the camera's rays; 1 is physical, a smaller
+            value approximates an octave of multiple scattering.
 
     Returns:
         The light on the smoke's device.
@@ -157,7 +153,7 @@ Depths = tuple[depth_lattice.Lattice, wp.array]
 
 @dataclass(frozen=True, eq=False)
 class Marching:
-    """A march through one volume from one view, for any number of lights; bricks are found once."""
+    """A march through one volume from one view, for any number of lights; bricks with smoke are found only once."""
 
     medium: Medium
     view: View
@@ -194,13 +190,7 @@ def light_in(
     lights: Sequence[AnyLight],
     visit: Callable[[int, Depths], None] | None = None,
 ) -> LitSmoke:
-    """Runs `light_smoke` in a prepared march.
-
-    Args:
-        scene: The march.
-        volume, camera, lights: As for `light_smoke`.
-        visit: Called with the index of each light and its depths, which are not kept.
-    """
+    """Runs `light_smoke` in a prepared march; `visit` gets the index of each light and the optical depths to it."""
     planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     for n, light in enumerate(lights):
         place, _, radius = in_voxels(light, volume)

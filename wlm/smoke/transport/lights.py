@@ -64,7 +64,7 @@ def half_sphere(count: int) -> np.ndarray:
 
 
 def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
-    """Returns three non-negative numbers, float64 [3].
+    """Checks that a colour is three numbers of at least 0 and returns it as float64 [3].
 
     Raises:
         ValueError: They are something else.
@@ -76,7 +76,7 @@ def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
 
 
 def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
-    """Returns three numbers of 0 to 1, float64 [3].
+    """Checks that an albedo is three numbers from 0 to 1 and returns it as float64 [3].
 
     Raises:
         ValueError: They are something else.
@@ -93,7 +93,7 @@ def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.nd
     The irradiance of a point light is given at a distance of one voxel; the radius of a light at infinity is None.
 
     Raises:
-        ValueError: A direction has no length, or a colour is wrong.
+        ValueError: A direction has length 0, or a colour is not three numbers of at least 0.
     """
     if isinstance(light, Light):
         return unit(light.toward), checked_colour("irradiance", light.irradiance) / (4.0 * math.pi), None

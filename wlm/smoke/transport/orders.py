@@ -1,13 +1,13 @@
 """Light of all orders of scattering, predicted from light scattered once and from diffusion.
 
 Multiply scattered light diffuses, except at the smoke's edges, where it leaves, and in thin parts. The difference can
-be predicted per pixel from light scattered once, from the same under the opposite light, from opacity, and from the
-share of thin smoke in these. R, all light except the first order, is a weighted sum of such features. The weights
-depend on the angle between light and camera and on the smoke's mean depth, and were fitted to path-traced light by
-least squares (`learning`).
+be predicted per pixel from light scattered once, under the light and under an opposite one, from opacity, and from the
+share of light and opacity that comes from thin smoke. R, all light except the first order, is a weighted sum of such
+features. The weights depend on the angle between light and camera and on the smoke's mean depth, and were fitted to
+path-traced light by least squares (`learning`).
 
-At albedo a all light is a S + a^2 R(a), where S was scattered once. Weights are known at `ALBEDOS` and are linear in
-between."""
+At albedo a all light is a S + a^2 R(a), where S is light scattered once at albedo 1. Weights are fitted at `ALBEDOS`
+and interpolated linearly in between."""
 
 import functools
 import os
@@ -42,12 +42,13 @@ _SHORTEST = 0.25  # voxels; shorter steps do not improve the result
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Inputs of the prediction for L lights of irradiance 4 pi; for point lights at the smoke's centre.
+    """Inputs of the prediction for L lights of irradiance 4 pi (of a point light: at the smoke's centre).
 
     Attributes:
         single: float32 tensor [L, H, W], S, light scattered once.
         opposite: float32 tensor [L, H, W], the same under lights from the opposite directions.
-        diffused: float32 tensor [L, A, H, W], R by diffusion: light scattered more than once over the squared albedo.
+        diffused: float32 tensor [L, A, H, W], R by diffusion: light scattered more than once divided by the squared
+            albedo.
         from_thin: float32 tensor [L, A, H, W], the part of `diffused` from thin smoke.
         albedos: The A albedos.
         transparency: float32 tensor [H, W].
@@ -93,10 +94,10 @@ class Inputs:
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """Returns the march for light of all orders.
+    """Returns the settings of the march that computes the inputs of the prediction.
 
     Its step is 1/130 of the smoke's longest edge, at least a quarter of a voxel. The nodes of its lattice have the same
-    spacing, but at least a voxel or, on small grids, 1/64 of the edge.
+    spacing, but at least a voxel, or 1/64 of the edge if that is less.
     """
     edge = max(volume.shape)
     step = max(_SHORTEST, edge / _STEPS)
@@ -116,7 +117,7 @@ def make_inputs(
         march: Settings with g = 0.
 
     Returns:
-        The smoke under light scattered once, and the inputs.
+        The smoke lit by single scattering, and the inputs of the prediction.
     """
     ways = [aim(light, volume) for light in lights]
     with marching(volume, camera, march) as scene:

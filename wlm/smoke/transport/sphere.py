@@ -67,7 +67,7 @@ def bake_sphere(
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
-    """Returns the sums [6, H, W] of planes [L, H, W] weighted by [L, 6]."""
+    """Returns six weighted sums [6, H, W] of planes [L, H, W], with weights [L, 6]."""
     return torch.einsum("lp,lhw->phw", weigh, planes)
 
 

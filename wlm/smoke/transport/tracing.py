@@ -35,8 +35,8 @@ class Transport:
 
     Attributes:
         planes: float32 tensor [S, orders + 2, H, W, 3]: for each source the light that was scattered 0, 1, ... `orders`
-            times, and last the light that was scattered more often. At a times the albedo, the light of order n is
-            a^n times this.
+            times, and last the light that was scattered more often. If the albedo is multiplied by a, the light of
+            order n is multiplied by a^n.
         sources: Names of the sources: "light 1" and so on, "sky" and "emission".
         noise: float32 tensor [S, H, W, 3], standard error of each source's sum over its planes.
         total_noise: float32 tensor [H, W, 3], standard error of `total`; since sources share paths, it exceeds the root
@@ -99,7 +99,7 @@ def trace(
         orders: Number of orders of scattering with separate planes.
         highest: Scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
-        seed: An integer of at least 0, on which alone results depend, on one kind of device.
+        seed: An integer of at least 0; the same seed gives the same result on one kind of device.
         progress: Called during the work.
 
     Returns:
@@ -177,7 +177,7 @@ def _require(planes: int, sources: int, view: View, parts: int, at_once: int, de
 
 
 def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
-    """Returns standard errors [...] of the sum over parts [P, ...]."""
+    """Returns the standard error [...] of the sum of the P parts [P, ...] into which the samples are divided."""
     parts = len(means)
     if parts == 1:
         return torch.full_like(means[0], math.inf)
