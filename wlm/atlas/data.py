@@ -210,7 +210,7 @@ def load(
     else:
         for name, value in {"mask": mask_path, "node": node, "encoding": encoding, "flip": flip or None}.items():
             if value is not None:
-                raise WlmError(f"{name}: expected with one lightmap alone; a list of lightmaps states it")
+                raise WlmError(f"{name}: only allowed with a single lightmap; a list of lightmaps states it")
         listing = _listed(path, document, lights_path)
     if node is not None:
         primitives = named(str(path), primitives, node)

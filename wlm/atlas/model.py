@@ -146,8 +146,8 @@ class Profile(Settings):
         """Returns the profile with some settings replaced, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: A setting is unknown or out of range, or the cascade is given a budget or two textures, which it
-                lacks.
+            WlmError: A setting is unknown or out of range, or the cascade, which has neither, is given a budget or
+                "mixed".
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:

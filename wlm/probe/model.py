@@ -178,7 +178,7 @@ class ProbeModel(Model):
         """
         if not self.has_positions:
             raise WlmError(
-                f"{self.name}: the file stores no positions: give those of the probes, or fit with positions"
+                f"{self.name}: the file stores no positions: give the probes' positions, or store them in the fit"
             )
         return self.origin + self.extent * self.size * (self.positions / CODES)
 

@@ -105,7 +105,7 @@ def score_views(
     if count is None:
         raise WlmError(f"{probes.name}: expected spherical harmonics, found {probes.outputs} numbers per probe")
     if views < 1 or not 16 <= resolution <= 4096:
-        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels, got {views} of {resolution}")
+        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels a side, got {views} of {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
     things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})

@@ -5,7 +5,7 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 1. `look` takes the new windows; `scroll` finds for each slot its block, whether a probe is near that block, and whether
    the pool still has it. Other blocks wait, and are counted by their distance to the viewer.
 2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
-   decoded, by distances in units of their own side; of two equal ones the finer block, then the one of the lower slot.
+   decoded, by distances in units of their own side; on a tie first the finer block, then the lower slot.
 3. `allocate` gives each block a row of the pool: the least recently used row of a group that no other block takes from.
    Groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.

@@ -105,8 +105,7 @@ def _relate(work: Work):
 
 @wp.kernel(enable_backward=False)
 def _weigh(work: Work):
-    """Computes the weights of one block per thread by Cholesky decomposition; blocks without a row of the pool are
-    ignored."""
+    """Computes the weights of one block's probes per thread by Cholesky decomposition; unused entries become 0."""
     k = wp.tid()
     count = work.picked[k]
     lower = _Square()

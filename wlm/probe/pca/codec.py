@@ -47,7 +47,7 @@ def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dr
     most = np.maximum(np.abs(bounds[0]), np.abs(bounds[0] + 255.0 * bounds[1]))
     largest = float(np.abs(stored["basis"].astype(np.float64)).max(initial=0.0)) if stored["basis"].size else 1.0
     if (bounds[1] < 0).any() or most[0] > _MOST_LOG:
-        raise ValueError(f"part bounds: expected rising ranges, and logarithms within {_MOST_LOG:g}")
+        raise ValueError(f"part bounds: expected steps of at least 0, and logarithms within {_MOST_LOG:g}")
     if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
         raise ValueError("parts bounds and basis: expected values that float32 holds")
     return Components(outputs, np.ascontiguousarray(stored["code"].T), stored["bounds"], stored["basis"])
