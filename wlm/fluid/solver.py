@@ -174,7 +174,7 @@ class Solver:
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
-            raise ValueError("temperature: expected True, since sources, buoyancy or cooling use it")
+            raise ValueError("temperature: expected True for these sources, buoyancy or cooling")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.shape = tuple(refinement * size for size in lattice.shape)

@@ -135,7 +135,7 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Tests if a population that leaves a cell towards p is stored in the cell's own element, or else by a link."""
+    """Tests if a population that leaves a cell towards p is stored in its own element; else a link writes it."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 
