@@ -386,7 +386,7 @@ def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
 
 
 def rings_for(cells: float) -> int:
-    """Returns the number of rings of bricks that a trace of a length in fine cells can reach, with one more cell read."""
+    """Returns how many rings of bricks a trace of a length in fine cells can reach, with one more cell for a read."""
     return -(-(int(cells) + 2) // BRICK)
 
 
