@@ -63,7 +63,7 @@ class Texture:
             `wlm.formats.ktx2.VK_FORMATS`.
         width, height: Size in texels.
         layers: Number of layers of a texture array; 0 for a plain texture.
-        mips: Number of mip levels below the largest.
+        mips: Number of mip levels after the full-size one.
         image: float32 [H, W, 3], or [L, H, W, 3] of an array: the decoded texels of BC6H and ASTC, for engines that
             do not load these formats. None for all other formats.
     """
@@ -83,7 +83,7 @@ class Texture:
         Args:
             texels: [H, W] or [H, W, C], or with `layered` [L, H, W] or [L, H, W, C]; little-endian numbers of the
                 format's own type.
-            fmt: As `fmt` of the class.
+            fmt: Pixel format, see the class.
             layered: Whether the first axis counts the layers of a texture array.
         """
         height, width = texels.shape[layered : layered + 2]
@@ -131,7 +131,7 @@ class Bundle:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the textures and buffers take in GPU memory, those of the parts included."""
+        """Bytes that the textures and buffers take in GPU memory, including the ones in `parts`."""
         own = sum(item.nbytes for item in (*self.textures.values(), *self.buffers.values()))
         return own + sum(part.nbytes for part in self.parts.values())
 

@@ -74,8 +74,7 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     A gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`.
 
     Args:
-        tensor: Any strides; those of the trailing dimensions that a vector or matrix type takes up must be
-            contiguous.
+        tensor: A tensor of any strides; trailing dimensions that become a vector or matrix must be contiguous.
         dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's scalar.
 
     Returns:

@@ -232,7 +232,7 @@ class Model:
         """Converts the model to textures, buffers and shader source for a GPU; the device computes the reference
         values.
 
-        `options` are those of the system's `bundle`.
+        `options` are passed to the function `bundle` of the system.
 
         Raises:
             WlmError: No such device.
@@ -240,7 +240,7 @@ class Model:
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-        """Returns settings, parts and source of the file."""
+        """Returns the settings, the parts and the source hash that `save` writes."""
         return _module(self.SYSTEM, "codec").encode(self)
 
 

@@ -1,7 +1,7 @@
 """Encodes blocks of 4 x 4 texels as unsigned BC6H with a small weighted squared error in linear light.
 
 BC6H interpolates between two colours in a space that is roughly the logarithm of light. A block is fitted there by
-weighted least squares, with the squared slope of light as a further weight of each texel; the texels' levels are then
+weighted least squares, with the squared slope of light as a further weight of each texel; the texels' indices are then
 chosen by their error in linear light. The most precise mode that can represent the endpoints is used. One line for all
 texels and the two best of the 32 partitions into two lines are encoded, and the best of these blocks is kept.
 
@@ -213,7 +213,7 @@ def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
 
 @wp.func
 def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
-    """Fits a line's ends by least squares, with each texel at the nearest level between the previous ends."""
+    """Fits a line's ends by least squares, with each texel at its nearest index between the previous ends."""
     along = b - a
     sums = _Sums()
     for i in range(_TEXELS):

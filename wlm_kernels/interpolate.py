@@ -169,7 +169,7 @@ def sample_backward(
     On CUDA points are added to `grad_values` in any order, so that the last bits change from run to run.
 
     Args:
-        values, times, layers, points, periodic: As for `sample`.
+        values, times, layers, points, periodic: Arguments of `sample`.
         grad_out: float [N, C].
         grad_values: float [L * T, H, W, C], added to; of shape [0, 0, 0, 0]: not computed.
         grad_points: float, like `points`, written; of shape [0, 0]: not computed.

@@ -127,7 +127,7 @@ class MlpKernels:
         d and of its bias the sum of d. The three layers' (h, d) are (x, d1), (h1, d2), (h2, grad_y).
 
         Args:
-            hidden, output, x: As for `forward`.
+            hidden, output, x: Weights and inputs, see `forward`.
             grad_y: vecO [N, B].
             grad_x: vecI [N, B], written.
             h1, h2: vecH [N, B], written: the layers' results.

@@ -16,7 +16,7 @@ _INSTALL = "install LLVM 16 or later (apt install libllvm19, for example), or na
 
 
 def start(device: str = "cpu") -> ModuleType:
-    """Imports Mitsuba with its variant for "cpu" or "cuda", where it uses the first GPU, and returns the module.
+    """Imports Mitsuba with its variant for "cpu" or "cuda" (the first GPU), and returns Mitsuba's module.
 
     Raises:
         WlmError: A package, LLVM or a GPU is missing; the line says what to install.

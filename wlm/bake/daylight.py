@@ -1,4 +1,4 @@
-"""Direction of the sun by the hour."""
+"""Direction to the sun at a given hour, day and latitude."""
 
 import math
 
@@ -16,7 +16,7 @@ def sun_direction(hour: float, latitude: float, day: int, north: float = 0.0, pe
 
     Args:
         hour: Solar time; the sun is highest at half the period.
-        latitude: Degrees, north positive.
+        latitude: Latitude in degrees, north positive.
         day: Day of the year.
         north: Degrees by which north is turned from -z towards -x.
         period: Hours of a day.

@@ -125,7 +125,7 @@ def bake_probes(
 
 
 def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
-    """Writes probes as `.npz`: `position`, `sh` of one hour or `sh_HOUR` of several, and the noise likewise.
+    """Writes probes as `.npz`: `position`, `sh` for one hour or `sh_HOUR` for each of several, and likewise the noise.
 
     Raises:
         WlmError: The file can't be written.

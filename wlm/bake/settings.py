@@ -43,7 +43,7 @@ class Daylight(_Settings):
     """Sun and sky by solar time, from Mitsuba's `sunsky` (Hosek and Wilkie 2012, 2013).
 
     Attributes:
-        latitude: Degrees, north positive.
+        latitude: Latitude in degrees, north positive.
         day: Day of the year, 1 to 366.
         north: Degrees by which north is turned from -z towards -x.
         turbidity: Turbidity of the air: 1 is clear air, 10 is haze.
@@ -96,7 +96,7 @@ class Lamp(_Settings):
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if (self.position is None) == (self.material is None):
-            raise ValueError("lamp: expected either a position or a material")
+            raise ValueError("expected a lamp at a position or of a material")
         given = self.model_fields_set
         if ("radiance" in given and self.material is None) or ("intensity" in given and self.position is None):
             raise ValueError("expected intensity with a position, radiance with a material")
@@ -117,7 +117,7 @@ class LightmapSettings(_Settings):
         resolution: Width and height in texels.
         uv_set: n of `TEXCOORD_n`; None: 1 if it exists, else 0.
         unwrap: Whether to create new UVs, `TEXCOORD_1`, and write the mesh with them.
-        padding: Texels between new charts.
+        padding: Distance between new charts, in texels.
         supersample: Sample positions along a texel's side; a texel is their mean.
         directional: Whether to bake light directions, too.
     """
@@ -181,7 +181,7 @@ class BakeScene(_Settings):
         if self.daylight is not None and self.sky is not None:
             raise ValueError("expected daylight or sky, found both")
         if len({f"{hour:.9g}" for hour in self.hours}) < len(self.hours):  # as files are named
-            raise ValueError("hours: expected no two hours that are equal to nine digits")
+            raise ValueError("hours: expected each once, when rounded to nine digits")
         if self.period is not None and not all(0 <= hour < self.period for hour in self.hours):
             raise ValueError(f"hours: expected 0 to below the period of {self.period:g}")
         return self

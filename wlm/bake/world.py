@@ -57,7 +57,7 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
         scene: The settings.
         geometry: The surfaces.
         picture: The environment map, float32 [H, W, 3], or None.
-        hour: The hour.
+        hour: The hour of the day, as in `scene.hours`.
     """
     content: dict[str, Any] = {"type": "scene"}
     glowing = {lamp.material: lamp.radiance if lamp.is_lit(hour) else (0.0, 0.0, 0.0) for lamp in scene.lamps}

@@ -59,7 +59,7 @@ def export(
         folder: The folder; made if it does not exist.
         engine: One of `wlm.export.ENGINES`; None for the raw folder.
         shader: Language of the raw folder's shader, one of `wlm.export.LANGUAGES`.
-        exact: Whether the raw folder's shader fetches texels and interpolates in floats, not by the filter.
+        exact: Whether the raw folder's shader fetches texels and interpolates in floats, without the texture filter.
         device: Device that decodes the model for the folder's reference image, for example "cpu" or "cuda:0".
         options: Options of the kit. Probes: `original`, the file that was compressed, if the model does not store its
             positions; `cells`, the number of a grid's cells along its longest side (three, godot, unreal); `mirror`,

@@ -1,4 +1,4 @@
-"""Exact packing and decoding of BC7 mode 6: per block two RGBA endpoints of 7 bits, a P bit each, and 16 levels.
+"""Exact packing and decoding of BC7 mode 6: per block two RGBA endpoints of 7 bits, a P bit each, and 16 indices.
 
 Bits from the lowest: 0-6 the mode (only bit 6 set); the endpoints' upper 7 bits R0 R1 G0 G1 B0 B1 A0 A1 from
 bit 7 on; P0 at 63, P1 at 64; the indices from 65, 3 bits for texel 0 and 4 for the others, row-major. An
@@ -98,7 +98,7 @@ def decode_mode6(blocks: np.ndarray) -> np.ndarray:
 
 
 def decode_image(blocks: np.ndarray) -> np.ndarray:
-    """Decodes the blocks of an image, uint8 [H/4, W/4, 16], to RGBA, uint8 [H, W, 4]; errors as for `decode_mode6`."""
+    """Decodes the blocks of an image, uint8 [H/4, W/4, 16], to RGBA, uint8 [H, W, 4]; raises like `decode_mode6`."""
     if blocks.ndim != 3:
         raise ValueError(f"expected blocks [H/4, W/4, 16], got {blocks.shape}")
     return blocks_image(decode_mode6(blocks))
@@ -112,7 +112,7 @@ def blocks_image(texels: np.ndarray) -> np.ndarray:
 
 
 def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the two 64-bit words of blocks whose anchor index is below 8."""
+    """Packs blocks, in which texel 0 has an index below 8, into two 64-bit words each."""
     wide = endpoints.astype(np.uint64)
     low = np.bitwise_or.reduce((wide >> np.uint64(1)) << _ENDPOINT_SHIFTS, axis=(-2, -1))
     low |= np.uint64(_MODE_6) | ((wide[..., 0, 0] & np.uint64(1)) << np.uint64(63))

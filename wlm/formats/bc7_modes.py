@@ -98,8 +98,8 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
     thread.
 
     Args:
-        extra: Name of the optional extra for the error message.
-        profile: One of `ENCODERS`.
+        extra: Name of this package's optional extra with the compressor, for the error message.
+        profile: Quality of the compressor, one of `ENCODERS`.
 
     Returns:
         The blocks, uint8 [H/4, W/4, 16].
@@ -151,7 +151,7 @@ def decode_blocks(blocks: np.ndarray) -> np.ndarray:
 
 
 def _texels(bits: np.ndarray, mode: int) -> np.ndarray:
-    """Decodes blocks of one mode, given as bits [n, 128], to texels [n, 16, 4]."""
+    """Decodes n blocks of one mode, given as bits [n, 128], to RGBA texels, uint8 [n, 16, 4]."""
     is_of = dict(zip(FIELDS, MODES[mode].tolist(), strict=True))
     subsets, at = is_of["subsets"], mode + 1
 

@@ -1,7 +1,7 @@
 """Checkpoints of a fit: finished batches in their stored form, and the exact states of the running batches.
 
-A checkpoint is one file beside the output, an artifact of its own system: it is written atomically, and every byte is
-checked when it is read. It records the inputs of the fit and refuses to resume any other fit.
+A checkpoint is one file beside the output, in the format of `wlm.formats.artifact`: it is written atomically, and every
+byte is checked when it is read. It records the inputs of the fit and refuses to resume any other fit.
 """
 
 import json
@@ -40,11 +40,11 @@ class Pace:
         self._took = 0.0
 
     def due(self) -> bool:
-        """Whether a save is due."""
+        """Returns whether the time of the next save has come."""
         return time.monotonic() - self._last >= self._wait
 
     def affordable(self) -> bool:
-        """Whether a save before the next due time would stay within the time budget."""
+        """Returns whether an extra save now would stay within the time budget, a twentieth of the time."""
         return not self._every or time.monotonic() - self._last >= self._took * (1.0 / _SHARE - 1.0)
 
     @contextmanager
@@ -149,11 +149,11 @@ class Checkpoint:
         return WlmError(f"{self.path}: state of batch {number}: {error}")
 
     def due(self) -> bool:
-        """Whether a save of the running batches is due."""
+        """Returns whether the time of the next save of the running batches has come."""
         return self._pace.due()
 
     def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
-        """Writes the state of a running batch, which replaces an older one.
+        """Writes the state of a running batch in place of an older state of the batch.
 
         Raises:
             WlmError: The file cannot be written; the old content stays.
@@ -161,7 +161,7 @@ class Checkpoint:
         self.save({number: state})
 
     def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
-        """Writes the states of running batches by number, which replace older ones of these batches.
+        """Writes the states of running batches, by number, in place of older states of these batches.
 
         Raises:
             WlmError: The file cannot be written; the old content stays.
@@ -238,7 +238,7 @@ class Checkpoint:
 
 
 def _difference(stored: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """Names the first difference between two fits; empty if they are the same."""
+    """Returns text that names the first difference between the inputs of two fits; empty if there is none."""
     for key, value in expected.items():
         before = stored.get(key)
         if isinstance(value, dict) and isinstance(before, dict):

@@ -111,8 +111,8 @@ def write_dds(
             without blocks the texels, row by row.
         width: Width in texels, 1 to 16384.
         height: Height in texels, 1 to 16384.
-        depth: Slices, 1 to 2048.
-        fmt: A key of `DXGI_FORMATS`.
+        depth: Number of slices, 1 to 2048.
+        fmt: Texel format, a key of `DXGI_FORMATS`.
         volume: Whether the texture is a volume, which shaders sample as 3D; None: if `depth` is above 1.
         mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `blocks`.
         layers: Number of layers of an array of 2D textures, 1 to 2048, layer by layer in `blocks`; 0: no array.
@@ -172,7 +172,7 @@ def _slice_bytes(fmt: str, width: int, height: int) -> int:
 
 
 def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest level of a DDS file of light: float32 [H, W, 3 or 4], and the names of its channels.
+    """Reads the largest mip of a DDS texture of light; returns float32 [H, W, 3 or 4] and the channel names.
 
     Raises:
         WlmError: The file is missing, is not a DDS file, is cut short or damaged, has another format, is an array, a
@@ -212,7 +212,7 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
 
 
 def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:
-    """Returns the format that the DX10 header states."""
+    """Returns the texel format that the DX10 header states."""
     if len(data) < _DX10.size:
         raise WlmError(f"{path}: the file is cut short within its DX10 header")
     number, dimension, flags, layers, _ = _DX10.unpack(data)
@@ -231,7 +231,7 @@ def _of_dx10(path: str | os.PathLike[str], data: bytes) -> tuple[str, Layout]:
 
 
 def _of_code(path: str | os.PathLike[str], flags: int, code: bytes) -> tuple[str, Layout]:
-    """Returns the format of a file without the DX10 header."""
+    """Returns the texel format of a file without a DX10 header, from its FourCC code."""
     number = int.from_bytes(code, "little")
     if flags & _FOUR_CC and number in _LEGACY:
         return _LEGACY[number]

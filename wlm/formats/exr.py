@@ -51,7 +51,7 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
 
 
 def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
-    """Returns the pixels of some channels of a part, float32 [H, W] each.
+    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W] each.
 
     Raises:
         WlmError: A channel is neither half nor float, or has another shape than the first.
@@ -75,7 +75,7 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
     stays.
 
     Raises:
-        ValueError: The shape is not that of a picture.
+        ValueError: The pixels' shape is not [H, W, 3 or 4].
         WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
@@ -250,14 +250,14 @@ def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None
 
 
 class _Chatter:
-    """Messages that OpenEXR printed in a block, on one line."""
+    """Collects the messages that OpenEXR prints in a block, joined to one line in `text`."""
 
     text = ""
 
 
 @contextlib.contextmanager
 def _captured_chatter() -> Iterator[_Chatter]:
-    """Captures messages: those of OpenEXR's C library on the process's stderr, of its Python module on sys.stdout."""
+    """Captures what OpenEXR prints in the block: its C library to the stderr, its Python module to sys.stdout."""
     chatter, printed = _Chatter(), io.StringIO()
     lines: list[bytes] = []
     try:

@@ -112,7 +112,7 @@ class GltfPrimitive:
         triangle: int32 [F, 3].
         uv: float32 [V, 2] for each UV set n (`TEXCOORD_n`); u right, v down.
         row: int64 [V], the row of each vertex in the primitive's accessors.
-        label, mesh_label: Names of the node and of its mesh; "node 3" and "mesh 2" if they have none.
+        label, mesh_label: Names of the node and of its mesh; "node 3" or "mesh 2", by index, without a name.
         material: Index of the material, or None.
     """
 
@@ -179,13 +179,13 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a document of one mesh, see `document_from_meshes`; returns it with its one primitive."""
+    """Makes a glTF document of one mesh from arrays, see `document_from_meshes`; returns it with its primitive."""
     document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
     return document, primitive
 
 
 def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a document of several meshes, each with a node of its own.
+    """Makes a glTF document of several meshes, each with its own node.
 
     Args:
         meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
@@ -437,7 +437,7 @@ def _material(where: str, primitive: dict) -> int | None:
 
 
 def _count(document: GltfDocument, number: int) -> int:
-    """Returns the number of elements that an accessor states; 0 if it is invalid, which reading it reports."""
+    """Returns the number of elements that an accessor states; 0 if the number is invalid."""
     count = document.item("accessors", number).get("count")
     return count if isinstance(count, int) else 0
 
@@ -452,7 +452,7 @@ def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
 
 
 def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int) -> np.ndarray:
-    """Returns the vertex of every corner, int64 [N]."""
+    """Returns the vertex index of each corner of a primitive's triangles, int64 [N]."""
     if "indices" not in primitive:
         return np.arange(vertices)
     index = components(document, primitive["indices"], "SCALAR")[:, 0]
@@ -464,7 +464,7 @@ def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int)
 
 
 def _triangles(corner: np.ndarray, mode: int, where: str) -> np.ndarray:
-    """Makes triangles [F, 3] from corners [N] in the order of the specification (section on primitive topology)."""
+    """Converts the corners [N] of a triangle list, strip or fan (`mode`) to triangles [F, 3]."""
     if mode == TRIANGLES:
         if len(corner) % 3:
             raise WlmError(f"{where}: expected three corners per triangle, found {len(corner)} corners")

@@ -89,7 +89,7 @@ def encode_glb(
         document: The document.
         replacements: At most one for each primitive.
         uv_set: n of the new `TEXCOORD_n`, the same for all replacements.
-        path: Name of the file in messages; None: that of the document.
+        path: Name of the file in messages; None: the document's path.
 
     Returns:
         The bytes of the file, in pieces.
@@ -281,7 +281,7 @@ def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
 def _pack(
     path: str | os.PathLike[str], content: dict, payloads: Sequence[bytes | memoryview]
 ) -> list[bytes | memoryview]:
-    """Places the views one after another in one buffer and returns the pieces of the file."""
+    """Places the buffer views' data (`payloads`) one after another in one buffer; returns the `.glb` file's pieces."""
     pieces: list[bytes | memoryview] = []
     start = 0
     for view, data in zip(content["bufferViews"], payloads, strict=True):

@@ -188,7 +188,7 @@ def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader, int]:
-    """Returns the points [N, 3], the colours [9 N, 4], the reader, and the offset of the colours in its bytes."""
+    """Returns the probes' points [N, 3] and colours [9 N, 4], the reader, and the colours' byte offset in the file."""
     reader = _reader(path)
     names, _ = _open(reader)
     points = colours = None
@@ -229,7 +229,7 @@ def _reader(path: str | os.PathLike[str]) -> _Reader:
 
 
 def _open(reader: _Reader) -> tuple[list[str], list[str]]:
-    """Reads the header, seeks the main resource's properties, and returns the names and the external file names."""
+    """Reads the header up to the main resource's properties; returns the name table and the external file names."""
     path = reader.path
     big = reader.u32()
     if big > 1:
@@ -331,7 +331,7 @@ class _Reader:
             raise WlmError(f"{self.path}: {field}: expected {text} (type {kind}), found type {marker}")
 
     def user(self, names: list[str]) -> GodotUser:
-        """Reads the four values of an entry of `user_data`."""
+        """Reads one mesh that uses a lightmap: the four values of an entry of `user_data`."""
         self.expect(_USERS, _NODE_PATH, "a path")
         steps, below = struct.unpack(self.order + "HH", self.take(4))
         path = [self.name(names) for _ in range(steps)]
@@ -444,7 +444,7 @@ def lmbake_bytes(
         sh: [N, 9, 3], the numbers that the module's description defines.
         tetrahedra: int [T, 4], indices of points.
         planes: [M, 4], planes n x = d of a BSP tree.
-        children: int [M, 2], the child where n x > d and the other child: a node, or -1 - t for tetrahedron t.
+        children: int [M, 2], each node's child where n x > d, then the other: a node, or -1 - t for tetrahedron t.
     """
     low, high = points.min(0), points.max(0)
     node = np.zeros((len(planes), 6), "<u4")

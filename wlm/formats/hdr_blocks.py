@@ -1,4 +1,4 @@
-"""BC6H and ASTC coding by optional packages: half-float RGB in and out, 16 bytes per block, row by row.
+"""BC6H and ASTC coding by optional packages: between half-float RGB images and blocks of 16 bytes, row by row.
 
 All work runs on the CPU; the ASTC encoder uses threads. The packages are imported when they are used.
 """
@@ -54,7 +54,7 @@ class Astc:
         self._idle: list[Any] = []  # idle contexts; a context serves one thread at a time
 
     def encode(self, texels: np.ndarray) -> bytes:
-        """Encodes half [H, W, 3], finite and not negative; astcenc pads to whole blocks.
+        """Encodes half [H, W, 3], finite and at least 0, to blocks; astcenc pads to whole blocks.
 
         Each thread encodes some rows of blocks; the result does not depend on the number of threads.
         """
@@ -71,7 +71,7 @@ class Astc:
         return b"".join(each(strip, range(0, height, step)))
 
     def decode(self, blocks: bytes, height: int, width: int) -> np.ndarray:
-        """Decodes to half [H, W, 3]; invalid blocks become NaN."""
+        """Decodes blocks to half [H, W, 3]; invalid blocks become NaN."""
         codec = self._codec
         target = codec.ASTCImage(codec.ASTCType.F16, width, height, 1)
         with self._context() as context:
@@ -92,7 +92,7 @@ def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
     """Returns the ASTC codec of the HDR profile with the given settings; equal settings share one codec.
 
     Args:
-        block: One of `ASTC_BLOCKS`.
+        block: Width and height of a block in texels, one of `ASTC_BLOCKS`.
         quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
         extra: Name of the optional extra for the error message that the package is missing.
     """

@@ -92,7 +92,7 @@ def write_ktx2(
             blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
         width: Width in texels, 1 to 16384.
         height: Height in texels, 1 to 16384.
-        fmt: A key of `VK_FORMATS`.
+        fmt: Texel format, a key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
         mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `data`.
 
@@ -207,7 +207,7 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
 
 
 def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest level of a KTX2 file of light, plain or compressed by zstd or zlib.
+    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
 
     The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
 
@@ -272,7 +272,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
 def _part(
     path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
 ) -> bytes:
-    """Reads a part of the file, at most its first `most` bytes."""
+    """Reads `size` bytes of the file from `start` on, but at most `most`; `what` names this part in messages."""
     if start + size > held:
         raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
     file.seek(start)

@@ -37,8 +37,8 @@ def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int],
     """Reads a PNG as a mask, bool [H, W]: true where any colour channel is above 0.
 
     Args:
-        beside: The lightmap of the mask, for messages.
-        size: Expected rows and columns.
+        beside: Path of the lightmap to which the mask belongs, for messages.
+        size: Expected height and width in texels.
         others: Text after "expected a PNG" in the message of a missing file, for example "or alpha in the lightmap".
 
     Raises:

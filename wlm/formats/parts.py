@@ -54,7 +54,7 @@ def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) ->
 
 
 def check_part(tensors: Mapping[str, np.ndarray], name: str, part: Part) -> np.ndarray:
-    """Checks one tensor of a file like `check_parts`, for parts that determine the shapes of other parts."""
+    """Checks and returns one tensor of a file, before `check_parts` can check others whose shapes depend on it."""
     kinds = part.dtype if isinstance(part.dtype, tuple) else (part.dtype,)
     value = tensors.get(name)
     if value is None:

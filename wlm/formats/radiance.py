@@ -81,7 +81,7 @@ def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int
 
 
 def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, float, float]:
-    """Returns the factors of red, green and blue, and checks the header's other fields."""
+    """Returns the factors that EXPOSURE and COLORCORR applied to red, green and blue, and checks the other fields."""
     product = [1.0, 1.0, 1.0]
     for line in lines:
         name, equals, value = line.decode("latin-1").partition("=")

@@ -51,7 +51,7 @@ class VdbGrid:
 
 @dataclass(frozen=True)
 class _Entry:
-    """An entry in the list of grids: its offset, and the grid whose tree it shares."""
+    """An entry in the file's list of grids: its offset in bytes, and the name of a grid whose tree it shares."""
 
     name: str
     type: str
@@ -124,7 +124,7 @@ class VdbFile:
             cursor.at = end
 
     def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "_Cursor", int]:
-        """Returns the transform of a grid, a cursor before its tree, and its compression flags."""
+        """Returns a grid's transform, a cursor at the start of its tree, and its compression flags."""
         cursor = _Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
         if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
@@ -258,7 +258,7 @@ class _Tree:
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def _values(self, active: np.ndarray) -> np.ndarray:
-        """Reads the values of the voxels or children of a mask, float32 [count]."""
+        """Reads the values of a node's voxels or children, float32 [count]; `active` is the node's mask."""
         cursor = self._cursor
         (kind,) = cursor.unpack("<B")
         if kind > _ALL:

@@ -1,4 +1,4 @@
-"""Temporal lightmaps: block-compressed features and a small MLP for each tile (neural-dynamic-gi)."""
+"""Lightmaps that change over time: each tile is block-compressed feature maps and a small MLP (neural-dynamic-gi)."""
 
 from wlm._facade import facade
 

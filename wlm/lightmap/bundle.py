@@ -1,7 +1,8 @@
-"""The bundle of a lightmap model: textures of all tiles, the networks, and a table for each hour.
+"""Exports a lightmap model for shaders: textures of all tiles, the networks, and a table of numbers for each hour.
 
-Everything that only depends on the hour is in its table, so that the shader does not compute it in every texel: the
-positions on the time axis, the scale of each tile, and the bias of the first layer with the encoded time in it.
+The table of an hour holds all numbers that only depend on the hour, so that the shader does not compute them for every
+texel: the positions on the time axis, the scale of each tile, and the bias of its network's first layer, to which the
+contribution of the encoded time has been added.
 """
 
 from collections.abc import Sequence
@@ -68,7 +69,7 @@ _SHEETS = "Each part is a sheet: up to three channels of a layer of an atlas, in
 
 
 def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
-    """Makes the bundle of a model. A model of several sheets is a collection with a part for each.
+    """Makes the bundle of a model; if the model has several sheets, a collection with one bundle for each sheet.
 
     Args:
         model: The model.
@@ -93,12 +94,12 @@ def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device: str = "cpu") -> Bundle:
-    """Makes the bundle of a sheet.
+    """Makes the bundle of one sheet.
 
-    The textures `uv` and `uvt` (BC7) and `planes` (R8G8_UNORM) are F_uv, F_uvt and F_ut beside F_vt of all tiles
-    (neural-dynamic-gi, table 1); `frames` (BC7) is an array with a layer for each stored time; `valid` is 255 inside
-    charts. The blocks are the model's own bytes. `networks`, float32 [n, 4], and `hours`, float32 [T, hour_fours, 4],
-    are the buffers. The reference `frame` is the map at the first stored time.
+    The textures `uv` (BC7), `uvt` (BC7) and `planes` (R8G8_UNORM) hold the feature maps F_uv, F_uvt, and F_ut beside
+    F_vt, of all tiles (neural-dynamic-gi, table 1); `frames` (BC7) is an array with a layer for each stored time;
+    `valid` is 255 inside charts. BC7 blocks are copied from the model without re-encoding. `networks`, float32 [n, 4],
+    and `hours`, float32 [T, hour_fours, 4], are the buffers. The reference `frame` is the map at the first stored time.
 
     Args:
         sheet: The sheet.
@@ -131,19 +132,20 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 
 
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
-    """Computes the shader's tables of some hours.
+    """Computes the tables that the shader reads, one for each given hour.
 
-    The text `hours` of `_ABOUT` describes a table; the fourth number of the first four is the columns of the grid.
+    `_ABOUT["hours"]` above describes the content of a table. The fourth number is the number of tile columns of the
+    grid.
 
     Args:
         model: The sheet.
-        times: Stored times, or any times if the model's networks interpolate.
+        times: Stored times; if the networks can evaluate times between them, any times.
 
     Returns:
         float32 [times, 2 + tiles record_fours, 4].
 
     Raises:
-        ValueError: A time is between two stored ones of a model whose radiance is mixed: it needs two tables.
+        ValueError: A time lies between two stored times, and the model blends their radiance, which needs two tables.
     """
     axis, profile, size = model.axis, model.profile, record_fours(model)
     tables = np.zeros((len(times), HEAD + model.kind.size * size, 4), np.float32)
@@ -163,7 +165,7 @@ def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
 
 
 def _document(model: SheetModel, textures: dict[str, Texture], source: str) -> dict[str, Any]:
-    """Describes textures, buffers and tiles."""
+    """Returns the description of the textures, buffers and tiles as JSON values."""
     profile, axis = model.profile, model.axis
     sides = {
         "uvt": (profile.uvt_resolution, profile.uvt_resolution),
@@ -202,7 +204,7 @@ def _document(model: SheetModel, textures: dict[str, Texture], source: str) -> d
 
 
 def _between(tau: float, count: int, repeats: bool) -> tuple[int, int, float]:
-    """Returns the texels of an axis that a linear filter reads at tau, and the share of the second."""
+    """Returns the two texels of an axis that a linear filter reads at `tau` in [0, 1], and the second one's weight."""
     position = tau * count - 0.5
     low = int(np.floor(position))
     pair = [i % count if repeats else min(max(i, 0), count - 1) for i in (low, low + 1)]

@@ -1,8 +1,8 @@
-"""A lightmap model as the parts of its file, and back.
+"""Converts a lightmap model to the named parts of its file, and back.
 
-Parts of sheet k are called `k.NAME`. Times are stored once, the mask of an atlas with its first sheet. The maps and the
-network of a tile, or its frames, are one zstd frame in the part `k.tiles`; `k.tile_sizes` has their sizes, so that each
-tile can be read alone.
+Parts of sheet k are called `k.NAME`. Times are stored once, and the mask of an atlas with the first sheet of that
+atlas. Each tile (its maps and network, or its BC7 frames) is one zstd frame in the part `k.tiles`; `k.tile_sizes` has
+the size of each zstd frame, so that a tile can be read alone.
 """
 
 import math
@@ -51,7 +51,7 @@ class _SheetHeader(Header):
 
 
 class _Header(Header):
-    """The settings of a file."""
+    """Settings of a file that all sheets share."""
 
     name: Name
     period: float | None = Field(gt=0)
@@ -60,10 +60,10 @@ class _Header(Header):
 
 
 def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Lays a model out for its file.
+    """Converts a model to the content of its file.
 
     Returns:
-        The settings, the parts and the hash of its source.
+        The settings, the parts by name, and the hash of the input that the model was made from.
     """
     headers, parts, atlases = [], {"times": _shortened(model.times)}, set()
     for number, (sheet, own) in enumerate(model.sheets.items()):
@@ -88,7 +88,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
 
 
 def decode(artifact: Artifact) -> LightmapModel:
-    """Makes a model of the parts of its file.
+    """Makes a model from the parts of its file.
 
     Raises:
         WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
@@ -146,12 +146,12 @@ def decode(artifact: Artifact) -> LightmapModel:
 
 
 def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
-    """Returns the bytes of a model's file by part, over all sheets, the largest first.
+    """Returns the size in bytes of each part of a model's file, summed over all sheets, largest part first.
 
-    `tiles` are the packed tiles; `header` is the rest: the header and the sizes of the tiles.
+    `tiles` is the size of the packed tiles; `header` is that of the file's header and of the table of tile sizes.
 
     Raises:
-        ValueError: `file_bytes` is less than the parts take.
+        ValueError: `file_bytes` is less than the sum of the parts.
     """
     parts: dict[str, int] = {}
     for name, value in encode(model)[1].items():
@@ -165,7 +165,7 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
 
 
 def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
-    """Returns the bytes of the parts of each sheet in the file; a mask counts for the first sheet of its atlas."""
+    """Returns the size in bytes of each sheet in the file; a mask counts for the first sheet of its atlas."""
     sizes = [0] * len(model.sheets)
     for name, value in encode(model)[1].items():
         number, _, own = name.partition(".")
@@ -175,7 +175,7 @@ def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
 
 
 def tile_sizes(sheet: SheetModel) -> np.ndarray:
-    """Returns the bytes of the zstd frame of each tile of the grid, int [tiles]; 0 for tiles without one."""
+    """Returns the size in bytes of each tile's zstd frame, int [tiles]; 0 for tiles without one."""
     sizes = np.zeros(len(sheet.kind), int)
     sizes[_packed_tiles(sheet)] = _pack_tiles(sheet).get("tile_sizes", ())
     return sizes
@@ -189,7 +189,7 @@ def _packed_tiles(sheet: SheetModel) -> list[int]:
 
 
 def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
-    """Packs each tile as one zstd frame: `tiles`, uint8, and `tile_sizes`, uint32 [n]."""
+    """Packs each tile as one zstd frame. Returns the parts `tiles`, uint8, and `tile_sizes`, uint32 [n]."""
 
     def pack(number: int) -> bytes:
         return zstd.compress(*encoding_of(sheet.kind[number]).pack(sheet, number))
@@ -202,7 +202,7 @@ def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
 
 
 def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
-    """Reads the tiles into the arrays of a sheet."""
+    """Unpacks the zstd frames of all tiles into the arrays of a sheet."""
     numbers = _packed_tiles(sheet)
     for number in set(np.flatnonzero(sheet.kind).tolist()).difference(numbers):
         encoding_of(sheet.kind[number]).unpack(sheet, number, np.empty(0, np.uint8))
@@ -231,7 +231,7 @@ def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
 
 @contextmanager
 def _named(number: int) -> Iterator[None]:
-    """Adds the number of the sheet to errors about its parts."""
+    """Context that adds the number of the sheet to the message of an error raised inside."""
     try:
         yield
     except (WlmError, ValueError) as error:
@@ -239,7 +239,7 @@ def _named(number: int) -> Iterator[None]:
 
 
 def _by_sheet(tensors: Mapping[str, np.ndarray], count: int) -> list[dict[str, np.ndarray]]:
-    """Returns the parts of each sheet by their names without its number; `times` is none of them."""
+    """Returns the parts of each sheet, by name without the sheet's number; the shared part `times` is left out."""
     parts: list[dict[str, np.ndarray]] = [{} for _ in range(count)]
     for name, value in tensors.items():
         number, _, own = name.partition(".")
@@ -251,14 +251,14 @@ def _by_sheet(tensors: Mapping[str, np.ndarray], count: int) -> list[dict[str, n
 
 
 def _shortened(times: np.ndarray) -> np.ndarray:
-    """Returns times as float32 if that keeps them distinct and within `_ROUNDING` of their value."""
+    """Returns the times as float32 if they stay distinct and change by at most `_ROUNDING`, else unchanged."""
     short = times.astype(np.float32)
     distinct = len(times) < 2 or np.all(np.diff(short) > 0)
     return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
 
 
 def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndarray:
-    """Returns the mask, bool [H, W]; without a part all texels are valid."""
+    """Reads the mask from the parts, bool [H, W]; if the file has no mask, all texels are valid."""
     if "mask" not in tensors:
         return np.ones((height, width), bool)
     bits = zstd.decompress(check_part(tensors, "mask", _BYTES).tobytes(), -(-height * width // 8), "part mask")

@@ -1,19 +1,22 @@
-"""Lightmap sets over time, read from files or arrays and checked.
+"""Reads sets of lightmaps over time from files or arrays, checks them and repairs them.
 
-The rules of input; a repair counts texels and becomes a line of `LightmapSet.warnings`:
+The rules for input. Each repair adds a line with the number of texels to `LightmapSet.warnings`:
 
 - Inside the mask a NaN or infinite texel takes the value of the nearest finite texel at that time, negative channels
-  are clamped to 0, and values above 65,504, the maximum of half floats, to that. Outside it the same happens silently.
-- A time without a finite texel inside, an empty mask, two equal times, a NaN or infinite time, a time outside [0,
-  period) and more than 100,000 times are errors. Times out of order are sorted.
-- A texel whose alpha is NaN or infinite is outside a mask from alpha. Texels that only some frames have are fitted at
-  the other times to the frame nearest in time that has them, and are only scored at their own times.
-- Frames whose light or alpha ends at the borders of other charts may be of different atlases, which is a warning.
-- A set that is not trusted names only files in its folder, and no frames beyond 1 GiB that small files claim. Larger
-  frames are kept in an unnamed file in the folder for temporary files (TMPDIR).
-- Frames, mask and `set.json` have one size. Content that is no light is refused with a line that says what was found.
-- Values beyond the range of a linear layer are clamped to it. A PNG of such a layer runs from the least to the greatest
-  value. A state without a layer or channel that another state has, and more than 12 channels of an atlas, are errors.
+  are clamped to 0, and values above 65,504, the maximum of half floats, to 65,504. Outside the mask the same repairs
+  are made without a warning.
+- A time without a finite texel inside the mask, an empty mask, two equal times, a NaN or infinite time, a time outside
+  [0, period) and more than 100,000 times are errors. Times out of order are sorted.
+- If the mask comes from alpha, texels with NaN or infinite alpha are outside. A texel that is valid in only some frames
+  is fitted at the other times to the nearest frame in which it is valid, and is only scored in frames where it is
+  valid.
+- Frames whose chart borders differ may belong to different atlases, which gives a warning (`wlm.lightmap.layout`).
+- Unless it is trusted, a set may only name files in its own folder, and a small file may not claim frames beyond 1 GiB.
+  Frames of more than 1 GiB are kept in an unnamed file in the folder for temporary files (TMPDIR).
+- Frames, mask and `set.json` must agree in size. A file that does not hold light is an error that says what it holds.
+- Layers that are not light (directions, masks) have a fixed range; values outside it are clamped. A PNG of such a layer
+  maps black to the range's lower end and white to its upper end. All states must have the same layers and channels, at
+  most 12 channels in an atlas.
 
 Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
 """
@@ -48,19 +51,21 @@ _ALL, _FROM_ALPHA = "all", "alpha"
 
 @dataclass(frozen=True, eq=False)
 class SheetFrames:
-    """The lightmaps of one sheet at several times, checked and repaired as the module's table says.
+    """The lightmaps of one sheet at several times, checked and repaired by the module's rules.
 
     Attributes:
         name: Name of the set, and of the sheet if it is not the ordinary lightmap.
         times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; levels in [0, 1] of a linear
-            sheet. Row 0 is v = 0. More than 1 GiB are mapped from a file, see `wlm.formats.scratch`.
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; if the sheet is linear, normalised
+            values in [0, 1]. Row 0 is v = 0. Arrays of more than 1 GiB are mapped from a file, see
+            `wlm.formats.scratch`.
         mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
         period: Length of the day in the unit of `times`, all of which are then in [0, period); None if the set is not
-            periodic and times outside its ends are clamped.
+            periodic: times before the first or after the last are then clamped.
         source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
         warnings: Repairs, one line each.
-        mesh: The mesh that the lightmaps belong to, as the set names it; the file may be missing. None without a name.
+        mesh: Path of the mesh that the lightmaps belong to, as the set names it; the file may be missing. None if the
+            set names no mesh.
         covered: `[T, H, W]` bool, the valid texels that each frame has; None if every frame has all of them. A texel
             that a frame lacks holds the light of the frame nearest in time that has it.
     """
@@ -94,7 +99,7 @@ class LightmapSet:
 
     @property
     def light(self) -> SheetFrames:
-        """The first sheet of radiance, or the first sheet: all of an ordinary set."""
+        """The first sheet of radiance; without one, the first sheet. An ordinary set has only this sheet."""
         return self.sheets[first_light(self.sheets)]
 
     def find(self, sheet: Sheet) -> SheetFrames:
@@ -110,7 +115,7 @@ class LightmapSet:
 
     @property
     def times(self) -> np.ndarray:
-        """float64 [T], increasing."""
+        """The times of all lightmaps, float64 [T], increasing."""
         return self.light.times
 
     @property
@@ -137,10 +142,10 @@ class Layer:
     """A layer of an atlas in memory.
 
     Attributes:
-        frames: `[T, H, W, C]` of numbers.
+        frames: The pixels at each time, numeric `[T, H, W, C]`.
         name, atlas: Names of the layer and of the atlas.
         encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
-        channels: C names; None names them R, G, B, A, or by numbers if there are more than four.
+        channels: Names of the C channels; None: R, G, B, A, or numbers if there are more than four.
     """
 
     frames: np.ndarray
@@ -163,7 +168,7 @@ def load(
 
     A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
 
-    The keys of a `set.json` are described in docs/formats.md. Names of files are relative to it.
+    The keys of a `set.json` are described in docs/formats.md. File names in it are relative to its folder.
 
     The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are read in natural order of their names
     ("2" before "10"). Without `times`, the hours are read from the names if every name ends like `_18_55h`, `_18.55h`,
@@ -184,10 +189,10 @@ def load(
         layers: Names of the layers to read; None reads all.
 
     Returns:
-        The set, repaired as the module's table says.
+        The set, repaired by the module's rules.
 
     Raises:
-        WlmError: One line that names the file and the field, for each error of the module's table.
+        WlmError: The set breaks one of the module's rules; the line names the file and the field.
     """
     listing = list_set(Path(path), times, layers, trust)
     stamps = np.asarray(listing.times, np.float64)
@@ -235,10 +240,10 @@ def from_arrays(
         name: Name of the set, also in messages.
 
     Returns:
-        The set, repaired as the module's table says; a frame is called "frame 3 (time 5)" in its warnings.
+        The set, repaired by the module's rules; a frame is called "frame 3 (time 5)" in its warnings.
 
     Raises:
-        WlmError: A shape is wrong, or an error of the module's table.
+        WlmError: A shape is wrong, or the set breaks one of the module's rules.
     """
     frames = np.asarray(frames)
     if frames.ndim != 4 or frames.shape[3] != 3:
@@ -256,13 +261,14 @@ def from_layers(
     """Makes a checked set of several layers from arrays, under the same rules as `load`.
 
     Args:
-        layers: In the order in which they are stored; all layers of an atlas have its height and width.
+        layers: The layers in the order in which they are stored; those of one atlas have the same height and width.
         times: `[T]`, in any order.
-        masks: By atlas `[H, W]`, true where a texel is valid, or `[T, H, W]`; an atlas without a mask has no gaps.
+        masks: By name of the atlas, bool `[H, W]`, true where a texel is valid, or `[T, H, W]`; without one all are
+            valid.
         period, name: As for `from_arrays`.
 
     Raises:
-        WlmError: A shape is wrong, or an error of the module's table.
+        WlmError: A shape is wrong, or the set breaks one of the module's rules.
     """
     stamps = np.asarray(times, np.float64)
     sizes: dict[Sheet, tuple[int, int]] = {}
@@ -346,7 +352,7 @@ def parse_times(text: str) -> list[float]:
 
 
 def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
-    """Applies the module's table to the times [T] of the states with these labels.
+    """Checks the times [T] by the module's rules; `labels` names the lightmap of each time in messages.
 
     Raises:
         WlmError: A time or the period is wrong, or two times are equal.
@@ -366,7 +372,7 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """The pictures of a layer of an atlas."""
+    """One layer of one atlas at all times."""
 
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None
@@ -374,7 +380,7 @@ class _Stack:
 
 
 class _Reader:
-    """Reads the layers of a listing one after another."""
+    """Reads the pictures that a `Listing` names, one layer of one atlas at a time."""
 
     def __init__(self, listing: Listing, order: np.ndarray, trust: bool) -> None:
         self._listing, self._place, self._trust = listing, np.argsort(order), trust
@@ -453,7 +459,7 @@ class _Reader:
 
 
 def _read(source: Source, layer: LayerInfo) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture: values [H, W, C] and the names of the channels."""
+    """Reads a picture. Returns its values [H, W, C] and the names of its channels."""
     if layer.encoding == LIGHT.encoding and layer.channels is None:
         pixels, names = read_light(source.path)
     else:
@@ -485,7 +491,7 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """The states of a set, in the order given, and the words that messages need."""
+    """Times and labels of a set's lightmaps, in the order given, and the words that messages about them need."""
 
     labels: Sequence[str]
     times: np.ndarray
@@ -496,7 +502,7 @@ class _States:
 
     @property
     def order(self) -> np.ndarray:
-        """int [T], the order of the times."""
+        """Indices that sort the times, int [T]."""
         return np.argsort(self.times, kind="stable")
 
     def checked(
@@ -508,7 +514,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Applies the module's table to the frames of a sheet."""
+        """Sorts, checks and repairs the frames of a sheet by the module's rules."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")
@@ -551,7 +557,7 @@ class _States:
 
 
 def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.ndarray) -> Iterator[str]:
-    """Clamps levels to [0, 1] in place; infinite ones become NaN, which are repaired later. Yields warnings."""
+    """Clamps normalised values to [0, 1] in place and yields warnings. Infinite values become NaN, repaired later."""
     least, greatest = VALUE_RANGES[sheet.encoding]
     for i, frame in enumerate(frames):
         inside = mask[i] if mask.ndim == 3 else mask
@@ -565,7 +571,7 @@ def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.nda
 
 
 def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, period: float | None) -> None:
-    """Gives texels that a frame lacks the light of the frame nearest in time that has them, in place."""
+    """Fills texels that a frame lacks, in place, from the frame nearest in time in which they are valid."""
     mask = covered.any(0)
     for i, time in enumerate(times):
         apart = np.abs(times - time)
@@ -592,5 +598,5 @@ def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
 
 
 def _size(shape: Sequence[int]) -> str:
-    """Writes [H, W, ...] with the width first."""
+    """Returns the size of a [H, W, ...] array in pixels as text, width first, such as "512x256"."""
     return f"{shape[1]}x{shape[0]}"

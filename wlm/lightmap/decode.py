@@ -1,4 +1,4 @@
-"""Decoding on the host's side: any tile at any time, or a whole map, from the stored bytes alone."""
+"""Decodes lightmaps to arrays on the host: a tile or a whole map at any time, from the stored bytes alone."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ _PIECE = 1024  # tiles that are decoded at once: 192 MiB
 
 
 def gelu_of(model: SheetModel, gelu: str | None) -> str:
-    """Returns the form of the GELU to decode with: `gelu`, or the model's for None."""
+    """Returns the GELU variant to decode with: `gelu` after a check, or the model's own if `gelu` is None."""
     gelu = gelu or model.profile.gelu
     if gelu not in GELUS:
         raise WlmError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
@@ -26,16 +26,16 @@ def gelu_of(model: SheetModel, gelu: str | None) -> str:
 
 
 class SheetDecoder:
-    """Holds the stored bytes of a sheet on a device and decodes from them.
+    """Uploads the stored bytes of a sheet to a device and decodes tiles and maps there.
 
-    Between two stored times the light is the mix of their radiance (eq. 2), or the network's output for interpolated
-    features, see `Profile.interpolation`; frames are always mixed. Times outside the day wrap, or are clamped to the
-    first and last time if the set is not periodic. Texels of the gaps within two texels of a chart have the light of
-    the nearest valid texel, so that a map can be filtered.
+    Between two stored times the radiance of both is interpolated (eq. 2), or the network evaluates interpolated
+    features, see `Profile.interpolation`; for tiles stored as frames it is always the radiance. Times outside the day
+    wrap, or are clamped to the first and last time if the set is not periodic. Texels outside charts, within two texels
+    of one, get the light of the nearest valid texel, so that a map can be filtered.
 
     Attributes:
         model: The sheet.
-        device: Where it is, as `wlm.interop.check_device` returns it.
+        device: The device, as `wlm.interop.check_device` returns it.
     """
 
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None) -> None:
@@ -44,7 +44,7 @@ class SheetDecoder:
         Args:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
-            gelu: Another form of the GELU than the model was trained with, for speed; None: the model's.
+            gelu: GELU variant to use instead of the one that the model was trained with, for speed; None: the model's.
         """
         self.model, self.device = model, interop.check_device(device)
         gelu, self._grid = gelu_of(model, gelu), model.grid
@@ -59,13 +59,13 @@ class SheetDecoder:
         return sum(tiles.device_bytes for tiles in self._tiles)
 
     def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
-        """Decodes one tile with gaps filled.
+        """Decodes one tile and fills the gaps between charts.
 
         Args:
             number: Number of the tile in the grid, row-major.
             time: In the unit of the set's times.
             border: Texels added on each side from the neighbouring tiles, so that a texture of tiles can be filtered;
-                past the map's ends its last texels are mirrored (section 9).
+                past the edges of the map, its outer texels are mirrored (section 9).
 
         Returns:
             Linear radiance, float32 [128 + 2 border, 128 + 2 border, 3].
@@ -107,7 +107,7 @@ class SheetDecoder:
         return out
 
     def tiles_8bit(self, numbers: Sequence[int], time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes tiles to the 8 bits that a texture cache holds; gaps are not filled.
+        """Decodes tiles to 8-bit RGBA for a texture cache; gaps between charts are not filled.
 
         Returns:
             uint8 [n, 128, 128, 4] and the bound b of each tile, float32 [n]: radiance = (byte / 255 * b) ** gamma.
@@ -122,8 +122,7 @@ class SheetDecoder:
         return out, bounds
 
     def frame(self, time: float) -> np.ndarray:
-        """Decodes the whole map to linear radiance, or levels of a linear sheet: float32 [H, W, 3]; empty tiles are
-        0."""
+        """Decodes the map, float32 [H, W, 3]: radiance, or a linear sheet's normalised values; 0 in empty tiles."""
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._stored():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
@@ -131,14 +130,13 @@ class SheetDecoder:
         return image
 
     def _stored(self) -> list[np.ndarray]:
-        """Returns the numbers of the tiles that are not empty, in pieces, so that a large map is not in memory
-        twice."""
+        """Returns the numbers of the non-empty tiles in groups: decoding by groups limits the memory that it takes."""
         stored = np.flatnonzero(self.model.kind)
         return np.split(stored, range(_PIECE, len(stored), _PIECE))
 
 
 class Decoder:
-    """Decodes a model.
+    """Decodes all layers and atlases of a model.
 
     Attributes:
         model: The model.
@@ -159,12 +157,12 @@ class Decoder:
 
     @property
     def light(self) -> SheetDecoder:
-        """The decoder of the first sheet of radiance, or of the first sheet."""
+        """The decoder of the first sheet of radiance; without one, of the first sheet."""
         return self.sheets[first_light(self.sheets)]
 
     @property
     def device(self) -> str:
-        """The device of the maps."""
+        """The device that decodes."""
         return self.light.device
 
     @property
@@ -173,21 +171,21 @@ class Decoder:
         return sum(decoder.device_bytes for decoder in self.sheets.values())
 
     def frame(self, time: float, layer: str | None = None, atlas: str | None = None) -> np.ndarray:
-        """Decodes a layer of an atlas.
+        """Decodes one layer of one atlas at one time.
 
         Args:
             time: In the unit of the set's times, stored or between.
-            layer, atlas: Names; None: the first layer of radiance, or the first layer, of the first atlas that has it.
+            layer, atlas: Names. None: the first layer of radiance (without one, the first layer); its first atlas.
 
         Returns:
-            The channels, float32 [H, W, C]: linear radiance, or values. Tiles without a valid texel have the level 0.
+            The channels, float32 [H, W, C]: linear radiance, or the layer's values; empty tiles have its lowest value.
         """
         sheets = self.model.layer(layer, atlas)
         frames = [sheet.to_values(self.sheets[sheet].frame(time)) for sheet in sheets]
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 
     def frames(self, time: float) -> dict[str, dict[str, np.ndarray]]:
-        """Decodes everything: by atlas and layer the channels, float32 [H, W, C]."""
+        """Decodes all layers at one time. Returns the channels, float32 [H, W, C], by names of atlas and layer."""
         result: dict[str, dict[str, np.ndarray]] = {}
         for atlas, layer in dict.fromkeys((sheet.atlas, sheet.layer) for sheet in self.sheets):
             result.setdefault(atlas, {})[layer] = self.frame(time, layer, atlas)

@@ -1,4 +1,4 @@
-"""Distributing batches of tiles to workers. Batches may finish in any order; the result is the same."""
+"""Distributes batches of tiles to worker processes. The result does not depend on the order in which they finish."""
 
 import math
 import time
@@ -34,7 +34,7 @@ class Batch:
     Attributes:
         number: Number of the batch, from 0.
         kind: STATIC or DYNAMIC.
-        rows: int [n], positions of the tiles among the tiles of the sheet's fit.
+        rows: int [n], indices of the tiles in `SheetFit.index`.
         first: Number of tiles of that kind in earlier batches of the sheet.
         fit: The `wlm.lightmap.fit.SheetFit` of the sheet.
     """
@@ -57,9 +57,9 @@ class _Running:
 
 
 def worker_devices(device: str, workers: int | None, cluster: str | None, samples: int = 0) -> list[str]:
-    """Chooses the device of each worker; arguments as for `wlm.lightmap.compress`.
+    """Returns the device of each worker; the first three arguments are those of `wlm.lightmap.compress`.
 
-    A short fit, judged by the samples that it takes, gets fewer processes.
+    A short fit gets fewer workers; `samples` is the number of training samples of the whole fit.
 
     Raises:
         WlmError: There is no such device, or the number of workers is below 1.
@@ -83,7 +83,7 @@ def start_workers(
     """Starts a `Fitter` for each device, or on the machines of a cluster at most one for each batch.
 
     Raises:
-        WlmError: The cluster is not there, or the system has no room for the processes.
+        WlmError: The cluster cannot be reached, or the system cannot start that many processes.
     """
     if cluster is not None:
         share = {"CPU": float(CPU_LANES)} if devices[0] == "cpu" else {"GPU": 1.0}
@@ -105,8 +105,9 @@ class Dispatch:
         meter: Meter,
         checkpoint: Checkpoint | None,
     ) -> None:
-        """Takes the workers, the batches of `steps` steps each, the number of batches that were done before, the meter
-        of all steps, and the checkpoint that keeps states and results, or None."""
+        """Takes the workers, the batches of `steps` steps each, the number of batches finished in an earlier run
+        (`done`), the progress meter, and the checkpoint that stores states and results; None: no checkpoint.
+        """
         self._workers, self._steps, self._done = workers, steps, done
         self._meter, self._checkpoint = meter, checkpoint
         self._waiting = deque(batches)
@@ -122,7 +123,7 @@ class Dispatch:
         """Fits the batches.
 
         Yields:
-            Each batch with its parts as it gets done.
+            Each finished batch with its trained maps and networks.
 
         Raises:
             WlmError: A fit diverged, a saved state is wrong, or the workers of a batch died again and again.
@@ -159,7 +160,7 @@ class Dispatch:
         self._workers.call(number, "start", run.batch.fit.job(run.batch), state)
 
     def _restart(self, number: int, why: Lost) -> None:
-        """Begins the batch of a lost worker again from its last saved state."""
+        """Starts the batch of a worker that died again, from the batch's last saved state."""
         self._dead.add(number)
         run = self._running.pop(number, None)
         if run is None or self._stop is not None:
@@ -170,7 +171,7 @@ class Dispatch:
         self._begin(number, run)
 
     def _take(self, number: int, answer: Any) -> tuple[Batch, Parts] | None:
-        """Takes the answer of a worker and lets it go on; returns a batch that is done."""
+        """Handles the answer of a worker and gives it more work. Returns its batch with the result if that is done."""
         run = self._running[number]
         if isinstance(answer, BaseException):
             # A wrong state is the checkpoint's fault.
@@ -207,7 +208,7 @@ class Dispatch:
             self._checkpoint.add_finished(batch.number, parts)
 
     def _report(self, moved: bool) -> None:
-        """Reports progress, and begins a save if one is due or the work is to stop."""
+        """Reports progress, and starts saving a checkpoint if one is due or the user has interrupted the fit."""
         if self._stop is not None:
             return
         done = self._done * self._steps + sum(run.step or 0 for run in self._running.values())
@@ -227,7 +228,7 @@ class Dispatch:
                 run.saving = True
 
     def _save(self) -> None:
-        """Ends a save once all states have arrived, and then the work if it is to stop."""
+        """Writes the checkpoint once all workers have sent their states; then stops the fit if it was interrupted."""
         late = time.monotonic() > self._patience
         if self._states is not None and (late or not any(run.saving for run in self._running.values())):
             self._checkpoint.save(self._states)

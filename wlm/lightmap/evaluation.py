@@ -1,8 +1,8 @@
-"""Scoring a compressed lightmap set against its input: by the paper's protocol (neural-dynamic-gi, section 10.2), and
-where it is shown (`wlm.lightmap.view_scores`).
+"""Scores a compressed lightmap set against its input: by the paper's protocol (neural-dynamic-gi, section 10.2), and by
+the light that a renderer would show (`wlm.lightmap.view_scores`).
 
-Errors of light are relative to the range of each tile at each time. Directions, ratios and masks have a range of their
-own, [0, 1] or [-1, 1], to which their errors are relative in all tiles alike. FLIP and views only apply to light.
+Errors of light are relative to the range of values of each tile at each time. Errors of directions, ratios and masks
+are relative to the fixed range of their layer, [0, 1] or [-1, 1]. FLIP and views are only computed for light.
 """
 
 import time
@@ -38,29 +38,29 @@ _TIME_TOLERANCE = 1e-6  # stored times are float32 if that keeps them distinct, 
 
 @dataclass(frozen=True)
 class SheetReport(ShownScore):
-    """Error and size of a sheet. A mean over nothing, and a metric that was not computed, is NaN.
+    """Error and size of a sheet. Means without any value and metrics that were not computed are NaN.
 
     The scores of `ShownScore` and `ViewScore` are attributes too.
 
     Attributes:
-        psnr, ssim, flip: Means over every scored tile at every time; decibels (120 for an exact tile), in [-1, 1], in
-            [0, 1].
-        psnr_unlimited: The mean of PSNR without the tiles of `format_limited`.
-        bytes: Bytes of its parts in the file; a mask counts for the first sheet of its atlas.
-        bpp: Bits per texel and time of these bytes, see `bits_per_texel`.
+        psnr, ssim, flip: Means over all scored tiles and times. PSNR is in dB, 120 for an exact tile; SSIM is in [-1,
+            1] and FLIP in [0, 1].
+        psnr_unlimited: Mean PSNR in dB over the tiles and times that are not in `format_limited`.
+        bytes: Bytes of the sheet in the file; a mask counts for the first sheet of its atlas.
+        bpp: `bytes` as bits per texel and time, see `bits_per_texel`.
         memory_bpp: Bits per texel and time in the memory of a GPU, see `SheetModel.memory_bytes`.
         tiles: Number of tiles that are not empty.
         psnr_by_tile, ssim_by_tile, flip_by_tile: float64 [rows, columns] of the grid, means over the times.
         psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
         worst_psnr: Lowest PSNR of any tile at any time.
-        worst_tile: Its place: `time`, `tile` (its number), `row`, `column`; None without a score.
+        worst_tile: Tile and time of `worst_psnr`: `time`, `tile` (its number), `row`, `column`; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the units of the input.
-        scored: Tiles times times that count in the means.
-        not_scored: The others, by reason: `empty` (no valid texel), `not_held` (valid texels, but not in the file),
-            `few_texels`, `zero_range` (see `wlm.metrics`).
-        format_limited: `time`, `tile` of the scored ones that only span a few steps of half float.
-        kinds: Number of tiles of the grid by kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
-        warnings: Tiles that were not scored, or light that was lost and that the means hide.
+        scored: Number of pairs of a tile and a time that count in the means.
+        not_scored: Number of the other pairs by reason: `empty` (no valid texel), `not_held` (valid texels, but not in
+            the file), `few_texels`, `zero_range` (see `wlm.metrics`).
+        format_limited: `time` and `tile` of the scored pairs whose values only span a few steps of half float.
+        kinds: Number of tiles of each kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
+        warnings: Lines about tiles that were not scored, and about lost light that the means do not show.
     """
 
     psnr: float
@@ -92,19 +92,19 @@ class Report(system.Report):
     """Error and size of a compressed set.
 
     Attributes:
-        psnr, ssim, flip, seen, ring, between, border, flicker: Means over the sheets, weighted by their channels; those
-            of the sheet for an ordinary set. NaN if no sheet has the score.
+        psnr, ssim, flip, seen, ring, between, border, flicker: Means of the scores of the sheets, weighted by their
+            numbers of channels; see `SheetReport` and `ShownScore`. NaN if no sheet has the score.
         bytes: Size of the file on disk.
-        bpp: Bits per texel of the atlases and time of the file, all layers together.
-        memory_bpp: The same in the memory of a GPU.
+        bpp: Bits in the file per texel and time, all layers together.
+        memory_bpp: Bits in the memory of a GPU per texel and time, all layers together.
         parts: Bytes of the file by part, see `wlm.lightmap.codec.part_bytes`.
         times: float64 [T], the stored times.
-        device: Device that decoded.
+        device: Device on which the model was decoded.
         seconds: Wall-clock time to decode and score everything; scoring takes most of it.
         profile: Name of the settings.
         sheets: The report of each sheet.
-        psnr_by_layer: For each layer the mean over the tiles of its sheets, each channel with the same weight, dB.
-        warnings: Warnings of the sheets, and about another input than the file's.
+        psnr_by_layer: For each layer, the mean PSNR in dB over the tiles of its sheets; channels have equal weights.
+        warnings: Warnings of all sheets, and one if the file was made from another input.
     """
 
     psnr: float
@@ -129,7 +129,7 @@ class Report(system.Report):
 
     @property
     def light(self) -> SheetReport:
-        """The report of the first sheet of radiance, or of the first sheet."""
+        """The report of the first sheet of radiance; without one, of the first sheet."""
         return self.sheets[first_light(self.sheets)]
 
     def to_json(self) -> dict[str, Any]:
@@ -150,16 +150,17 @@ def evaluate(
 ) -> Report:
     """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
 
-    Only tiles that the model holds are scored: if it was made of some tiles, the texels of the others are masked out.
+    Only tiles that the model holds are scored; if it was made from a selection of tiles, all other tiles are masked
+    out.
 
     Args:
         model: The model.
         lightmaps: The input. Another set with the same sheets, sizes and times is scored too, with a warning.
         device: Device that decodes: "cpu", "cuda" or "cuda:N".
-        metrics: Any of "psnr", "ssim", "flip" and "seen"; FLIP takes most of the time.
-        views: Number of views of the set's mesh, of "seen"; 0 for none. Without a mesh there are none.
+        metrics: Any of "psnr", "ssim", "flip", and "seen" for `ShownScore` and views; FLIP takes most of the time.
+        views: Number of rendered views of the set's mesh, scored with "seen"; 0: none. Without a mesh there are none.
         progress: Called about twice a second.
-        file_bytes: Size of the model's file; None: the size of the file that it would be saved to.
+        file_bytes: Size of the model's file; None: the size that the model would have as a file.
 
     Returns:
         The report.
@@ -221,7 +222,7 @@ def _score(
     meter: Meter,
     before: int,
 ) -> SheetReport:
-    """Scores a sheet, after `before` other ones."""
+    """Scores a sheet; `before` is the number of sheets already scored, for the progress."""
     mask, decoder, peak = scored_mask(model, lightmaps), SheetDecoder(model, device), model.profile.peak
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views, device=device)
@@ -249,17 +250,17 @@ def _mean(values: Sequence[float], weights: Sequence[int]) -> float:
 
 
 def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.ndarray) -> float:
-    """Computes the mean PSNR over the tiles of a decoded map [H, W, 3] against the input's lightmap of a number, dB."""
+    """Returns the mean PSNR in dB over the tiles of a decoded map [H, W, 3], compared with input lightmap `number`."""
     mask, name = lightmaps.mask & _stored(model), f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
     return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
 
 
 def lost_light(model: LightmapModel, lightmaps: LightmapSet, device: str = "cpu") -> list[str]:
-    """Looks for fireflies that a fit lost: tiles whose light is in few texels are decoded at their times.
+    """Returns warnings about very bright texels (fireflies) that the fit lost, with their number and the largest loss.
 
-    `evaluate` checks all tiles. A light of more texels can not vanish unnoticed: PSNR would be below 30 dB. The lines
-    have the number of texels and the largest loss.
+    Only tiles with light in few texels are checked; `evaluate` checks all tiles. Losing light in more texels
+    would show in the fit's PSNR, which would be below 30 dB.
     """
     lit = [sheet for sheet, own in model.sheets.items() if not sheet.linear and own.kind.any()]
     return [line for sheet in lit for line in _lost_light(model.sheets[sheet], lightmaps.sheets[sheet], device)]
@@ -281,7 +282,7 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
 
 
 def _windows(model: SheetModel) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Yields the tiles that are not empty, each with its place in the map."""
+    """Yields the number of each tile that is not empty, and its window (rows and columns) in the map."""
     for tile in np.flatnonzero(model.kind).tolist():
         yield tile, model.grid.window(tile)
 
@@ -291,7 +292,7 @@ def _place(tile: int, stamp: float) -> str:
 
 
 def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
-    """Returns the bits per texel and time of a number of bytes, given the valid texels of the input, bool [H, W].
+    """Returns the bits per texel and time that `size` bytes are, given the valid texels of the input, bool [H, W].
 
     The area is the whole map with the gaps between charts, as the file replaces textures of that size. If the model
     only holds some of the tiles with a valid texel, it is the part of the map that these cover.
@@ -308,7 +309,7 @@ def _area(model: SheetModel, mask: np.ndarray) -> int:
 
 
 def count_kinds(model: SheetModel) -> dict[str, int]:
-    """Returns the number of tiles by kind, in small letters; tiles that were not compressed are "empty" too."""
+    """Returns the number of tiles by the kind's lower-case name; tiles that were not compressed are "empty"."""
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
 
 
@@ -374,7 +375,7 @@ def _sheet_report(
 
 
 def _left_out(model: SheetModel, lightmaps: SheetFrames, summary: Summary) -> dict[str, int]:
-    """Counts tiles times times without a score by reason; the metrics count a masked tile as one of few texels."""
+    """Counts pairs of tile and time without a score by reason, see `SheetReport.not_scored`."""
     valid, times = model.grid.tiles_with(lightmaps.mask).ravel(), len(model.times)
     empty = int((~valid).sum()) * times
     not_held = int((valid & (model.kind == TileKind.EMPTY)).sum()) * times

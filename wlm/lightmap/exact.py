@@ -1,4 +1,4 @@
-"""The float64 path: decodes a stored tile in plain NumPy, as the reference of every other decoder."""
+"""Reference decoder: decodes a stored tile in float64 with plain NumPy; tests compare all other decoders with it."""
 
 import math
 
@@ -15,7 +15,7 @@ SQRT_12 = math.sqrt(12.0)
 
 
 def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
-    """Decodes one tile in float64 (neural-dynamic-gi, eq. 4, with the scale of section 4 undone).
+    """Decodes one tile in float64: evaluates its network (neural-dynamic-gi, eq. 4) and undoes the scale of section 4.
 
     Args:
         model: The sheet.
@@ -65,12 +65,12 @@ def _colour(model: SheetModel, number: int, time: float) -> np.ndarray:
 
 
 def bound64(model: SheetModel, number: int, time: float) -> float:
-    """Returns the gamma-space colour of level 255 of the 8-bit output; 0 for a black or an empty tile.
+    """Returns the gamma-space colour that byte 255 of the 8-bit output stands for; 0 for a black or an empty tile.
 
     Args:
         model: The sheet.
         number: Number of the tile in the grid.
-        time: Between two stored times the larger of both bounds holds.
+        time: In the unit of the set's times. Between two stored times it is the larger of their two values.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.EMPTY:
@@ -91,7 +91,7 @@ def _check(model: SheetModel, number: int, time: float) -> None:
 
 
 def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
-    """Decodes a frame of a tile to gamma space, [128, 128, 3]."""
+    """Decodes the frame of a tile at stored time `at` to gamma space, [128, 128, 3]."""
     row = model.row(number)
     levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
@@ -99,7 +99,7 @@ def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
 
 
 def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
-    """Returns the radiance of a constant tile, [3]."""
+    """Returns the linear radiance of a constant tile at one time, [3]."""
     before, after, share = model.axis.neighbours(time)
     rows = model.constant[model.row(number)].astype(np.float64)
     return (1.0 - share) * rows[before] + share * rows[after]
@@ -110,7 +110,7 @@ def _filled(colour: np.ndarray) -> np.ndarray:
 
 
 def _network_output(model: SheetModel, number: int, place: int, time: float) -> np.ndarray:
-    """Returns the network's output y, [128, 128, 3]."""
+    """Returns the output of a tile's network at one time, normalised colour [128, 128, 3]."""
     profile = model.profile
     dynamic = model.kind[number] == TileKind.DYNAMIC
     row = model.row(number)

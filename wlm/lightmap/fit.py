@@ -1,4 +1,4 @@
-"""Fitting a lightmap set: from checked input to a compressed model (neural-dynamic-gi, sections 3.4 and 4)."""
+"""Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
 import os
 from collections.abc import Sequence
@@ -119,9 +119,9 @@ def open_checkpoint(
     """Opens the checkpoint of a fit: the file `OUTPUT.partial`, which names everything that the fit depends on.
 
     Args:
-        output: The file that the fit is for.
+        output: The `.wlm` that the fit will be saved to.
         lightmaps, profile, tiles, seed, settings: As for `compress`.
-        device: Only its kind matters: a fit may continue on another GPU.
+        device: Device of the fit. It can only be resumed on the same kind of device: CPU, or any GPU.
         resume: Whether to continue from the file, if there is one. Otherwise it is ignored, and replaced at the first
             save.
         every: Seconds between two saves of a running fit; 0: after every few steps.
@@ -145,7 +145,7 @@ def open_checkpoint(
 
 
 def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
-    """Computes the training data of the dynamic tiles of a sheet, for other trainers; None without such tiles."""
+    """Returns the training data of the dynamic tiles of a sheet, for use by other trainers; None without such tiles."""
     fit = SheetFit(lightmaps, profile)
     rows = np.flatnonzero(fit.kinds == TileKind.DYNAMIC)
     return fit.job(Batch(0, TileKind.DYNAMIC, rows, 0, fit)).targets() if len(rows) else None
@@ -153,7 +153,7 @@ def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
 
 @dataclass(frozen=True, eq=False)
 class _Facts:
-    """Numbers that are stored of a tile beside its maps and network, rounded as in the file (section 4)."""
+    """Numbers of one tile that the file stores beside its maps and network, rounded as in the file (section 4)."""
 
     kind: TileKind
     scale: np.ndarray | None = None  # [T, 3] of tiles with maps: codes, of a static tile half floats
@@ -163,14 +163,14 @@ class _Facts:
 
 
 class SheetFit:
-    """The tiles of a sheet, and the model that a fit fills with them.
+    """The tiles of a sheet to be fitted, and the model that receives their maps and networks.
 
     Tiles are cut out of the sheet as they are needed, a few at a time: all tiles of a large set do not fit in memory.
 
     Attributes:
         index: int [N], numbers of the tiles in their grid, rising.
         kinds: int [N], `TileKind` of each.
-        model: Complete except for the maps and networks of batches that have not been stored.
+        model: The model; maps and networks of batches that are not stored yet are still missing.
         warning: A setting that could not be followed, or None.
     """
 
@@ -181,7 +181,7 @@ class SheetFit:
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
     ) -> None:
-        """Classifies the tiles, all or those with the given numbers, and encodes those that are stored as frames.
+        """Classifies the tiles (all, or those with the given numbers) and encodes the tiles that are stored as frames.
 
         Raises:
             WlmError: A number is outside the grid or given twice, there is none, or the encoder of frames is missing.
@@ -235,7 +235,7 @@ class SheetFit:
                 meter.report(i + 1)
 
     def batches(self, first: int, most: int | None = None) -> list[Batch]:
-        """Returns batches of `BATCH_TEXELS`, of 1 to `most` tiles, numbered from `first`; dynamic tiles come first."""
+        """Splits the tiles into batches of 1 to `most` tiles, about `BATCH_TEXELS` each, numbered from `first`."""
         size = max(1, BATCH_TEXELS // (len(self.model.times) * TILE * TILE))
         size = size if most is None else min(size, most)
         result: list[Batch] = []
@@ -247,7 +247,7 @@ class SheetFit:
         return result
 
     def job(self, batch: Batch) -> TileJob:
-        """Returns the data of a batch that a worker gets."""
+        """Returns the data of a batch that is sent to a worker."""
         slots = np.searchsorted(self._mapped, batch.rows)
         return TileJob(
             cut(self._lightmaps, self.index[batch.rows]),
@@ -259,7 +259,7 @@ class SheetFit:
         )
 
     def table(self, batch: Batch) -> dict[str, Part]:
-        """Returns the types and shapes of the parts of a finished batch, as the trainer returns them."""
+        """Returns the types and shapes of the arrays that the trainer returns for a finished batch, by name."""
         kind = np.full(len(batch.rows), batch.kind, np.uint8)
         table = part_table(self.model.profile, kind, len(self.model.times))
         if batch.kind == TileKind.STATIC:
@@ -267,7 +267,7 @@ class SheetFit:
         return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
 
     def store(self, batch: Batch, parts: Parts) -> None:
-        """Puts the maps and networks of a finished batch into the model."""
+        """Copies the maps and networks of a finished batch into the model."""
         dynamic = batch.kind == TileKind.DYNAMIC
         maps, settings = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",), self.model.profile
         sizes = settings.uvt_resolution, settings.uvt_slices, settings.plane_columns, settings.plane_rows
@@ -282,7 +282,7 @@ class SheetFit:
         nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
 
     def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Stores the parts of a batch that are finished in a checkpoint; returns whether there are any."""
+        """Copies a batch that a checkpoint holds as finished into the model; returns False if it does not hold it."""
         parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
         if parts is None:
             return False
@@ -297,7 +297,7 @@ class SheetFit:
 def _classify(
     lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None, budget_db: float
 ) -> list[_Facts]:
-    """Classifies tiles and computes the scale, shift and spread of each (section 4); settings as in `Profile`."""
+    """Classifies tiles and computes the scale, shift and spread of each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
         tile = split(lightmaps, gamma, [number])

@@ -1,7 +1,7 @@
-"""The gaps between charts, which are filled after decoding so that a filtered read may leave a chart.
+"""Fills the gaps between charts after decoding, so that filtered reads at the edge of a chart are correct.
 
-A bilinear read at the edge of a chart includes texels outside it. The fit spends nothing on those; each takes the light
-of the nearest valid texel once its map is decoded, as a baker dilates charts before a lightmap is stored.
+A bilinear read at the edge of a chart includes texels outside it. The fit ignores these texels. After decoding, each of
+them takes the light of the nearest valid texel, as a baker dilates charts before it stores a lightmap.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Gaps:
     """The texels of a map that are filled.
 
     Attributes:
-        target: int [G, 2], row and column of each.
+        target: int [G, 2], row and column of each filled texel.
         source: int [G, 2], row and column of the valid texel whose light it takes.
     """
 
@@ -27,7 +27,7 @@ class Gaps:
 
     @classmethod
     def of(cls, mask: np.ndarray) -> Gaps:
-        """Finds the invalid texels within `wlm.texels.REACH` of a valid one, given the valid texels [H, W]."""
+        """Finds the texels to fill: invalid ones within `wlm.texels.REACH` of a valid one of a mask [H, W]."""
         return cls(*near_gaps(mask))
 
     def fill(self, image: np.ndarray) -> None:

@@ -1,10 +1,10 @@
-"""Detects frames that are not of the same atlas: charts begin and end in the same texels at any time.
+"""Detects frames that belong to different atlases: in one atlas, charts have the same borders at all times.
 
-The border of a chart shows in the texels around it: they have no light, or are outside of a coverage. Light also ends
-within a chart, at a shadow of the sun for example, so that one frame of an atlas can have borders that another lacks;
-but both have the borders of charts that are lit in both. Borders of two different atlases only coincide by chance. On
-20 of our own sets, 0.74 to 0.99 of the borders of an atlas at two times coincide beyond chance, and at most 0.11 of
-those of two different atlases.
+A chart's border is visible in a frame because the texels around the chart have no light, or an alpha of 0. Light also
+ends inside charts, at a sun shadow for example, so that one frame of an atlas can have borders that another lacks; but
+both frames have the borders of the charts that are lit in both. Borders of two different atlases only coincide by
+chance. On 20 of our own sets, 0.74 to 0.99 of the border texels of two frames of one atlas coincide beyond chance, and
+at most 0.11 for frames of different atlases.
 """
 
 from collections.abc import Callable
@@ -25,11 +25,11 @@ def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] 
 
     Args:
         count: Number of frames.
-        lit: Returns the texels of a frame that have light, or a chart, bool [H, W]; called for at most 8 frames, spread
-            evenly.
+        lit: Returns the texels of a frame that have light or belong to a chart, bool [H, W]; called for at most 8
+            evenly spaced frames.
 
     Returns:
-        The numbers of both frames; None if all may be of one atlas, or too few texels are dark to tell.
+        The indices of the two frames; None if all may belong to one atlas, or if too few texels are dark to tell.
     """
     chosen = spread(count, PICTURES)
     pictures = [lit(i) for i in chosen]
@@ -45,7 +45,7 @@ def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] 
 
 
 def spread(count: int, most: int) -> list[int]:
-    """Returns at most `most` of the numbers from 0 to count - 1, spread evenly."""
+    """Returns at most `most` evenly spaced numbers from 0 to count - 1."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
 
@@ -65,14 +65,14 @@ def _differ(a: np.ndarray, border_a: np.ndarray, b: np.ndarray, border_b: np.nda
 
 
 def _border(lit: np.ndarray) -> np.ndarray:
-    """Returns the lit texels beside dark ones, bool [H, W]; a single dark texel is noise."""
+    """Returns the lit texels next to dark ones, bool [H, W]; single dark texels are ignored as noise."""
     dark = ~lit
     dark &= _near(dark)
     return _near(dark) & ~dark
 
 
 def _near(mask: np.ndarray) -> np.ndarray:
-    """Returns the texels beside those of a mask, in four directions."""
+    """Returns the texels that have a horizontal or vertical neighbour in a mask, bool [H, W]."""
     near = np.zeros_like(mask)
     near[1:] |= mask[:-1]
     near[:-1] |= mask[1:]

@@ -1,4 +1,4 @@
-"""The files of a lightmap set and their times: from a `set.json`, or from the names in folders.
+"""Lists the files of a lightmap set and their times, from a `set.json` or from file names in folders.
 
 No pixels are read here. The layout follows the scene configuration of neural-dynamic-gi, section 10.1. A set consists
 of atlases and layers; the plain set of one lightmap for each time has one atlas "0" with one layer "light".
@@ -33,7 +33,7 @@ _MASK_WORDS = ("all", "alpha")
 
 @dataclass(frozen=True)
 class Source:
-    """A picture: a file, or one of several pictures of equal height that are stacked in a file.
+    """A picture: a whole file, or one of several pictures of equal height that are stacked vertically in a file.
 
     Attributes:
         path: The file.
@@ -50,7 +50,7 @@ class Source:
 
 @dataclass(frozen=True)
 class LayerInfo:
-    """A layer that every atlas has.
+    """Description of a layer, which every atlas of the set has.
 
     Attributes:
         name: Name of the layer.
@@ -65,13 +65,14 @@ class LayerInfo:
 
 @dataclass(frozen=True)
 class AtlasInfo:
-    """An atlas.
+    """Description of an atlas.
 
     Attributes:
         name: Name of the atlas.
-        mask: "all", "alpha", the path of a PNG, or None: alpha if the light has it, otherwise all.
+        mask: "all", "alpha", the path of a PNG, or None: "alpha" if the layer of light has an alpha channel, otherwise
+            "all".
         size: Height and width in texels if the set states them, else None.
-        mesh: The mesh that the atlas belongs to, which does not have to exist, or None.
+        mesh: Path of the mesh that the atlas belongs to (it does not have to exist), or None.
     """
 
     name: str
@@ -89,9 +90,9 @@ class Listing:
         where: The `set.json` or the folder.
         times: A time for each state, not yet checked.
         period: Length of the day in the unit of the times, or None.
-        layers, atlases: In the order of the set.
-        states: For each time the picture of each layer of each atlas, by the names of atlas and layer.
-        labels: Name of each state in messages.
+        layers, atlases: The layers and atlases, in the order of the set.
+        states: For each time, the pictures by names of atlas and layer.
+        labels: Name of each state (the pictures of one time) in messages.
         warn_order: Whether times that are out of order deserve a warning.
     """
 
@@ -114,7 +115,7 @@ class Listing:
 def list_set(
     path: Path, times: Sequence[float] | None = None, layers: Sequence[str] | None = None, trust: bool = False
 ) -> Listing:
-    """Lists a set, as `wlm.lightmap.load` describes.
+    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes.
 
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
@@ -142,7 +143,7 @@ def list_set(
 
 
 def natural(name: str) -> list[str | int]:
-    """Returns a sort key with digits split from text: "2" sorts before "10"."""
+    """Returns a sort key that compares digits in a name as numbers, so that "2" sorts before "10"."""
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
@@ -166,7 +167,7 @@ def is_name(value: object) -> bool:
 
 
 def state_folders(folder: Path) -> list[Path]:
-    """Returns the folders with light as Unity names it: the folder itself, or folders in it in natural order.
+    """Returns the folders that hold lightmaps with Unity's names: the folder itself, or folders in it in natural order.
 
     A folder with lightmaps of other names is a plain set, whatever the folders in it contain.
     """
@@ -225,13 +226,13 @@ def _has_light(folder: Path) -> bool:
 
 
 def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
-    """Returns the files of a folder that have Unity's names, with atlas and layer; hidden files are left out."""
+    """Returns the files of a folder that have Unity's names, by atlas and layer; hidden files are left out."""
     found = [(match, path) for path in folder.iterdir() if (match := _UNITY.fullmatch(path.name))]
     return [((match[1], match[2].lower()), path) for match, path in found if path.name[0] != "." and path.is_file()]
 
 
 def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[str] | None) -> Listing:
-    """Lists a folder with one state of light as Unity bakes it, or with a folder for each state."""
+    """Lists a folder of lightmaps as Unity bakes them: one state of light, or a folder inside it for each state."""
     states = state_folders(folder)
     found: list[dict[tuple[str, str], dict[str, Path]]] = []
     for state in states:
@@ -277,7 +278,7 @@ def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[s
 def _refuse(
     folder: Path, key: tuple[str, str], states: list[Path], found: list[dict[tuple[str, str], dict[str, Path]]]
 ) -> None:
-    """Raises an error that names the state that lacks a picture that another state has."""
+    """Raises an error about states with different files; it names a picture, and a state that does not have it."""
     name, has = f"{key[0]}_comp_{key[1]}", [bool(files.get(key)) for files in found]
     if all(has):
         raise WlmError(f"{folder}: {name} has no format that all states have; expected the same files in each")
@@ -290,7 +291,7 @@ def _refuse(
 
 
 def _labelled(path: Path, *place: int) -> Source:
-    """Returns a picture whose label has the name of its folder, which tells the state."""
+    """Returns a picture with the name of its folder in the label, because the folder's name identifies the state."""
     return Source(path, f"{path.parent.name}/{path.name}", *place)
 
 
@@ -359,7 +360,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
 
 
 def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> dict[str, Any]:
-    """Returns an object of named entries, which must not be empty."""
+    """Returns a JSON object of named entries from a field; an empty one is an error."""
     values = _field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
     for name in values:
         if not is_name(name):
@@ -368,7 +369,7 @@ def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> d
 
 
 def _layer(path: Path, name: str, value: Any) -> LayerInfo:
-    """Reads a layer: an encoding, or an object with `encoding` and optional `channels`."""
+    """Reads the description of a layer: an encoding, or an object with `encoding` and optional `channels`."""
     place, options = f"layers.{name}", {"encoding": value} if isinstance(value, str) else value
     if not isinstance(options, dict):
         raise WlmError(f"{path}: {place}: expected an encoding or an object (encoding, channels), got {_kind(value)}")
@@ -386,7 +387,7 @@ def _layer(path: Path, name: str, value: Any) -> LayerInfo:
 
 
 def _atlas(path: Path, name: str, value: Any, trust: bool) -> AtlasInfo:
-    """Reads an atlas: an object with optional `width` and `height`, `mask` and `mesh`."""
+    """Reads the description of an atlas: an object with optional `width`, `height`, `mask` and `mesh`."""
     place = f"atlases.{name}"
     if not isinstance(value, dict):
         raise WlmError(f"{path}: {place}: expected an object (width, height, mask, mesh), got {_kind(value)}")
@@ -414,7 +415,7 @@ def _mesh(path: Path, holder: dict[str, Any], place: str, trust: bool) -> Path |
 
 
 def _source(path: Path, value: Any, place: str, found: dict[str, Path], trust: bool) -> Source:
-    """Reads a picture: a file, or a slice of one. `found` holds the files named before: links are followed once."""
+    """Reads the entry of a picture: a file, or a slice of one. `found` caches resolved paths of files named before."""
     options = {"file": value} if isinstance(value, str) else value
     file = _field(path, options, "file", f"{place}.", is_text, "the name of a picture")
     if file not in found:
@@ -453,7 +454,7 @@ def is_text(value: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    """Returns whether a value is a finite number of a usable size."""
+    """Returns whether a JSON value is a finite number that is not too large for a float."""
     # Python's True is an int, and its JSON reader accepts NaN, Infinity and integers of any length.
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False

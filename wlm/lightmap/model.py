@@ -1,14 +1,14 @@
-"""The model of a temporal lightmap: its arrays and their meaning.
+"""Data model of a compressed lightmap over time: its arrays and their meaning.
 
-A tile of 128 x 128 texels over T times is F_uv, F_uvt, F_ut, F_vt and a small MLP (neural-dynamic-gi, eq. 5). The
-network's output y is normalised colour; decoding undoes the normalisation:
+A tile of 128 x 128 texels over T times is stored as the feature maps F_uv, F_uvt, F_ut, F_vt and a small MLP
+(neural-dynamic-gi, eq. 5). The network's output y is normalised colour; decoding undoes the normalisation:
 
     colour(u, v, t) = (shift + spread y) * scale(t),     radiance = max(colour, 0) ** gamma
 
 `colour` is in gamma space. `scale` is the mean of each channel at each time (section 4), `shift` and `spread` are the
-mean and the standard deviation, over all times, of colour / scale. The paper stops at the mean; the network of a tile
-whose light hardly varies would then have to output 1 +- 0.001. All three are stored rounded, and the fit divides by the
-rounded values, so that rounding them costs nothing.
+mean and the standard deviation, over all times, of colour / scale. The paper only divides by the mean; the network of a
+tile whose light hardly varies would then have to output 1 +- 0.001. All three are stored rounded, and the fit
+normalises with the rounded values, so that rounding adds no error.
 
 A `LightmapModel` is a collection of sheets (`wlm.lightmap.sheet`); the arrays of each sheet are a `SheetModel`.
 """
@@ -36,15 +36,15 @@ SCALE_SPAN = (-21.0, 16.0)
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
-    """Encodes values >= 0 as 8-bit logarithmic codes: code 0 is exactly 0, codes 1 to 255 share `SCALE_SPAN` evenly.
+    """Encodes values >= 0 as 8-bit logarithmic codes: code 0 is 0, codes 1 to 255 divide `SCALE_SPAN` evenly.
 
-    At gamma 2.2 one step is 4.7%. The span is fixed, so that the bytes of a tile do not depend on other tiles. Smaller
-    values take code 1.
+    At gamma 2.2 one step is 4.7%. The span is fixed, so that the bytes of a tile do not depend on other tiles. Values
+    above 0 but below the span take code 1.
 
     Args:
         values: Any shape, in gamma space.
         gamma: Gamma of that space.
-        up: Round up instead of to the nearest code, for upper bounds.
+        up: Whether to round up, for upper bounds, instead of to the nearest code.
     """
     low, high = (bound / gamma for bound in SCALE_SPAN)
     with np.errstate(divide="ignore"):
@@ -64,8 +64,8 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """Returns the types and shapes of the arrays of a sheet.
 
-    N_m tiles have feature maps (static and dynamic ones, in the order of their numbers), N_d of them temporal maps; N_c
-    tiles are constant and N_f are frames.
+    N_m tiles have feature maps (static and dynamic tiles, by rising number) and N_d of them are dynamic, with temporal
+    maps; N_c tiles are constant and N_f are stored as frames.
 
     Args:
         profile: The settings.
@@ -105,17 +105,18 @@ class SheetModel:
         kind: uint8 [tiles], `TileKind` of each tile of the grid, row-major; EMPTY also for tiles that were not fitted.
         uv: BC7 blocks of F_uv.
         uvt: BC7 blocks of F_uvt, slice by slice.
-        ut, vt: F_ut and F_vt, time along the rows.
+        ut, vt: F_ut and F_vt, one row for each step of time.
         net: Networks of dynamic tiles, `hidden` rows and then `output` rows, see `wlm_kernels.mlp`.
         net_static: Networks of static tiles.
         scale: Codes of the mean of each channel at each time, in gamma space.
         scale_static: The means of static tiles as half floats: their network does not get the time as an input, so it
-            can not make up for rounding.
+            cannot compensate for coarse rounding.
         peak: Codes of an upper bound of the tile at each time, in gamma space: the colour of level 255 of the 8-bit
             output.
-        affine: Shift and spread.
+        affine: Shift and spread of the module's formula.
         constant: Radiance of constant tiles: half floats, or float32 if a half float would be more than 1% off.
-        frames: BC7 blocks of any mode of the tiles that are stored as frames; black where no read reaches.
+        frames: BC7 blocks of any mode of the tiles that are stored as frames; blocks that no filtered read touches are
+            black.
         ranges: Least and greatest colour of each frame, in gamma space.
     """
 
@@ -143,12 +144,12 @@ class SheetModel:
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
-        """The arrays by name, in the order of `part_table`; `kind` is the last."""
+        """The arrays by name, in the order of `part_table`, and `kind` last."""
         return {name: getattr(self, name) for name in (*part_table(self.profile, self.kind, len(self.times)), "kind")}
 
     @property
     def axis(self) -> TimeAxis:
-        """The time axis of the features."""
+        """Maps times to positions on the time axis of the feature maps."""
         return TimeAxis(self.times, self.period, self.profile.time_axis, self.profile.interpolation)
 
     @property
@@ -158,12 +159,12 @@ class SheetModel:
 
     @property
     def mapped(self) -> np.ndarray:
-        """int [N_m], numbers of the tiles that have feature maps: the rows of `uv`, `peak` and `affine`."""
+        """Numbers of the tiles with feature maps, in the order of `uv`, `peak` and `affine`, int [N_m]."""
         return self.numbers(TileKind.STATIC, TileKind.DYNAMIC)
 
     @property
     def scales(self) -> np.ndarray:
-        """The scale of every tile with feature maps, float32 [N_m, T, 3]."""
+        """The decoded scale of each tile with feature maps at each time, float32 [N_m, T, 3]."""
         kinds = self.kind[self.mapped]
         result = np.empty((len(kinds), len(self.times), 3), np.float32)
         result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
@@ -172,7 +173,7 @@ class SheetModel:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes that a GPU holds: maps, networks as half floats, scales, colours and frames."""
+        """Bytes that the sheet takes on a GPU: maps, networks as half floats, scales, colours and frames."""
         return sum(value.nbytes for value in self.parts.values())
 
     def numbers(self, *kinds: TileKind) -> np.ndarray:
@@ -197,7 +198,7 @@ class LightmapModel(Model):
         source: Hash of the input, see `wlm.lightmap.data.LightmapSet.source`.
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
         sheets: The sheets, with the same times; those of one atlas share the size and the mask.
-        warnings: Settings that the fit could not follow, one line each; not in the file.
+        warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
     """
 
     SYSTEM: ClassVar[str] = "lightmap"
@@ -210,7 +211,7 @@ class LightmapModel(Model):
 
     @property
     def light(self) -> SheetModel:
-        """The first sheet of radiance, or the first sheet: the whole model of an ordinary lightmap."""
+        """The first sheet of radiance; without one, the first sheet. An ordinary lightmap has only this sheet."""
         return self.sheets[first_light(self.sheets)]
 
     @property
@@ -225,14 +226,14 @@ class LightmapModel(Model):
 
     @property
     def atlases(self) -> Mapping[str, tuple[int, int]]:
-        """Height and width of each atlas by name."""
+        """Height and width in texels of each atlas, by name."""
         return {sheet.atlas: (own.height, own.width) for sheet, own in self.sheets.items()}
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes that a GPU holds, over all sheets."""
+        """Bytes that all sheets together take on a GPU."""
         return sum(own.memory_bytes for own in self.sheets.values())
 
     def layer(self, name: str | None = None, atlas: str | None = None) -> list[Sheet]:
-        """Returns the sheets of one layer of one atlas, see `wlm.lightmap.sheet.layer_sheets`."""
+        """Returns the models of the sheets of one layer of one atlas, see `wlm.lightmap.sheet.layer_sheets`."""
         return layer_sheets(self.name, self.sheets, name, atlas)

@@ -86,10 +86,10 @@ class Profile(Settings):
         return self
 
     def for_times(self, times: int) -> "Profile":
-        """Returns the settings with sizes along time for a set of that many times.
+        """Returns the settings with the feature maps' size along time adapted to a set of `times` times.
 
-        With `follow_times` F_uvt, F_ut and F_vt have at most one slice or row for each stored time: more would only
-        hold mixtures. Beyond 26 times the sizes grow in proportion, up to 64.
+        With `follow_times` F_uvt, F_ut and F_vt have at most one slice or row for each stored time: more could only
+        hold interpolated values. Beyond 26 times the sizes grow in proportion, up to 64.
         """
         if not self.follow_times:
             return self
@@ -100,22 +100,22 @@ class Profile(Settings):
         return self.override(sizes | {"follow_times": False})
 
     def for_sheet(self, sheet: Sheet) -> "Profile":
-        """Returns the settings of a sheet. A linear sheet has no gamma, and its errors are relative to [0, 1]."""
+        """Returns the settings for one sheet. A linear sheet has gamma 1, and its errors are relative to [0, 1]."""
         return self.override({"gamma": 1.0, "peak": 1.0}) if sheet.linear else self
 
     def inputs(self, temporal: bool) -> int:
-        """Returns the number of inputs of the network of a tile with (`temporal`) or without temporal maps."""
+        """Returns the number of inputs of a tile's network, with or without temporal feature maps."""
         return TEMPORAL_INPUTS if temporal else STATIC_INPUTS
 
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Places a time on the time axis of the features; see `Profile.time_axis`.
+    """Converts times to positions on the time axis of the feature maps; see `Profile.time_axis`.
 
     Attributes:
         times: float64 [T], increasing.
         period: Length of the day in the unit of the times, or None.
-        kind: "paper" or "frames".
+        kind: "paper" or "frames", see `Profile.time_axis`.
         interpolation: "radiance" or "network", see `Profile.interpolation`.
     """
 
@@ -126,16 +126,16 @@ class TimeAxis:
 
     @property
     def periodic(self) -> bool:
-        """Whether the time axis of the features wraps."""
+        """Whether the time axis of the feature maps wraps around, as for a day."""
         return self.period is not None and self.kind == "frames" and len(self.times) > 1
 
     @property
     def turn(self) -> float:
-        """Factor of tau in gamma(t) of eq. 4, in radians: a full turn if the axis wraps."""
+        """Factor of tau in the time encoding gamma(t) of eq. 4, in radians: 2 pi if the axis wraps."""
         return (2.0 if self.periodic else 1.0) * math.pi
 
     def wrap(self, t: float) -> float:
-        """Wraps a time by the period, or clamps it to the first and last stored time."""
+        """Wraps a time into the period; without a period, clamps it to the first and last stored time."""
         if not math.isfinite(t):
             raise WlmError(f"time: expected a finite number, got {t}")
         if self.period is not None:
@@ -158,7 +158,7 @@ class TimeAxis:
         return before, after, float(((t - self.times[before]) % self.period) / gap)
 
     def place(self, t: float) -> float:
-        """Returns tau in [0, 1], the position at which the features are read at time t."""
+        """Returns tau in [0, 1], the position on the time axis at which the feature maps are read for time t."""
         if self.kind == "paper":
             first = 0.0 if self.period is not None else self.times[0]
             span = self.period if self.period is not None else max(self.times[-1] - self.times[0], 1e-12)
@@ -168,7 +168,7 @@ class TimeAxis:
         return tau % 1.0 if self.periodic else tau
 
     def reads(self, t: float) -> list[tuple[float, float]]:
-        """Returns the times at which the network is evaluated for time t, each with its share of the radiance."""
+        """Returns the one or two times at which a network is evaluated for time t, with weights of their radiance."""
         before, after, share = self.neighbours(t)
         if self.interpolation == "network":
             return [(t, 1.0)]
@@ -176,7 +176,7 @@ class TimeAxis:
         return [read for read in pair if read[1] > 0.0]
 
     def encode(self, t: float) -> np.ndarray:
-        """Returns gamma(t) of eq. 4, float32 [4]."""
+        """Returns the time encoding gamma(t) of eq. 4, float32 [4]."""
         turn = self.turn * self.place(t)
         return np.array([math.sin(turn), math.cos(turn), math.sin(2 * turn), math.cos(2 * turn)], np.float32)
 

@@ -1,9 +1,9 @@
-"""Decoding to 32 bits a texel at run time: all data stays on the device, and a decode only launches kernels.
+"""Decodes to 32 bits per texel at run time: all data stays on the device, and a decode only launches kernels.
 
 `wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
-the tiles of one kind of one sheet, with gaps unfilled: a `StripDecoder`, or on CUDA a `MatrixDecoder` for wide
-networks, an `ExactDecoder` for static tiles, and a `FrameDecoder`. `wlm.lightmap.runtime_texture` puts them together to
-a texture of the map.
+the tiles of one kind of one sheet, without filling gaps between charts: a `StripDecoder`, or on CUDA a `MatrixDecoder`
+for wide networks, an `ExactDecoder` for static tiles, and a `FrameDecoder`. `wlm.lightmap.runtime_texture` combines
+them to fill one texture with the whole map.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from wlm_kernels.lightmap import matrix_decode, output
 
 
 class RuntimeDecoder:
-    """The tiles of one kind on a device, and the time at which they are decoded.
+    """Base class: decodes all tiles of one kind on a device at a time that `set_time` chooses.
 
     Attributes:
         numbers: int [n], numbers of the tiles in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], written by `decode`: RGBA from the lowest byte, alpha 255; or RGB9E5.
+        out: `wp.array` uint32 [n, 128, 128], written by `decode`: 8-bit RGBA with R in the lowest byte and alpha 255;
+            or RGB9E5.
     """
 
     _tiles: DeviceTiles
 
     def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
-        """Allocates the output; the time is the first stored one."""
+        """Allocates the output; `shared` chooses RGB9E5. The time is initially the first stored one."""
         self.model, self.device, self.shared = model, device, shared
         self.numbers = self._tiles.numbers
         self._rows = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
@@ -48,10 +49,9 @@ class RuntimeDecoder:
     def set_time(self, time: float) -> None:
         """Sets the time of the following decodes.
 
-        The arrays of the old time are overwritten in place, but its position on the time axis is an argument of the
-        launches: a CUDA graph that was captured before is out of date and must be captured again. Between two stored
-        times both are decoded and mixed: a renderer that keeps the two and mixes them itself decodes once for each
-        stored time.
+        A CUDA graph that was captured before must be captured again, because the position on the time axis is an
+        argument of the launches. Between two stored times, each decode decodes both and interpolates. A renderer that
+        keeps the light of both and interpolates by itself only has to decode once for each stored time.
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
@@ -59,22 +59,21 @@ class RuntimeDecoder:
         raise NotImplementedError
 
     def decode(self) -> None:
-        """Decodes all tiles into `out`. It only launches kernels, allocates nothing and can be captured."""
+        """Decodes all tiles into `out`. It only launches kernels, so that a CUDA graph can capture it."""
         raise NotImplementedError
 
     def numpy(self) -> np.ndarray:
-        """Returns the last decode: uint8 [n, 128, 128, 4], or of RGB9E5 linear radiance, float32 [n, 128, 128, 3]."""
+        """Returns the decoded tiles: RGBA, uint8 [n, 128, 128, 4]; for RGB9E5 radiance, float32 [n, 128, 128, 3]."""
         return unpack_rgb9e5(self.out.numpy()) if self.shared else rgba(self.out)
 
     @property
     def bounds(self) -> np.ndarray:
-        """Colour of level 255 of texels of 8 bits in gamma space, float32 [n]: radiance = (byte / 255 * bound) **
-        gamma."""
+        """Bound of each tile's 8-bit colours, float32 [n]: radiance = (byte / 255 * bound) ** gamma."""
         return self._tiles.bounds(self._time).copy()
 
 
 class _MapDecoder(RuntimeDecoder):
-    """Static or dynamic tiles."""
+    """Base class of the decoders of static or dynamic tiles."""
 
     def __init__(
         self,
@@ -84,7 +83,7 @@ class _MapDecoder(RuntimeDecoder):
         kind: TileKind = TileKind.DYNAMIC,
         shared: bool = False,
     ) -> None:
-        """Uploads the tiles of one kind, STATIC or DYNAMIC; other arguments and errors as for `StripDecoder`."""
+        """Uploads the tiles of one kind, STATIC or DYNAMIC; for other arguments and errors see `StripDecoder`."""
         device, self.gelu = interop.check_device(device), gelu_of(model, gelu)
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
@@ -116,7 +115,7 @@ class _MapDecoder(RuntimeDecoder):
 
 
 class _ScratchDecoder(_MapDecoder):
-    """Dynamic tiles, decoded by kernels that keep intermediate results of a time."""
+    """Base class of decoders of dynamic tiles whose kernels keep intermediate results of a time in buffers."""
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
         tiles = self._tiles
@@ -124,23 +123,23 @@ class _ScratchDecoder(_MapDecoder):
 
 
 class StripDecoder(_ScratchDecoder):
-    """The fast path of dynamic tiles: one thread decodes four texels (section 3.5).
+    """Fast decoder of dynamic tiles: one thread decodes four texels (section 3.5).
 
     Attributes:
-        gelu: The form of the GELU in use.
+        gelu: The GELU variant in use.
     """
 
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None, shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is the first stored one.
+        """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is initially the first stored one.
 
         Args:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
-            gelu: Another form of the GELU than the model's, see `wlm_kernels.mlp`; None: the model's.
-            shared: Texels are linear radiance with a shared exponent (RGB9E5) instead of 8 bits relative to a bound.
+            gelu: GELU variant to use instead of the model's, see `wlm_kernels.mlp`; None: the model's.
+            shared: Whether texels are linear radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
 
         Raises:
-            WlmError: There is no such device or form, or the sheet has no dynamic tile.
+            WlmError: There is no such device or GELU variant, or the sheet has no dynamic tile.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
@@ -153,15 +152,14 @@ class StripDecoder(_ScratchDecoder):
 
 
 class MatrixDecoder(_ScratchDecoder):
-    """The fast path of dynamic tiles with wide networks, on a GPU's matrix units, in half floats, with the GELU
-    "fast"."""
+    """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU "fast"."""
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet, whose hidden width is a multiple of 16; arguments as for
-        `StripDecoder`.
+        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`.
 
         Raises:
-            WlmError: The device is not a GPU, the width is another one, or the sheet has no dynamic tile.
+            WlmError: The device is not a GPU, the networks' hidden width is not a multiple of 16, or the sheet has no
+                dynamic tile.
         """
         name, hidden = interop.check_device(device), model.profile.hidden
         if name == "cpu":
@@ -178,17 +176,17 @@ class MatrixDecoder(_ScratchDecoder):
 
 
 class ExactDecoder(_MapDecoder):
-    """The plain path of static or dynamic tiles: one thread decodes one texel, in training's order of operations."""
+    """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations."""
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
         self._tiles.launch(state, self._rows, 1 + self.shared, out)
 
 
 class FrameDecoder(RuntimeDecoder):
-    """The tiles that are stored as frames: one thread reads one texel of one or two frames."""
+    """Decoder of tiles that are stored as frames: one thread reads one texel of one frame, or of two to interpolate."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", shared: bool = False) -> None:
-        """Uploads the frames of a sheet and allocates all buffers; arguments as for `StripDecoder`."""
+        """Uploads the frames of a sheet and allocates all buffers; for the arguments see `StripDecoder`."""
         device = interop.check_device(device)
         self._tiles = FrameTiles(model, device)
         self._inverse = wp.empty(len(self._tiles.numbers), dtype=float, device=device)
@@ -203,7 +201,7 @@ class FrameDecoder(RuntimeDecoder):
 
 
 def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
-    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder`, if the width and the GELU allow it."""
+    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder`, if width and GELU allow it."""
     device = interop.check_device(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:

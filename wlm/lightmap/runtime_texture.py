@@ -1,7 +1,8 @@
-"""A whole map at run time as one texture that a renderer samples: RGB9E5 with mips, on the device.
+"""Decodes a whole map at run time into one texture that a renderer samples: RGB9E5 with mips, on the device.
 
-Tiles of 8 bits have a bound each, so that a filter must not cross from one to the next. Here they lie in one texture of
-also 32 bits a texel, with gaps filled over the whole map and mips of the texels inside charts.
+Decoded tiles with 8 bits per channel have different bounds, so that a filter must not read across two tiles. In this
+texture, also of 32 bits per texel, all tiles share one format; gaps between charts are filled, and mips average only
+texels inside charts.
 """
 
 import os
@@ -22,22 +23,22 @@ from wlm_kernels.lightmap import texture
 
 
 class MapDecoder:
-    """All tiles of a sheet in one texture and its mips.
+    """Decodes all tiles of a sheet into one texture and its mips.
 
     Attributes:
         levels: `wp.array` uint32 [h, w] each, RGB9E5, written by `decode`: the map, then mips of half the size, rounded
-            down. A texel of a mip is the mean of the valid texels of stored tiles that it covers; gaps within
-            `wlm.texels.REACH` of those hold the nearest one of their own level.
+            down. A mip texel is the mean of the valid texels that it covers, in tiles that are not empty; texels in
+            gaps within `wlm.texels.REACH` of a valid texel have the light of the nearest valid one of the same level.
         decoders: The decoder of each kind of tile.
     """
 
     def __init__(self, model: SheetModel, device: str = "cpu", mips: int | None = None) -> None:
-        """Uploads a sheet and allocates all buffers; the time is the first stored one.
+        """Uploads a sheet and allocates all buffers; the time is initially the first stored one.
 
         Args:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
-            mips: Number of levels below the map; None: down to one texel.
+            mips: Number of mips besides the map itself; None: down to one texel.
 
         Raises:
             WlmError: There is no such device, or the map does not have that many mips.
@@ -75,7 +76,7 @@ class MapDecoder:
         return self._vectors(np.array([grid.origin(int(number)) for number in numbers]).reshape(-1, 2))
 
     def set_time(self, time: float) -> None:
-        """Sets the time of the following decodes; a graph captured before is out of date, as for `StripDecoder`.
+        """Sets the time of the following decodes; a CUDA graph captured before must be captured again.
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
@@ -85,7 +86,7 @@ class MapDecoder:
         self._colours.assign(self._constant.colours(time))
 
     def decode(self) -> None:
-        """Decodes the map into `levels`. It only launches kernels, allocates nothing and can be captured."""
+        """Decodes the map into `levels`; it only launches kernels and allocates nothing: CUDA graphs can capture it."""
         whole = self.levels[0]
         for decoder, corners in zip(self.decoders, self._corners, strict=True):
             decoder.decode()
@@ -99,7 +100,7 @@ class MapDecoder:
                 texture.fill(target, source, level)
 
     def numpy(self, level: int = 0) -> np.ndarray:
-        """Returns a level of the last decode on the host: linear radiance, float32 [h, w, 3]."""
+        """Copies a level (0: the map, 1: the first mip) to the host: linear radiance, float32 [h, w, 3]."""
         return unpack_rgb9e5(self.levels[level].numpy())
 
 
@@ -107,7 +108,7 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
     """Writes the map at one time as a renderer samples it: a DDS of RGB9E5 texels with all mips.
 
     Args:
-        path: The DDS.
+        path: The DDS file to write.
         model: The sheet.
         time: In the unit of the set's times.
         device: Device that decodes.
@@ -128,7 +129,7 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
 
 
 def _halved(weight: np.ndarray) -> np.ndarray:
-    """Returns sums of two by two texels [h, w]; the last texel of an odd side covers three."""
+    """Returns the sums of blocks of 2x2 texels [h, w]; at an odd side, the last covers three."""
     for axis in (0, 1):
         starts = np.arange(max(weight.shape[axis] // 2, 1)) * 2
         weight = np.add.reduceat(weight, starts, axis)

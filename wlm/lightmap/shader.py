@@ -1,4 +1,4 @@
-"""The GLSL that decodes a lightmap from the textures and buffers of its bundle (`wlm.lightmap.bundle`)."""
+"""Generates the GLSL that decodes a lightmap from the textures and buffers of its bundle (`wlm.lightmap.bundle`)."""
 
 from wlm.bundle import sampler
 from wlm.lightmap.encodings.base import columns
@@ -287,12 +287,12 @@ vec3 wlm_value(ivec2 texel)
 
 
 def record_fours(model: SheetModel) -> int:
-    """Returns the number of groups of four floats in the record of a tile."""
+    """Returns the number of groups of four floats in a tile's record, see `wlm.lightmap.bundle.hour_tables`."""
     return 3 + max(fours(model.profile), 2)
 
 
 def texture_names(model: SheetModel) -> list[str]:
-    """Returns the textures that the shader of a sheet reads, in the order of their declarations."""
+    """Returns the names of the textures that the shader of a sheet reads, in the order of their declarations."""
     maps, dynamic = bool(len(model.uv)), bool(len(model.uvt))
     needed = {"networks": maps, "uv": maps, "uvt": dynamic, "planes": dynamic, "frames": bool(len(model.frames))}
     return [name for name in _TEXTURES if needed.get(name, True)]
@@ -302,11 +302,11 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
     """Returns the shader of a sheet: functions to be included below `#version`.
 
     Args:
-        model: The sheet; its settings and its tiles choose the text and the constants in it.
-        values: Values of the levels 0 and 1 of a linear sheet; None: the sheet is of radiance.
+        model: The sheet; the shader depends on its settings and on the kinds of its tiles.
+        values: Range of a linear sheet, to which decoded levels from 0 to 1 are mapped; None: the sheet is radiance.
 
     Returns:
-        GLSL 3.30 and ES 3.00; Vulkan's dialect takes it too if the bindings are defined.
+        Source for GLSL 3.30 and GLSL ES 3.00; it also compiles for Vulkan if the bindings are defined.
     """
     profile, names = model.profile, texture_names(model)
     dynamic = len(model.uvt)

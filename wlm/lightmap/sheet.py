@@ -5,8 +5,8 @@ several atlases has a sheet for each; a layer with more than three channels, suc
 sheets of three.
 
 Radiance is stored in gamma space. Directions, ratios of SH coefficients and masks are not light and have no gamma:
-their sheets hold levels in [0, 1] that are linear in the value, so that the kernels need no case for negative values
-and a mix of two hours mixes the values.
+their sheets hold values mapped linearly to levels in [0, 1], so that kernels need no case for negative values and
+interpolating levels interpolates values.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ WIDTH = 3
 
 @dataclass(frozen=True)
 class Sheet:
-    """Names the numbers that a lightmap of three channels holds.
+    """Identifies the up to three channels that are stored together as one RGB lightmap.
 
-    A sheet of fewer than three channels repeats its last one. Block compression and networks store three equal channels
-    as well as one, and scores over the three are nearly the scores of the real channels.
+    A sheet of fewer than three channels repeats its last one. Three equal channels compress about as well as one, and
+    scores over the three are nearly those of the real channels.
 
     Attributes:
         atlas, layer: Names of the atlas and of the layer.
@@ -56,7 +56,7 @@ class Sheet:
 
     @property
     def label(self) -> str:
-        """Name of the sheet in messages: `Lightmap-0/dir RGB`."""
+        """Name of the sheet in messages, such as `Lightmap-0/dir RGB`."""
         joint = "" if all(len(name) == 1 for name in self.channels) else ","
         return f"{self.atlas}/{self.layer} {joint.join(self.channels)}"
 
@@ -67,12 +67,12 @@ class Sheet:
 
     @property
     def values(self) -> tuple[float, float] | None:
-        """Values of the levels 0 and 1; None for radiance."""
+        """The values that levels 0 and 1 stand for, such as (-1, 1); None for radiance."""
         return VALUE_RANGES[self.encoding] if self.linear else None
 
     @property
     def span(self) -> float:
-        """Difference between the values of the levels 1 and 0."""
+        """Size of the value range: the value of level 1 minus that of level 0."""
         least, greatest = VALUE_RANGES[self.encoding]
         return greatest - least
 
@@ -100,7 +100,7 @@ def sheets_of(atlas: str, layer: str, channels: tuple[str, ...], encoding: str) 
 
 
 def first_light(sheets: Iterable[Sheet]) -> Sheet:
-    """Returns the first sheet of radiance, or the first sheet if there is none of radiance."""
+    """Returns the first sheet of radiance; without one, the first sheet."""
     sheets = list(sheets)
     return next((sheet for sheet in sheets if not sheet.linear), sheets[0])
 
@@ -111,8 +111,8 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
     Args:
         where: Name of the collection, for messages.
         sheets: The sheets to choose from.
-        layer: Name of the layer; None takes the first layer of radiance, or the first layer.
-        atlas: Name of the atlas; None takes the first atlas that has the layer.
+        layer: Name of the layer; None: the first layer of radiance; without one, the first layer.
+        atlas: Name of the atlas; None: the first atlas that has the layer.
     """
     sheets = list(sheets)
     named = [sheet for sheet in sheets if atlas in (None, sheet.atlas) and layer in (None, sheet.layer)]
@@ -132,8 +132,8 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
         sizes: Height and width of each sheet.
 
     Raises:
-        WlmError: There is no sheet; there are too many sheets, channels of an atlas or texels of all sheets; a channel
-            occurs twice; or an atlas has sheets of two sizes.
+        WlmError: There is no sheet; there are too many sheets, channels in an atlas, or texels in all sheets together;
+            a channel occurs twice; or sheets of an atlas differ in size.
     """
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")

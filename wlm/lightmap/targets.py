@@ -1,4 +1,4 @@
-"""The training data of a batch of tiles: normalised colour and weights."""
+"""Training data of a batch of tiles: normalised colours and their weights in the loss."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ class Targets:
     Attributes:
         number: int [N], numbers of the tiles in their grid.
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
-        texels: int32 [N, K], flat indices of valid texels, padded.
+        texels: int32 [N, K], flat indices of valid texels, padded to the largest count K.
         count: int32 [N], number of valid texels.
-        weight, emphasis: float32 [N, T, 3] and a number, see `wlm_kernels.lightmap.features.Batch`.
+        weight, emphasis: float32 [N, T, 3], and a number, see `wlm_kernels.lightmap.features.Batch`.
         shift, spread: float32 [N, 3].
         scale: float32 [N, T, 3].
-        range: float32 [N, T], range of the radiance, or the peak.
+        range: float32 [N, T], range of the radiance that errors are relative to, or `peak` if it is given.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Targets:
         metric_weight: float,
         peak: float | None = None,
     ) -> None:
-        """Normalises and weights colour [N, T, 128, 128, 3] in gamma space, valid in a mask [N, 128, 128].
+        """Normalises and weights gamma-space colours [N, T, 128, 128, 3] where `mask` [N, 128, 128] is true.
 
         `scale` [N, T, 3] and `affine` [N, 2, 3], the shift and the spread, are float32, as rounded for the file.
         """
@@ -77,11 +77,11 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class TileJob:
-    """A batch of N tiles of one kind as it is sent to a worker, which then does the costly part of the preparation.
+    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it.
 
     Attributes:
-        tiles: The tiles as they are cut from their sheet.
-        dynamic: Whether they are dynamic instead of static.
+        tiles: Light and masks of the tiles.
+        dynamic: Whether the tiles are dynamic instead of static.
         scale, affine: See `Targets`.
         profile: The settings.
         axis: The time axis.

@@ -1,6 +1,6 @@
-"""Tiles of a lightmap: cutting, assembling and classifying them.
+"""Cuts lightmaps into tiles, classifies the tiles, and assembles maps from them.
 
-A tile is the unit of streaming and of fitting, with a model of its own (neural-dynamic-gi, sections 3.5 and 9).
+Each tile is fitted, stored and streamed on its own (neural-dynamic-gi, sections 3.5 and 9).
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ _HALF_MANTISSA_BITS = 10
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The tiles of a map, row-major. The last row and column reach past the map's end if its size is not a multiple of
-    128.
+    """The grid of 128 x 128 tiles that covers a map, numbered row by row; tiles may reach past the map's edges.
 
     Attributes:
         height: Height of the map in texels.
@@ -48,7 +47,7 @@ class TileGrid:
 
     @classmethod
     def of(cls, height: int, width: int) -> TileGrid:
-        """Makes the grid of a map, whose size must be one that `wlm.texels.check_size` allows."""
+        """Makes the grid of a map of a size in texels; raises WlmError if `wlm.texels.check_size` does not allow it."""
         check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
@@ -58,7 +57,7 @@ class TileGrid:
         return self.rows * self.cols
 
     def origin(self, index: int) -> tuple[int, int]:
-        """Returns the row and the column of the first texel of the tile with a number in [0, count)."""
+        """Returns the row and the column of the first texel of tile `index`, which is in [0, count)."""
         if not 0 <= index < self.count:
             raise WlmError(f"tiles: tile {index} is outside the grid of {self.rows}x{self.cols} tiles")
         row, column = divmod(int(index), self.cols)
@@ -70,19 +69,19 @@ class TileGrid:
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
 
     def tiles_with(self, mask: np.ndarray) -> np.ndarray:
-        """Returns the tiles with a texel in a mask [H, W], bool [rows, columns]."""
+        """Returns which tiles have a texel in a mask [H, W], bool [rows, columns]."""
         whole = np.zeros((self.rows * TILE, self.cols * TILE), bool)
         whole[: self.height, : self.width] = mask
         return whole.reshape(self.rows, TILE, self.cols, TILE).any(axis=(1, 3))
 
     def texels_of(self, tiles: np.ndarray) -> np.ndarray:
-        """Returns the texels of chosen tiles [rows, columns], bool [H, W]."""
+        """Returns a mask of the texels of chosen tiles, bool [H, W], given bool [rows, columns]."""
         return tiles.repeat(TILE, 0).repeat(TILE, 1)[: self.height, : self.width]
 
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """N tiles in the form in which they are fitted.
+    """N tiles as gamma-space colours, padded to 128 x 128 texels.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
@@ -99,7 +98,7 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class TileCut:
-    """N tiles as views of the lightmaps that they are cut from.
+    """N tiles as array views into their lightmaps, without a copy.
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
@@ -112,7 +111,7 @@ class TileCut:
     mask: list[np.ndarray]
 
     def encoded(self, gamma: float) -> TileData:
-        """Returns the tiles in the form in which they are fitted, N * T * 192 KiB."""
+        """Converts the tiles to padded gamma-space colours, which take N * T * 192 KiB."""
         colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
 
         def encode(i: int) -> None:
@@ -150,8 +149,8 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
     Args:
         lightmaps: The sheet, frames `[T, H, W, 3]`.
-        gamma: Colours are stored as `x ** (1 / gamma)`, which spends precision on dark values; above 0.
-        tiles: Numbers of the tiles, in the order of the result; None for all. They take N * T * 192 KiB of memory.
+        gamma: Above 0; colours become `x ** (1 / gamma)`, which gives dark values more precision.
+        tiles: Numbers of the tiles, in the order of the result; None for all. N tiles take N * T * 192 KiB of memory.
 
     Returns:
         The N tiles.
@@ -164,7 +163,7 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
 
 def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
-    """Cuts the tiles with the numbers `[N]` out of a sheet without a copy; errors as for `check_index`."""
+    """Cuts tiles with the numbers `index` out of a sheet, as views without a copy. Raises as `check_index` does."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     check_index(index, grid)
     windows = [grid.window(tile) for tile in index]
@@ -172,7 +171,7 @@ def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
 
 
 def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns the texels of a mask [H, W] in the tile with a number, bool [128, 128]; false past the map's end."""
+    """Returns the part of a mask [H, W] in tile `number`, bool [128, 128]; false past the map's edges."""
     return _whole(mask[TileGrid.of(*mask.shape).window(number)])
 
 
@@ -195,7 +194,7 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Computes the pattern of each tile whose product with the means approximates a tile that only changes in strength.
+    """Computes each tile's mean pattern, whose product with the means fits a tile that only changes in brightness.
 
     It is the sum of the colours over time divided by the sum of the means, so that a nearly black time hardly counts
     and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a colour per time and a
@@ -216,30 +215,30 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
-    """Finds the smallest model that represents each tile within an error budget.
+    """Finds for each tile the simplest `TileKind` that represents it within an error budget.
 
     In linear space, over the valid texels:
 
     - `EMPTY`: the tile has no valid texel.
-    - `CONSTANT`: at every time no channel spans more than one step of half float at its least value.
+    - `CONSTANT`: at every time, the greatest value of each channel is at most one step of half float above the least.
     - `STATIC`: `means * static_pattern` has a PSNR of at least the budget at every time, relative to the range of the
       tile at that time (neural-dynamic-gi, section 10.2), or no channel of any texel is off by more than a step of half
       float.
     - `DYNAMIC`: all other tiles.
 
-    For values that are not light, `peak` replaces the range, and a tile is also constant if at every time the means of
-    its channels have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the error that this allows:
-    sources of 8 bits are never exactly flat.
+    For values that are not light, `peak` replaces the range. Such a tile is also constant if, at every time, its
+    channel means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that
+    PSNR, because 8-bit sources are never exactly flat.
 
     Args:
         tiles: From `split`.
         gamma: The gamma given to `split`.
-        static_budget_db: The lowest PSNR in decibels that makes a tile static; infinite admits only tiles within a step
-            of half float.
+        static_budget_db: The lowest PSNR in decibels that makes a tile static; if infinite, only tiles that are exact
+            to a step of half float are static.
         peak: See `wlm.lightmap.profile.Profile.peak`.
 
     Returns:
-        `TileKind` of each tile, `[N]` int64.
+        The `TileKind` of each tile, `[N]` int64.
     """
     means = channel_means(tiles.colour, tiles.mask)
     kinds = np.empty(len(tiles.index), np.int64)
@@ -257,7 +256,7 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
 
 
 def check_index(index: np.ndarray, grid: TileGrid) -> None:
-    """Raises `WlmError` unless numbers of tiles, `[N]`, are in the grid and distinct, and there is at least one."""
+    """Raises `WlmError` unless the tile numbers `index`, `[N]`, are in the grid and distinct, with at least one."""
     if not index.size:
         raise WlmError("tiles: expected at least one tile, got none")
     for tile in (index.min(), index.max()):
@@ -274,7 +273,7 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
         image: `[H, W, C]`, written.
         tiles: `[N, 128, 128, C]`. Texels past the map's end are dropped.
         index: `[N]`, number of each tile in the grid.
-        grid: The map's.
+        grid: The grid of the map.
     """
     for tile, number in zip(tiles, index, strict=True):
         part = image[grid.window(number)]
@@ -282,7 +281,7 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
 
 
 def _whole(valid: np.ndarray) -> np.ndarray:
-    """Returns the valid texels of a tile [h, w] as [128, 128]."""
+    """Pads the mask [h, w] of a tile at the map's end to [128, 128] with false."""
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask
@@ -305,7 +304,7 @@ def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
 
 
 def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
-    """Returns whether the means of the channels are near all texels at every time, see `classify`."""
+    """Returns whether all texels are close to the channel means at every time, see `classify`."""
     linear = colour[:, valid].astype(np.float64) ** gamma
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)

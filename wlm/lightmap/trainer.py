@@ -1,4 +1,4 @@
-"""Training of one batch of tiles on a device: its parameters, its optimisers and its steps."""
+"""Trains one batch of tiles on a device."""
 
 import math
 import time
@@ -35,14 +35,14 @@ CPU_LANES = 2
 
 
 def _padded(count: int) -> int:
-    """Returns the length of an optimiser's tensor of `count` numbers."""
+    """Returns the padded length of a tensor of `count` parameters."""
     # Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
     # CPUs: without a remainder, a tile is the same in any batch.
     return -(-count // _VECTOR) * _VECTOR
 
 
 def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns zeros for an optimiser, flat and padded, and a view of them in their shape; both have gradients."""
+    """Returns a flat, padded tensor of zeros for an optimiser, and a view of it in `shape`; both have gradients."""
     count = math.prod(shape)
     stored = torch.zeros(_padded(count), device=device).requires_grad_()
     stored.grad = torch.zeros_like(stored)
@@ -52,25 +52,25 @@ def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch
 
 
 class Trainer:
-    """Trains N tiles of one kind together; see `Profile` for the stages.
+    """Trains N tiles of one kind together; see `stage` for the stages of the training.
 
     `state` holds everything that a later step depends on, so that a resumed fit continues exactly.
 
     Attributes:
         axis: The time axis.
-        steps: Steps of the fit.
+        steps: Number of steps of the fit.
         frozen: The first step at which only the network is trained.
-        device: As `interop.check_device` returns it.
+        device: The device, as `interop.check_device` returns it.
         temporal: Whether the tiles are DYNAMIC instead of STATIC.
         numbers: int32 [N], numbers of the tiles in their grid.
-        tiles: N.
+        tiles: N, the number of tiles.
         inputs: Number of inputs of the network.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
-        maps, maps_grad: float32 [M], all maps and their gradients, padded.
+        maps, maps_grad: float32 [M], all M parameters of the maps, padded, and their gradients.
         hidden, output: The networks, see `wlm_kernels.mlp`.
         loss: float32 [N], running mean of each tile's loss over about 50 steps.
-        control: int32 [1], steps done.
-        batch: The targets as the kernels take them.
+        control: int32 [1], number of steps done.
+        batch: The training data in the form that the kernels read.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Trainer:
     ):
         """Uploads the targets of STATIC or DYNAMIC tiles and draws the initial parameters.
 
-        The seed is that of the parameters and of all samples; `track` sums the errors that `psnr` needs.
+        The seed determines the initial parameters and all samples; `track` collects the errors that `psnr` needs.
         """
         self._track = track
         self.axis, self.device, self.temporal = axis, device, temporal_maps
@@ -122,7 +122,7 @@ class Trainer:
         ]
 
     def _allocate(self, shapes: dict[str, tuple[int, ...]], hidden: int) -> None:
-        """Allocates maps of these shapes, networks of a width, and all that a step writes."""
+        """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
         device, n = self.device, self.tiles
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
         total = _padded(sum(lengths.values()))
@@ -203,7 +203,7 @@ class Trainer:
             self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
-        """Returns Adam on a GPU for one array of parameters, with moments of 0."""
+        """Returns the state of our GPU Adam for one array of parameters, with all moments 0."""
         adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
@@ -244,7 +244,7 @@ class Trainer:
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
-        """Returns the schedule of learning rates for `gather.update_maps`."""
+        """Returns the learning rates and Adam's corrections at each step, vec3 [steps], for `gather.update_maps`."""
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
@@ -252,7 +252,7 @@ class Trainer:
         return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:
-        """Draws the initial parameters. Each tile has its own generator, so that it is the same in any batch."""
+        """Draws random initial parameters. Each tile has its own generator, so that batching does not change them."""
         hidden, inputs = self.hidden.shape[-1], self.inputs
         maps = {key: np.empty(view.shape, np.float32) for key, view in self.views.items()}
         w = np.zeros(tuple(self.hidden.shape), np.float32)
@@ -273,15 +273,15 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        """Steps done."""
+        """Number of steps done."""
         return int(self.control.item())
 
     def stage(self, step: int) -> int:
-        """Returns the stage of a step: 0 continuous maps with noise, 1 maps on their exact levels, 2 maps frozen."""
+        """Returns the stage of a step: 0 continuous maps with noise, 1 quantised maps, 2 frozen maps."""
         return int(step >= self._quantised_from) + int(step >= self.frozen)
 
     def run(self, steps: int) -> None:
-        """Queues the next steps."""
+        """Runs the given number of training steps; on a GPU it only queues them."""
         first = self.step
         threads = torch.get_num_threads()
         try:
@@ -327,7 +327,7 @@ class Trainer:
                 adam.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs `work(lane)` for each lane in threads; a launch releases Python's lock."""
+        """Runs `work(lane)` for each CPU lane in a thread of its own; kernel launches release Python's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
     def losses(self) -> np.ndarray:
@@ -335,7 +335,7 @@ class Trainer:
         return self.loss.cpu().numpy()
 
     def psnr(self) -> float:
-        """Returns the mean PSNR over tiles and times of the samples since the last call; NaN without `track`."""
+        """Returns the mean PSNR in dB over tiles and times, for samples since the last call; NaN without `track`."""
         with interop.stream(self.device):
             sums = self._tracked.sum(0).cpu()
             self._tracked.zero_()
@@ -344,7 +344,7 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """Returns the maps and networks by name, as in `SheetModel`; the networks of static tiles are also `net`."""
+        """Returns maps and networks by their names in `SheetModel`; networks of static tiles are called `net` too."""
         nets = self.hidden.detach(), self.output.detach()
         if self._integers:
             nets = self._on_levels
@@ -361,7 +361,7 @@ class Trainer:
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
-        """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]."""
+        """Returns the map of this name as BC7 blocks, uint8 [S, H/4, W/4, 16]; S counts tiles, or tiles and slices."""
         endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
         with interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
@@ -373,10 +373,11 @@ class Trainer:
         return pack_mode6(levels.numpy(), index)
 
     def check(self) -> None:
-        """Checks that the fit is sound.
+        """Checks that the fit has not diverged.
 
         Raises:
-            WlmError: It diverged: the loss or maps of a tile are not finite, or its network is not in half floats.
+            WlmError: It diverged: the loss or the maps of a tile are not finite, or its network exceeds the range of
+                half floats.
         """
         broken = ~torch.isfinite(self.loss)
         for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
@@ -388,7 +389,7 @@ class Trainer:
             )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps depend on."""
+        """Returns all arrays that later steps depend on, by name."""
         self.check()
         result = {key: getattr(self, key) for key in _STATE} | self._moments
         for name, adam in self._adams.items():
@@ -398,7 +399,7 @@ class Trainer:
         return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """Returns the types and shapes of a `state` after `step` steps."""
+        """Returns the types and shapes of the arrays that `state` returns after `step` steps, by name."""
         table = {key: Part(np.float32, tuple(getattr(self, key).shape)) for key in _STATE}
         table["control"] = Part(np.int32, (1,), least=step, most=step)
         for key, values in self._moments.items():
@@ -417,10 +418,10 @@ class Trainer:
         return table
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores a `state`.
+        """Restores what `state` returned.
 
         Raises:
-            ValueError: A part is missing, of another shape or out of its range; the trainer is unchanged.
+            ValueError: An array is missing, has another shape or is out of range; the trainer is then unchanged.
         """
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         parts = check_parts(state, self.table(int(done[0])))
@@ -436,7 +437,7 @@ class Trainer:
                         adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
-        """Ends the threads of the CPU lanes."""
+        """Ends the threads that `_share` runs work in."""
         if self._pool is not None:
             self._pool.shutdown()
 
@@ -446,9 +447,9 @@ class Advance:
     """The progress of a batch.
 
     Attributes:
-        step: Steps done.
-        loss, psnr: Means over its tiles of the latest samples, see `Trainer`; NaN if they are not tracked. At the end
-            they are of the maps as the file holds them.
+        step: Number of steps done.
+        loss, psnr: Means over the batch's tiles, from the latest samples, see `Trainer`; NaN if not tracked. After the
+            last step they are means for the maps as the file holds them.
         parts: The maps and networks as the file holds them, once the batch is done.
     """
 
@@ -462,12 +463,12 @@ class Fitter:
     """Fits batches of tiles one after another, in this process or in another one (`wlm.workers`)."""
 
     def __init__(self, seed: int, device: str, track: bool) -> None:
-        """Takes the seed, the device and whether to report the PSNR, which all batches share."""
+        """Takes settings for all batches: the seed, the device, and whether to report the PSNR (`track`)."""
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
         self._trainer: Trainer | None = None
 
     def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
-        """Begins a batch, or continues it from its state at an earlier step; a state of another one is a ValueError."""
+        """Starts a batch, or continues it from a saved `state`; raises ValueError if that is of another batch."""
         self.close()
         options = job.dynamic, self._seed, self._device, self._track
         self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)
@@ -478,7 +479,7 @@ class Fitter:
         return Advance(self._trainer.step)
 
     def advance(self, seconds: float) -> Advance:
-        """Trains for some seconds, at least a few steps, or to the end of the batch."""
+        """Trains the batch for about `seconds`, at least a few steps, or to its end; returns the progress."""
         trainer = self._trainer
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
@@ -499,11 +500,11 @@ class Fitter:
         return Advance(step, *figures, parts)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps of the batch depend on."""
+        """Returns all arrays that later steps of the batch depend on, by name."""
         return self._trainer.state()
 
     def close(self) -> None:
-        """Drops the batch."""
+        """Drops the batch and frees its memory."""
         if self._trainer is not None:
             self._trainer.close()
             self._trainer = None

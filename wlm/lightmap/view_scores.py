@@ -1,20 +1,20 @@
-"""Error of a decoded lightmap set where it is shown: filtered, between the stored hours, over time, in views of a mesh.
+"""Error of a decoded lightmap as a renderer shows it: filtered, between stored hours, over time, in views of a mesh.
 
 The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels at the stored times. A renderer reads
-elsewhere: it filters, so that texels of the gaps between charts and of neighbouring tiles count too, at any hour. The
-scores here are over the same tiles and times, relative to the same range, that of the tile at that time. They are
-described in docs/lightmap.md and at `ShownScore`. Random points and places are the same in every run, and reads are
-clamped at the ends of the map.
+filtered light at any hour, so that texels of gaps between charts and of neighbouring tiles matter too. The scores of
+this module cover the same tiles and times; errors are relative to a tile's range of values at a time. The scores are
+described in docs/lightmap.md and at `ShownScore`. Random points and times are the same in every run, and reads are
+clamped at the edges of the map.
 
-`flicker` takes two steps of 3 minutes (1/480 of the period) at a random place in each of 12 intervals between stored
+`flicker` takes two steps of 3 minutes (1/480 of the period) at a random time in each of 12 intervals between stored
 times. With D the decoded and R the original light, it is the mean over valid texels, tiles and steps of
 
     max(|D(t + step) - D(t)| - |R(t + step) - R(t)|, 0) / range
 
-Views: cameras are spread evenly on a sphere around the mesh of the set (`wlm.ops.views`), each at one of its times in
+Views: cameras are spread evenly on a sphere around the set's mesh (`wlm.ops.views`); each draws one stored time, in
 turn. Back faces are not drawn, so that a room is visible through its walls. A pixel is the light of the lightmap at its
-surface point, read bilinearly, displayed with the exposure of that time (`wlm.texels.exposure`), Reinhard's curve and
-sRGB. Pixels without a surface do not count.
+surface point, read bilinearly, displayed with that time's exposure (`wlm.texels.exposure`), Reinhard's curve and sRGB.
+Pixels without a surface do not count.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ VIEWS, RESOLUTION = 50, 512
 
 @dataclass(frozen=True)
 class ViewScore(system.Report):
-    """The error in views. Without a view that shows the mesh it is NaN or None.
+    """The error in rendered views. If no view shows the mesh, its fields are NaN or None.
 
     Attributes:
         views: Number of views that show the mesh.
@@ -68,7 +68,7 @@ NO_VIEWS = ViewScore(0, math.nan, math.nan, None)
 
 
 class Views:
-    """Accumulates the error in views, time by time."""
+    """Renders the views and accumulates their error, time by time."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Views:
         """Places the cameras.
 
         Args:
-            lightmaps: The sheet, for its times, its mask and the exposures.
+            lightmaps: The sheet, whose times, mask and exposures are used.
             geometry: The mesh, with UVs.
             count: Number of cameras.
             indices: Indices of the times that will be added; None: all.
@@ -103,12 +103,12 @@ class Views:
         self._pictures = Pictures()
 
     def add(self, index: int, original: np.ndarray, decoded: np.ndarray) -> None:
-        """Draws the views of a time.
+        """Draws the views of one time from the original and the decoded map, and adds their errors.
 
         Args:
             index: Index of the time.
             original: Linear radiance, float32 [H, W, 3], with gaps filled.
-            decoded: The decoded map.
+            decoded: The decoded map, in the same form.
         """
         numbers = self._cameras[index]
         if not numbers:
@@ -138,13 +138,13 @@ class Views:
 def views_of(
     lightmaps: SheetFrames, count: int, indices: Sequence[int] | np.ndarray | None = None, device: str = "cpu"
 ) -> tuple[Views | None, list[str]]:
-    """Makes the views of a sheet that names a mesh.
+    """Makes the `Views` of a sheet, from the mesh that the sheet names.
 
     Args:
         lightmaps, count, indices, device: As for `Views`.
 
     Returns:
-        The views, None without a mesh or with a count of 0; and a warning if the mesh can not be read.
+        The views, or None without a mesh or with a count of 0; and a warning if the mesh cannot be read, else None.
 
     Raises:
         WlmError: The count is negative, or there is no such device.
@@ -170,18 +170,18 @@ _STEPS_OF_PERIOD, _STEP = 480, 0.05  # a step of `flicker` as a share of the per
 
 @dataclass(frozen=True)
 class ShownScore(ViewScore):
-    """The error where light is shown, see the module. A score without anything to measure is NaN or None.
+    """The error of light as a renderer shows it, see the module. Scores without anything to measure are NaN or None.
 
     Attributes:
         seen: PSNR of filtered reads, dB, mean over tiles and times.
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
-        worst_seen: The tile and time with the lowest one: `psnr`, `time`, `tile` (its number), `row`, `column`.
+        worst_seen: The tile and time with the lowest `seen`: `psnr`, `time`, `tile` (its number), `row`, `column`.
         ring: PSNR of the texels of gaps that touch a chart, dB, mean over tiles and times.
         between: PSNR half-way between stored times, dB, mean over tiles and intervals.
-        worst_between: The lowest one, as in `worst_seen`; `time` is the middle.
-        border: RMS error of reads across borders of tiles divided by that within tiles, relative to the range of each
-            texel's tile; 1: borders are invisible.
+        worst_between: The tile and interval with the lowest `between`, as in `worst_seen`; `time` is the half-way time.
+        border: RMS error of reads across tile borders divided by the RMS error of reads within tiles, relative to the
+            range of each texel's tile; at 1, borders are invisible.
         flicker: Mean change in a step of 3 minutes beyond the change of the original, as a share of the range.
     """
 
@@ -197,7 +197,7 @@ class ShownScore(ViewScore):
 
 
 class Tally:
-    """Accumulates the scores of a decoder, time by time."""
+    """Accumulates the scores of this module for one decoder, time by time."""
 
     def __init__(
         self,
@@ -208,17 +208,17 @@ class Tally:
         name: str = "lightmap",
         peak: float | None = None,
     ) -> None:
-        """Prepares the reads.
+        """Prepares the scoring of one sheet.
 
         Args:
             lightmaps: The input.
-            mask: bool [H, W], the valid texels that are scored. In tiles that only have others, such as tiles that are
+            mask: bool [H, W], the valid texels that are scored. In tiles without any such texel, such as tiles that are
                 not in the file, the decoded light counts as correct.
             decode: Returns linear radiance [H, W, 3] for any time, also between two stored ones; None: light between
-                stored times is the mix of the two lightmaps that were added (eq. 2).
+                stored times is interpolated from the two decoded maps that were added (eq. 2).
             views: Views of the mesh; None for none.
             name: Name of the decoder in messages.
-            peak: As for `wlm.metrics.evaluate_frame`.
+            peak: Fixed range that errors are relative to, as in `wlm.metrics.evaluate_frame`.
         """
         self._lightmaps, self._mask, self._decode, self._views, self._name = lightmaps, mask, decode, views, name
         self._peak = peak
@@ -241,7 +241,7 @@ class Tally:
         self._added: dict[int, np.ndarray | None] = {}
 
     def add(self, index: int, decoded: np.ndarray, metrics: FrameMetrics) -> None:
-        """Adds a stored time; an interval is scored once both of its ends are added.
+        """Adds the decoded map of a stored time; an interval is scored once both of its ends are added.
 
         Args:
             index: Index of the time, above that of the last call.
@@ -310,13 +310,13 @@ class Tally:
 
     @functools.cached_property
     def _left_out(self) -> np.ndarray | None:
-        """bool [H, W], the tiles whose valid texels are not scored; None if there are none."""
+        """All texels of tiles that have valid texels but no scored ones, bool [H, W]; None if there are none."""
         grid = self._grid
         tiles = grid.tiles_with(self._lightmaps.mask) & ~grid.tiles_with(self._mask)
         return grid.texels_of(tiles) if tiles.any() else None
 
     def _add_points(self, index: int, error: np.ndarray, metrics: FrameMetrics) -> None:
-        """Scores the reads at points: a read of the difference is the difference of the reads."""
+        """Scores `seen` and `border`. Reads are linear, so only the error map (decoded - original) has to be read."""
         grid, (read, sides) = self._grid, _points()
         ends = ((1, grid.rows * TILE + 1 - grid.height), (1, grid.cols * TILE + 1 - grid.width))
         padded = np.pad(error, (*ends, (0, 0)), mode="edge")
@@ -341,7 +341,7 @@ class Tally:
                 self._border += len(crossing) * np.array([across, inner.mean() / span**2])
 
     def _add_interval(self, index: int) -> None:
-        """Scores the interval after a stored time."""
+        """Scores `between` and `flicker` in the interval after a stored time."""
         after = (index + 1) % self._count
         first, second = self._lightmaps.frames[index], self._lightmaps.frames[after]
         middle = float(self._middles[index])
@@ -368,7 +368,7 @@ class Tally:
             self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
     def _place(self, psnr: np.ndarray, times: np.ndarray) -> dict[str, float | int] | None:
-        """Returns the lowest of PSNRs [n, rows, columns] and its place."""
+        """Returns the lowest of PSNRs [n, rows, columns] with its tile and time, as in `ShownScore.worst_seen`."""
         if np.isnan(psnr).all():
             return None
         lowest = int(np.nanargmin(psnr))
@@ -379,7 +379,7 @@ class Tally:
 
 
 class _Texels:
-    """Some texels of a map, and sums over those of each tile."""
+    """A selection of a map's texels, whose values can be summed by tile."""
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)
@@ -388,18 +388,18 @@ class _Texels:
         self.count = np.bincount(self._tile, minlength=grid.count).reshape(self._shape)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Returns sums of values, float64 [K, 3], over the texels and channels of each tile, [rows, columns]."""
+        """Sums values, float64 [K, 3], of the K selected texels over texels and channels by tile: [rows, columns]."""
         rows, columns = self._shape
         return np.bincount(self._tile, values.sum(1), rows * columns).reshape(self._shape)
 
 
 @functools.cache
 def _points() -> tuple[csr_array, np.ndarray]:
-    """Returns the points of a tile, `POINTS` for each texel, row by row; all tiles have the same.
+    """Returns the random points at which each tile is read, `POINTS` for each texel, row by row.
 
     Returns:
-        The matrix that reads them, [16384 POINTS, 130 x 130], from the tile with one more texel on each side; and bool
-        [4, 16384 POINTS], whether a read includes texels above, below, left or right of the tile.
+        The sparse matrix [16384 POINTS, 130 x 130] of bilinear weights, for a tile with one more texel on each side;
+        and bool [4, 16384 POINTS]: whether a read includes texels above, below, left or right of the tile.
     """
     side = TILE + 2
     place = np.random.default_rng(_SEED).random((2, TILE, TILE, POINTS)) - 0.5

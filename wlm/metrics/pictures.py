@@ -10,7 +10,7 @@ from wlm.metrics.structural import ssim
 
 
 def picture_error(reference: np.ndarray, test: np.ndarray, seen: np.ndarray, flip: bool = True) -> tuple[float, float]:
-    """Compares a pair of pictures.
+    """Computes the error of a test picture against a reference picture.
 
     Args:
         reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.

@@ -36,7 +36,7 @@ def bc7_map(
         weights: float [H, W] or [L, H, W], one per texel, clamped like the endpoints; has a gradient.
         uv: float [..., 2], u right, v down, the centre of texel i of n at (i + 1/2) / n; has a gradient.
         layer: int32 or int64 [...], 0 to L - 1: the index of each point's map.
-        quantised: Whether to evaluate on the exact levels of BC7 mode 6.
+        quantised: Whether to round to the values that BC7 mode 6 can store.
 
     Returns:
         float [..., 4].
@@ -57,13 +57,13 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
     Args:
         endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.
         weights: float [H, W] or [L, H, W].
-        quantised: Whether to evaluate on the exact levels of BC7 mode 6.
+        quantised: Whether to round to the values that BC7 mode 6 can store.
 
     Returns:
         float [H, W, 4] or [L, H, W, 4], an input for `plane`, or for `volume` if the maps are its slices.
 
     Raises:
-        ValueError: As for `bc7_map`.
+        ValueError: See `bc7_map`.
     """
     _check(endpoints, weights)
     shape = (-1 if weights.numel() else 0, *weights.shape[-2:])
@@ -82,7 +82,7 @@ def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
         uint8 [H/4, W/4, 16] or [L, H/4, W/4, 16], BC7 blocks of mode 6.
 
     Raises:
-        ValueError: As for `bc7_map`.
+        ValueError: See `bc7_map`.
     """
     _check(endpoints, weights)
     *layers, height, width = weights.shape

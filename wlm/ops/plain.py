@@ -186,7 +186,7 @@ def rasterize(clip: Tensor, triangle: Tensor, height: int, width: int) -> Raster
 
 
 def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raster:
-    """Rasterizes like `rasterize`, for corners [V, 2] in a texture; the first of overlapping triangles is visible."""
+    """Rasterizes like `rasterize`, for corners [V, 2] in UV space; the first of overlapping triangles is visible."""
     return rasterize(uv, triangle, height, width)
 
 

@@ -92,7 +92,7 @@ def rasterize_uv(
         derivative, coverage: Whether to compute these fields of `Raster`.
 
     Raises:
-        ValueError: As for `rasterize`.
+        ValueError: See `rasterize`.
     """
     return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
 
@@ -110,7 +110,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
         float [H, W, C].
 
     Raises:
-        ValueError: As for `rasterize`.
+        ValueError: See `rasterize`.
     """
     check("attribute", attribute, (None, None))
     triangle = _checked_triangles(triangle, attribute)

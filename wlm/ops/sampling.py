@@ -54,7 +54,7 @@ def volume(
         float [..., C].
 
     Raises:
-        ValueError: As for `plane`.
+        ValueError: See `plane`.
     """
     return sample(values, points, layer, periodic, axes=3)
 
@@ -77,7 +77,7 @@ def triplane(
         float [..., C], or [..., the sum of the three C].
 
     Raises:
-        ValueError: As for `plane`, or there is no such reduction.
+        ValueError: See `plane`; or there is no such reduction.
     """
     if reduce not in REDUCTIONS:
         raise ValueError(f"reduce: expected one of {', '.join(REDUCTIONS)}, got {reduce!r}")

@@ -83,7 +83,7 @@ def zeros_for(tensor: torch.Tensor, needed: bool = True) -> torch.Tensor | None:
 
 
 def optional_array(tensor: torch.Tensor | None, dimensions: int, dtype: Any, device: torch.device) -> wp.array:
-    """Wraps a buffer as a Warp array; None becomes the empty array, which tells a kernel that there is no buffer."""
+    """Wraps a buffer as a Warp array; None becomes an empty array, by which a kernel knows there is no buffer."""
     if tensor is None:
         return wp.empty((0,) * dimensions, dtype=dtype, device=wp.device_from_torch(device))
     return to_warp(tensor, dtype)

@@ -1,1 +1,1 @@
-"""Kernels of temporal lightmaps."""
+"""Warp kernels that train and decode lightmaps over time."""

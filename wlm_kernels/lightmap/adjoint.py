@@ -1,9 +1,9 @@
-"""Hand-written adjoints of sampling a temporal lightmap's maps: each adds a gradient to the cells that were read.
+"""Hand-written adjoints of sampling feature maps: each adds a sample's gradient to the texels that were read.
 
-On CUDA gradients are added as 64-bit integers, since the result of integer addition does not depend on the order and
-one seed must give one result; on the CPU each lane (a range of samples, run by one thread) has its own float buffers.
+On CUDA gradients are added as 64-bit integers: integer sums do not depend on the order of addition, so that one seed
+gives one result. On the CPU each lane (a range of samples, run by one thread) has its own float buffers.
 
-Read first: `tests/reference/temporal.py`, `train_features`, whose gradients by autograd these are.
+Read first: `train_features` in `tests/reference/temporal.py`, whose autograd gradients these functions reproduce.
 """
 
 import functools
@@ -18,7 +18,7 @@ from wlm_kernels.lightmap.features import Maps, Offsets
 
 @wp.func
 def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
-    """Returns the linear weights of the two cells of an axis; 0 for a cell outside `block`."""
+    """Returns the linear weights of the two texels read along an axis; 0 for texels outside the 4-texel `block`."""
     a = wp.where(first // 4 == block, 1.0 - f, 0.0)
     b = wp.where(second // 4 == block, f, 0.0)
     return wp.vec2(a, b)
@@ -48,7 +48,7 @@ _Spread = wp.types.vector(8, float)
 #endif
 """)
 def _spread_texels(g: wp.vec4) -> _Spread:
-    """Returns channel l % 4 of the samples of lanes 4 r + l / 8, for lane l."""
+    """Redistributes g over a warp: number r for lane l is channel l % 4 of the g of lane 4 r + l / 8."""
 
 
 @wp.func_native("""
@@ -68,7 +68,7 @@ def _spread_texels(g: wp.vec4) -> _Spread:
 #endif
 """)
 def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
-    """Adds a g to 4 sums from `at` on and b g to the next 4, if `at` is not negative; all lanes of a warp call it."""
+    """Adds a * g to sums at .. at + 3 and b * g to the next 4; nothing if at < 0. All lanes of a warp must call it."""
 
 
 @wp.func_native("""
@@ -94,7 +94,7 @@ def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: f
 #endif
 """)
 def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
-    """Adds two numbers to each of two cells of a row and two of the next; all lanes of a warp call it."""
+    """Adds v, two channels for each of two texels, to rows `early` and `late` by weight; all warp lanes call it."""
 
 
 @wp.func
@@ -104,7 +104,7 @@ def _spread_none(g: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns the functions and types of additions: of one number, its type, of the endpoints of a block, and of g."""
+    """Returns `add` of a number, the type of sums, `add_endpoints` of a block, and what prepares its g."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -130,13 +130,13 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
 
 @functools.cache
 def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
-    """Builds (once) the adjoints of texel, volume and plane sampling.
+    """Builds (once) the adjoints of sampling F_uv, F_uvt, and the planes F_ut and F_vt.
 
     Args:
         device_kind: "cpu" or "cuda".
 
     Returns:
-        Three `wp.func`s and the scalar type of the sums that they add to.
+        Three `wp.func`s in this order, and the scalar type of the gradient sums.
     """
     add, scalar, add_endpoints, spread = _adders(device_kind)
 

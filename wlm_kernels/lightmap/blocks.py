@@ -1,12 +1,12 @@
-"""Feature maps stored as BC7 mode 6 blocks: endpoints and weights, their exact levels, and their texels.
+"""Feature maps stored as BC7 mode 6 blocks: evaluates and quantises them in training, and decodes stored blocks.
 
 A map of 4 channels is cut into blocks of 4x4 texels. A block has two endpoints `e0, e1` in [0, 1]^4 and one
 weight in [0, 1] per texel; a texel is `(1 - w) e0 + w e1` (neural-dynamic-gi, eq. 7 and 8). BC7 mode 6 stores the
 endpoints with 7 bits a channel plus one lowest bit shared by the four channels, and the weights with 4 bits.
 
-`quantised` evaluates the map on exactly those levels, so that training sees the texels that the file decodes to. The
-adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that
-Adam can bring them back. `wlm.ops.plain.bc7_texels` is the same in a few lines of torch.
+With `quantised`, endpoints and weights are rounded to these levels, so that training sees the texels of the file. The
+adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that Adam
+can bring them back. `wlm.ops.plain.bc7_texels` is the same in a few lines of torch.
 
 Arrays: endpoints `[S, H/4, W/4, 2]` of vec4, weights `[S, H, W]`, where S counts slices (tiles, or tiles x
 times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the high half of 16 little-endian bytes.
@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def weight_index(w: float) -> int:
-    """Returns the 4-bit index of a weight; index i stands for the level (64 i + 7) // 15 of 64."""
+    """Returns the 4-bit index of the BC7 weight nearest to w; index i means the weight ((64 i + 7) // 15) / 64."""
     return int(wp.floor(wp.clamp(w, 0.0, 1.0) * 15.0 + 0.5))
 
 
@@ -30,7 +30,7 @@ def index_level(index: int) -> int:
 
 @wp.func
 def ste_weight(w: float, quantised: int) -> float:
-    """Returns the weight as used: clamped, or on its exact level of 64ths. Its derivative is taken as 1."""
+    """Returns w clamped to [0, 1], or if quantised the nearest BC7 weight. The adjoint treats the derivative as 1."""
     if quantised == 0:
         return wp.clamp(w, 0.0, 1.0)
     return float(index_level(weight_index(w))) / 64.0
@@ -46,7 +46,7 @@ def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
 
 @wp.func
 def endpoint_byte(e: wp.vec4) -> wp.vec4:
-    """Returns the stored bytes (as floats 0..255) of an endpoint, with the better of the two shared lowest bits."""
+    """Returns the stored bytes of an endpoint as floats 0..255, with the shared lowest bit that has less error."""
     v = wp.vec4(
         wp.clamp(e[0], 0.0, 1.0) * 255.0,
         wp.clamp(e[1], 0.0, 1.0) * 255.0,
@@ -62,7 +62,7 @@ def endpoint_byte(e: wp.vec4) -> wp.vec4:
 
 @wp.func
 def ste_endpoint(e: wp.vec4, quantised: int) -> wp.vec4:
-    """Returns the endpoint as used, in [0, 1]: clamped, or on its exact bytes / 255. Its derivative is taken as 1."""
+    """Returns e clamped to [0, 1], or if quantised its stored bytes / 255. The adjoint treats the derivative as 1."""
     if quantised == 0:
         return wp.vec4(
             wp.clamp(e[0], 0.0, 1.0),
@@ -202,14 +202,14 @@ def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
         endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
         weights: float [S, H, W], in [0, 1].
         out: vec4 [S, H, W].
-        quantised: Evaluate on the exact levels of BC7 mode 6.
+        quantised: Whether endpoints and weights are rounded to the levels of BC7 mode 6.
     """
     inputs = [endpoints, weights, int(quantised)]
     wp.launch(_reconstruct, weights.shape, inputs=inputs, outputs=[out], device=weights.device)
 
 
 def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False) -> None:
-    """The adjoint of `reconstruct`, straight through clamps and roundings; each run gives the same bits.
+    """The adjoint of `reconstruct`, which takes clamping and rounding as identity; results are the same in every run.
 
     Args:
         endpoints, weights, quantised: As for `reconstruct`.
@@ -223,7 +223,7 @@ def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weig
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:
-    """Writes the integers that the file stores: the levels on which `quantised` evaluates.
+    """Writes the integers that the file stores for endpoints and weights.
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2].

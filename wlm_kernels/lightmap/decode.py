@@ -1,9 +1,9 @@
-"""Decodes temporal lightmap tiles from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
+"""Decodes tiles of a lightmap over time from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is the
-runtime path: values that depend on the time alone are computed once per frame (the two slices of F_uvt are mixed; F_ut
-and the encoded time pass the first layer for each column), and a thread decodes four texels, so that each weight is
-loaded once for four texels.
+`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is faster,
+for use at run time: what all texels of a frame share is computed once (F_uvt interpolated between two slices, and for
+each column the contribution of F_ut and the encoded time to the first layer), and a thread decodes four texels, so that
+each weight is loaded once for four texels.
 
 Read `wlm/lightmap/exact.py` first; it contains the same decode in NumPy.
 """
@@ -23,7 +23,7 @@ from wlm_kernels.shared_exponent import pack_rgb9e5
 
 @wp.struct
 class Stored:
-    """N tiles as stored, S slices of F_uvt. Static tiles leave all but the first empty."""
+    """Feature maps of N tiles as stored, with S slices in F_uvt. For static tiles all arrays but `uv` are empty."""
 
     uv: wp.array4d[wp.uint64]  # [N, 32, 32, 2]
     uvt: wp.array4d[wp.uint64]  # [N * S, R/4, R/4, 2]
@@ -35,7 +35,7 @@ class Stored:
 
 @wp.struct
 class TimeState:
-    """One time, and the coefficients that convert the output y of a network to colour: (shift + spread y) scale."""
+    """A time, and for each tile what turns its network's output y into colour: (shift + spread y) scale."""
 
     tau: float
     encoding: wp.vec4
@@ -95,7 +95,7 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
 
 @wp.func
 def finish_colour(time: TimeState, n: int, y: wp.vec3) -> wp.vec3:
-    """Returns the colour in gamma space, not below 0."""
+    """Converts the output y of tile n's network to colour in gamma space, clamped to at least 0."""
     c = wp.cw_mul(time.shift[n] + wp.cw_mul(time.spread[n], y), time.scale[n])
     return wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0))
 
@@ -123,7 +123,7 @@ def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
 
 @wp.func
 def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
-    """Returns a colour in 8 bits relative to a bound; alpha is 255."""
+    """Packs colour * `inverse_bound` to 8-bit RGBA with R in the lowest byte; alpha is 255."""
     r = finish_byte(colour[0], inverse_bound)
     g = finish_byte(colour[1], inverse_bound)
     b = finish_byte(colour[2], inverse_bound)
@@ -132,18 +132,18 @@ def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
 
 @wp.func
 def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Returns the 8-bit output: gamma-space colour relative to the bound of the tile at this time; alpha is 255."""
+    """Converts the network's output y to 8-bit RGBA: gamma-space colour relative to the tile's bound; alpha is 255."""
     return bytes_over(finish_colour(time, n, y), time.inverse_peak[n])
 
 
 @wp.func
 def finish_shared(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Returns linear radiance as RGB9E5."""
+    """Converts the network's output y to linear radiance packed as RGB9E5."""
     return pack_rgb9e5(finish_radiance(time, n, y))
 
 
 def finish_words(shared: bool) -> Any:
-    """Returns the function that packs the output of a network: as RGB9E5, or as 8 bits relative to a bound."""
+    """Returns the `wp.func` that packs a network's output: `finish_shared` (RGB9E5) or `finish_bytes` (8-bit RGBA)."""
     return finish_shared if shared else finish_bytes
 
 
@@ -157,10 +157,10 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any
         gelu: One of `mlp.GELUS`.
 
     Returns:
-        Two kernels over (tiles, 128, 128). Their inputs are `Stored`, hidden vecH [N, I + H + 2], output vec3
-        [N, H + 1], `TimeState`, places int [N] (position of each tile in `TimeState`) and tiles int [n]. Their output
-        is [n, 128, 128]: linear radiance as vec3; 8-bit colour as uint32, RGBA from the lowest byte; or linear radiance
-        as uint32, RGB9E5.
+        Kernels with a thread for each texel of n tiles. Their inputs are `Stored`, the networks hidden vecH [N, I + H +
+        2] and output vec3 [N, H + 1] with I inputs, `TimeState`, places int [N] (index of each tile in `TimeState`) and
+        tiles int [n], the tiles to decode. Their output is [n, 128, 128]: linear radiance as vec3; 8-bit colour as
+        uint32, RGBA from the lowest byte; or linear radiance as uint32, RGB9E5.
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -229,7 +229,7 @@ def frame_volume(
     # out:
     volume: wp.array3d[wp.vec4],
 ):
-    """Computes F_uvt at one time, centred: [N, R, R]."""
+    """Writes F_uvt, interpolated at one time and centred, to `volume` [N, R, R]."""
     n, y, x = wp.tid()
     t = cell(tau, stored.slices)
     ft = fraction(tau, stored.slices)
@@ -241,7 +241,7 @@ def frame_volume(
 
 @dataclass(frozen=True)
 class StripKernels:
-    """The runtime path of one network shape; see `decode`.
+    """Kernels of the fast decoder for one hidden width; see `decode`.
 
     Attributes:
         hidden: H, width of the hidden layers.
@@ -266,18 +266,18 @@ class StripKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles to words at one time.
+        """Decodes tiles at one time to 32 bits per texel.
 
         Args:
             stored: Dynamic tiles.
-            hidden: vecH [N, I + H + 2].
-            output: vec3 [N, H + 1].
-            time: The time.
-            volume: vec4 [N, R, R], scratch.
-            columns: float [N, H, 128], scratch.
-            rows: vec2 [N, 128], scratch.
-            places: int [N], position of each tile in `time`.
-            tiles: int [n], the tiles to decode. The scratch of all N is filled.
+            hidden: vecH [N, I + H + 2], hidden layers with H units and I inputs, see `wlm_kernels.mlp`.
+            output: vec3 [N, H + 1], output layers.
+            time: The time, and the coefficients of the tiles.
+            volume: vec4 [N, R, R], scratch memory.
+            columns: float [N, H, 128], scratch memory.
+            rows: vec2 [N, 128], scratch memory.
+            places: int [N], index of each tile in `time`.
+            tiles: int [n], the tiles to decode. Scratch memory is filled for all N tiles.
             out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
         device = out.device
@@ -301,7 +301,7 @@ class StripKernels:
 
 @wp.func
 def centred_texel(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
-    """Returns texel i of a block with endpoint bytes a and b, as it enters the network."""
+    """Returns texel i of a BC7 block, centred for the network; a, b: endpoint bytes; `high`: indices of texels."""
     index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
     if i == 0:
         index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
@@ -333,12 +333,12 @@ STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 r
 
 @functools.cache
 def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
-    """Builds (once) the runtime path for dynamic tiles of a hidden width.
+    """Builds (once) the fast decoder of dynamic tiles for one hidden width.
 
     Args:
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
-        shared: Whether they write RGB9E5 instead of 8 bits.
+        shared: Whether to write RGB9E5 instead of 8-bit RGBA.
     """
     net = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu)
     finish = finish_words(shared)
@@ -355,8 +355,7 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         columns: wp.array3d[float],
         rows: wp.array2d[wp.vec2],
     ):
-        """Computes the contribution of F_ut and the time to the first layer of each column, and F_vt of each row,
-        centred."""
+        """Writes to `columns` what F_ut and time add to the first layer in each column; to `rows` F_vt of each row."""
         n, i = wp.tid()
         p = (float(i) + 0.5) / 128.0
         ut = stored_plane_at(stored.ut, n, p, time.tau, stored.periodic)
@@ -385,7 +384,7 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        """One thread decodes the four texels of one column of a block; a warp's threads are neighbours in x."""
+        """Kernel: one thread decodes a column of four texels of a block; the threads of a warp are neighbours in x."""
         i, block, x = wp.tid()
         n = tiles[i]
         place = places[n]

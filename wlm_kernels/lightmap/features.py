@@ -1,13 +1,13 @@
-"""The temporal lightmap model in training: maps, time axis and targets, as functions for kernels.
+"""Kernel functions that evaluate a lightmap's feature maps in training and draw random training samples.
 
-A tile is F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table 1). Its network's inputs are, in
-order: F_uv 4, F_uvt 4, F_ut 2, F_vt 2, the encoded time 4; tiles without temporal maps use F_uv alone. Features v in
-[0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
+A tile has the maps F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table 1). The inputs of the MLP
+are, in order, 4 channels of F_uv, 4 of F_uvt, 2 of F_ut, 2 of F_vt and 4 of the encoded time; tiles without temporal
+maps use F_uv alone. Features v in [0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
 
-`step` uses these functions in training, `gather` converts its sums to gradients, `adjoint` contains the hand-written
-adjoints of sampling, and `decode` decodes tiles from their stored bytes.
+`step` is the training step that calls these functions; `gather` converts its sums to gradients; `adjoint` contains the
+hand-written adjoints of sampling; `decode` decodes tiles from their stored bytes.
 
-Read first: `tests/reference/temporal.py`, `train_features`.
+Read first: `train_features` in `tests/reference/temporal.py`.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles with S time slices in F_uvt. In static tiles all but the first two are empty."""
+    """The feature maps of N tiles, with S slices in F_uvt. For static tiles all arrays but the first two are empty."""
 
     uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
     uv_weights: wp.array3d[float]  # [N, 128, 128]
@@ -34,7 +34,7 @@ class Maps:
 
 @wp.struct
 class Offsets:
-    """Start of the gradients of each map in the flat gradient array, in scalars."""
+    """Index of the first gradient of each map in the flat array of all gradients."""
 
     uv_endpoints: int
     uv_weights: int
@@ -46,7 +46,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """Returns the value of a plane, clamped or on its level; its adjoint is straight-through, in `scatter_plane`."""
+    """Returns v clamped to [0, 1], or if quantised rounded to a byte / 255; `scatter_plane` has derivative 1."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
@@ -104,7 +104,7 @@ def volume_at(
 
 @wp.struct
 class Batch:
-    """Training data of N tiles at T stored times; K is the length of the longest list of valid texels."""
+    """Training data of N tiles at T stored times; K is the largest number of valid texels of a tile."""
 
     targets: wp.array3d[wp.vec3]  # [N, T, 128 * 128] normalised gamma-space colour
     texels: wp.array2d[int]  # [N, K] flat indices of valid texels, padded
@@ -143,7 +143,7 @@ class Sample:
 
 @wp.func
 def draw_sample(batch: Batch, n: int, b: int, samples: int) -> Sample:
-    """Draws sample b of tile n at this step: a valid texel and a stored time."""
+    """Draws random sample b of tile n for this step: a valid texel and a stored time."""
     state = draw_state(batch, n, b, samples)
     s = Sample()
     s.flat = batch.texels[n, wp.randi(state, 0, batch.texel_count[n])]
@@ -181,7 +181,7 @@ def radiance_of(batch: Batch, n: int, k: int, y: wp.vec3) -> wp.vec3:
 
 @wp.func
 def track_error(batch: Batch, lane: int, n: int, k: int, target: wp.vec3, error: wp.vec3):
-    """Adds the error of a sample as PSNR measures it; only progress reports use it."""
+    """Adds the squared radiance error of a sample to `batch.tracked`, for the PSNR in progress reports."""
     if batch.tracked.shape[0] > 0:
         e = radiance_of(batch, n, k, target + error) - radiance_of(batch, n, k, target)
         wp.atomic_add(batch.tracked, lane, n, k, 0, wp.dot(e, e) / 3.0 * batch.inverse_range[n, k])

@@ -1,8 +1,8 @@
-"""Decodes tiles that are stored as frames: BC7 blocks of any mode, whose levels lie between two bounds of the tile's
-colour.
+"""Decodes tiles that are stored as frames: BC7 blocks of any mode, whose values lie between two colours per frame.
 
-Blocks are `[N T, 32, 32, 2]` of uint64, the T frames of a tile one after another: the low and the high half of 16
-little-endian bytes. The tables of the format are arrays, which `wlm.formats.bc7_modes` defines and describes.
+Blocks are uint64 `[N T, 32, 32, 2]` for N tiles at T times, the T frames of a tile one after another. The last axis is
+the low and the high half of a block's 16 little-endian bytes. The tables of BC7 are arrays, which
+`wlm.formats.bc7_modes` defines and describes.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Tables:
-    """The tables of BC7."""
+    """The tables of the BC7 format, see `wlm.formats.bc7_modes`."""
 
     modes: wp.array2d[int]  # [8, 10], by mode: bits and counts
     partitions: wp.array2d[wp.uint32]  # [3, 64], by subsets: the subset of each texel, two bits
@@ -37,7 +37,7 @@ class StoredFrames:
 
 @wp.func
 def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
-    """Extracts bits `at` to `at + count - 1` of a block; fewer than 31."""
+    """Returns bits `at` to `at + count - 1` of a block as an integer; `count` is at most 30."""
     word = low
     if at >= 64:
         word = wp.rshift(high, wp.uint64(at - 64))
@@ -50,7 +50,7 @@ def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
 def share_of(
     low: wp.uint64, high: wp.uint64, tables: Tables, at: int, count: int, texel: int, first: int, second: int
 ) -> int:
-    """Returns the weight of endpoint 1 in a texel, in 64ths, from indices of `count` bits that begin at bit `at`."""
+    """Returns the weight of a texel's endpoint 1, in 64ths, from indices of `count` bits that begin at bit `at`."""
     start = at + count * texel
     width = count
     if texel > 0:
@@ -83,7 +83,7 @@ def mixed(a: int, b: int, share: int) -> int:
 
 @wp.func
 def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> wp.vec3:
-    """Decodes the red, green and blue bytes of a texel of a block; a reserved mode is black."""
+    """Decodes the R, G and B bytes of a texel of a block; blocks of the reserved mode are black."""
     mode = int(0)
     while mode < 8 and bits_of(low, high, mode, 1) == 0:
         mode += 1
@@ -147,7 +147,7 @@ def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> 
 
 @wp.func
 def frame_colour(stored: StoredFrames, frame: int, y: int, x: int) -> wp.vec3:
-    """Decodes the colour in gamma space of a texel of a frame."""
+    """Decodes a texel of a frame to colour in gamma space."""
     low = stored.blocks[frame, y // 4, x // 4, 0]
     high = stored.blocks[frame, y // 4, x // 4, 1]
     level = block_texel(low, high, stored.tables, 4 * (y % 4) + x % 4) / 255.0
@@ -161,7 +161,7 @@ def power(colour: wp.vec3, exponent: float) -> wp.vec3:
 
 @wp.func
 def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
-    """Interpolates the linear radiance of a texel between two frames (neural-dynamic-gi, eq. 2)."""
+    """Interpolates a texel's linear radiance between two frames; `share` weights the later."""
     light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
     if share > 0.0:
         other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)
@@ -225,11 +225,11 @@ KERNELS = (_decode_radiance, _decode_bytes, _decode_shared)
 
 
 def decode(stored: StoredFrames, early: int, late: int, share: float, tiles, out, inverse_bounds=None) -> None:
-    """Decodes tiles with one launch.
+    """Decodes tiles at one time with one kernel launch.
 
     Args:
         stored: The frames.
-        early, late, share: The two frames around the time, and the share of the second one in [0, 1).
+        early, late, share: Indices of the two frames around the time, and the weight of the second one in [0, 1).
         tiles: int [n], the tiles to decode.
         out: [n, 128, 128], written: linear radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` colour in
             gamma space relative to the bound, uint32, RGBA from the lowest byte, alpha 255.

@@ -1,8 +1,8 @@
-"""Converts the sums of `step` to gradients and advances the schedule; on a GPU it also updates the parameters.
+"""Converts the sums of a training step (`step`) to gradients; on a GPU also updates the parameters with Adam.
 
-On a GPU the launches that sum the gradients also run Adam: the fused Adam of torch reads and writes the gradients once
-more and assigns 65,536 numbers to each block of threads, so that the networks of 64 tiles would use only one to six
-multiprocessors.
+On a GPU the launches that sum the gradients also run Adam. Torch's fused Adam would read and write the gradients once
+more, and would use only one to six multiprocessors for the networks of 64 tiles, because it gives 65,536 numbers to
+each block of threads.
 
 Read `tests/kernels/stepping.py` first; it compares these gradients with autograd's.
 """
@@ -12,7 +12,7 @@ import warp as wp
 
 @wp.func
 def drain(partial: wp.array2d[float], i: int, clear: int) -> float:
-    """Returns the sum of column i, and clears it if `clear` is not 0."""
+    """Returns the sum of column i, and sets the column to 0 if `clear` is not 0."""
     s = float(0.0)
     for p in range(partial.shape[0]):
         s += partial[p, i]
@@ -47,7 +47,7 @@ class Adam:
 
 @wp.func
 def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """Returns a parameter after a step. `corrections`: 1 - decay^t of the gradients, and its root of their squares."""
+    """Returns a parameter after an Adam step t. `corrections`: 1 - decay[0]^t and sqrt(1 - decay[1]^t)."""
     first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
     second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
     adam.first[i] = first
@@ -88,7 +88,7 @@ def _update_maps(
 
 @wp.func
 def toward(mean: float, value: float) -> float:
-    """Returns a running mean over about 50 steps."""
+    """Returns a running mean over about 50 steps, updated with a new value."""
     return mean + (value - mean) * 0.02
 
 
@@ -156,13 +156,13 @@ def _gather_net(
 
 
 def gather_maps(acc: wp.array, parameters: wp.array, grad: wp.array, base: int = 0, count: int | None = None) -> None:
-    """Turns the maps' sums that `StepKernels.launch` left on the CPU into gradients, and clears them.
+    """Converts the maps' sums from `StepKernels.launch` on the CPU into gradients, and sets the sums to 0.
 
     Args:
-        acc: float [lanes, M], the sums; cleared.
+        acc: float [lanes, M], sums for the M parameters of the maps; set to 0.
         parameters: float [M], the maps; clamped to [0, 1].
         grad: float [M], written.
-        base, count: The range that this launch takes; default all.
+        base, count: First index and number of parameters that this launch converts; default all.
     """
     dim = parameters.shape[0] - base if count is None else count
     wp.launch(_gather_maps_cpu, dim, inputs=[acc, parameters, base], outputs=[grad], device=parameters.device)
@@ -180,11 +180,11 @@ def gather_net(
     mean_loss: wp.array,
     rates: wp.array,
 ) -> None:
-    """Turns the networks' sums on the CPU into gradients, and advances the schedule by one step.
+    """Converts the networks' sums on the CPU into gradients, and advances the schedule of learning rates by one step.
 
     Args:
-        partial, partial_out, loss: The networks' sums as float [P, ...]; cleared.
-        schedule: vec3 [steps], of which the first is the fraction of the initial learning rates at each step.
+        partial, partial_out, loss: The networks' sums as float [P, ...], of P lanes; set to 0.
+        schedule: vec3 [steps], whose first component is the factor on the initial learning rates at each step.
         first_rates: The initial learning rates of the maps and of the networks.
         control: int [1], the step; increased.
         grad, grad_out: float, the networks' gradients, written.
@@ -211,16 +211,16 @@ def update_maps(
     grad: wp.array,
     rates: wp.array,
 ) -> None:
-    """Turns the maps' integer sums into gradients, clears them and moves the maps; begins a step's update.
+    """Converts the maps' integer sums into gradients and updates the maps with Adam: the first half of a step's update.
 
     Args:
-        schedule: vec3 [steps]: the fraction of the initial learning rates, and Adam's corrections, see `moved`.
+        schedule: vec3 [steps]: the factor on the initial learning rates, and Adam's two corrections, see `moved`.
         first_rates: The initial learning rates of the maps and of the networks.
         control: int [1], the step.
-        move: Whether the maps move; they are clamped in any case.
-        acc: int64 [1, M], the sums; cleared.
-        adam: Updated.
-        parameters: float [M], the maps; clamped to [0, 1], then moved.
+        move: Whether the maps are updated; they are clamped in any case.
+        acc: int64 [1, M], the sums; set to 0.
+        adam: State of the optimiser, updated.
+        parameters: float [M], the maps; clamped to [0, 1], then updated.
         grad: float [M], written.
         rates: float [4], the learning rates and the corrections of this step, written.
     """
@@ -247,13 +247,13 @@ def update_net(
     grad: wp.array,
     grad_out: wp.array,
 ) -> None:
-    """Turns the networks' sums into gradients and moves the networks; ends a step's update.
+    """Converts the networks' sums into gradients and updates the networks with Adam: ends a step's update.
 
     Args:
-        partial, partial_out, loss: The networks' sums as float [P, ...].
+        partial, partial_out, loss: The networks' sums as float [P, ...], of P blocks.
         rates: As `update_maps` wrote them.
-        adam, adam_out: Updated.
-        hidden, output: float, the networks, moved.
+        adam, adam_out: States of the optimisers of hidden and output layers, updated.
+        hidden, output: float, the networks, updated.
         mean_loss: float [N], running mean of each tile's loss, updated.
         control: int [1], the step; increased.
         grad, grad_out: float, the networks' gradients, written.

@@ -1,4 +1,4 @@
-"""Rounds the weights of networks to 8-bit levels in one launch; torch operations would take about forty launches.
+"""Rounds the weights of networks to 8-bit levels with one kernel launch; torch would need about forty.
 
 Read `tests/reference/levels.py` first; it computes bitwise identical results in torch.
 """
@@ -17,7 +17,7 @@ def _half(value: float) -> float:
 
 @wp.func
 def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
-    """Rounds the weights of one unit, and copies the bias stored after them."""
+    """Rounds the weights into one unit (column j), and copies the bias in the row after them."""
     most = float(0.0)
     for i in range(rows):
         most = wp.max(most, wp.abs(values[n, first + i, j]))
@@ -51,11 +51,11 @@ def _put_on_levels(
 
 
 def put_on_levels(hidden: wp.array, output: wp.array, hidden_out: wp.array, output_out: wp.array) -> None:
-    """Rounds the weights of networks to levels; biases are not changed.
+    """Rounds the weights of N networks to 8-bit levels; biases are copied unchanged.
 
     Args:
-        hidden: float [N, I + H + 2, H], see `wlm_kernels.mlp`.
-        output: float [N, H + 1, 3].
+        hidden: float [N, I + H + 2, H], hidden layers with I inputs and H units, see `wlm_kernels.mlp`.
+        output: float [N, H + 1, 3], output layers.
         hidden_out, output_out: Arrays of the same shapes, written.
     """
     shape = (hidden.shape[0], 2 * hidden.shape[2] + 3)

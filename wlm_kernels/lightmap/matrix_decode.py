@@ -1,9 +1,10 @@
-"""Decodes wide networks on a GPU's matrix units: the runtime path of dynamic tiles with 32 hidden units or more.
+"""Decodes dynamic tiles whose networks have 32 hidden units or more on a GPU's matrix units (tensor cores).
 
-Activations and weights are half floats and sums float32; GELU is the tanh form with the GPU's instruction. A thread
-decodes eight texels of a column, one after another, so that a block loads its tile's weights once for 1,024 texels.
+Activations and weights are half floats, sums are float32, and GELU is its tanh approximation with the GPU's tanh
+instruction. A thread decodes eight texels of a column one after another, so that a block of threads loads its tile's
+weights once for 1,024 texels.
 
-Read first: `wlm_kernels/lightmap/decode.py`, the exact path.
+Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
@@ -40,7 +41,7 @@ def _frame_planes(
     ut: wp.array2d[wp.vec2],
     vt: wp.array2d[wp.vec2],
 ):
-    """Computes F_ut and F_vt at one time, centred: [N, 128] each."""
+    """Writes F_ut and F_vt, interpolated at one time and centred, to `ut` and `vt` [N, 128]."""
     n, i = wp.tid()
     p = (float(i) + 0.5) / 128.0
     half = wp.vec2(0.5)
@@ -50,7 +51,7 @@ def _frame_planes(
 
 @dataclass(frozen=True)
 class MatrixKernels:
-    """The path of one hidden width; see `decode`."""
+    """Kernels of the decoder for one hidden width; see `decode`."""
 
     hidden: int
     _decode: Any
@@ -68,17 +69,17 @@ class MatrixKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles to words at one time, on CUDA.
+        """Decodes tiles at one time to 32 bits per texel, on CUDA.
 
         Args:
             stored: Dynamic tiles.
-            hidden: vecH [N, I + H + 2], of half floats.
-            output: vec3 [N, H + 1], of half floats.
-            time: The time.
-            volume: vec4 [N, R, R], scratch.
-            ut, vt: vec2 [N, 128], scratch.
-            places: int [N], position of each tile in `time`.
-            tiles: int [n], the tiles to decode. The scratch of all N is filled.
+            hidden: vecH [N, I + H + 2], half floats: hidden layers with H units and I inputs, see `wlm_kernels.mlp`.
+            output: vec3 [N, H + 1], half floats: output layers.
+            time: The time, and the coefficients of the tiles.
+            volume: vec4 [N, R, R], scratch memory.
+            ut, vt: vec2 [N, 128], scratch memory.
+            places: int [N], index of each tile in `time`.
+            tiles: int [n], the tiles to decode. Scratch memory is filled for all N tiles.
             out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
         """
         device = out.device
@@ -96,11 +97,11 @@ class MatrixKernels:
 
 @functools.cache
 def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
-    """Builds (once) the path of a hidden width.
+    """Builds (once) the decoder for one hidden width.
 
     Args:
         hidden: H, a multiple of 16.
-        shared: Whether they write RGB9E5 instead of 8 bits.
+        shared: Whether to write RGB9E5 instead of 8-bit RGBA.
 
     Raises:
         ValueError: The width is not a multiple of 16.

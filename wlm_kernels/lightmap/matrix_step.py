@@ -1,6 +1,6 @@
-"""The network of a training step on a GPU's matrix units: `native/matrix_step.cuh` as a function for kernels.
+"""Runs the network of a training step on a GPU's matrix units: wraps `native/matrix_step.cuh` for Warp kernels.
 
-Read first: `wlm_kernels/mlp.py`, the same network in float32, and `tests/reference/temporal.py`, `losses`.
+Read first: `wlm_kernels/mlp.py`, the same network in float32, and `losses` in `tests/reference/temporal.py`.
 """
 
 import functools
@@ -16,13 +16,13 @@ _WIDEST = 64  # a block's activations and weights then fill its 48 KiB of shared
 
 
 def fits_matrix_units(inputs: int, hidden: int) -> bool:
-    """Returns whether `matrix_network` supports the shape of a network."""
+    """Returns whether `matrix_network` supports networks with these numbers of inputs and hidden units."""
     return inputs <= _STEP and hidden % _STEP == 0 and hidden <= _WIDEST
 
 
 @functools.cache
 def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
-    """Builds (once) the `wp.func` that takes a block of `BLOCK` samples of one tile through its network and back.
+    """Builds (once) the `wp.func` that runs a network forward and backward for `BLOCK` samples of one tile.
 
     Its arguments are the networks `hidden` [N, I + H + 2] and `output` [N, H + 1], see `wlm_kernels.mlp`, and the
     number `n` of the block's network; the inputs `f`, the `target` and the `weight` of the channels of each sample;
@@ -32,7 +32,7 @@ def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     It returns the gradient of the inputs of each sample, followed by the error of the output.
 
     Args:
-        inputs, hidden: I and H, as `fits_matrix_units` allows.
+        inputs, hidden: I and H, the numbers of inputs and hidden units, as `fits_matrix_units` allows.
         gelu: "exact" or "tanh".
     """
     vec_in, vec_hidden = wp.types.vector(inputs, float), wp.types.vector(hidden, float)

@@ -1,7 +1,7 @@
-"""Interpolates between the decoded light of two stored times, in radiance.
+"""Interpolates linear radiance between the decoded tiles of two stored times.
 
-Tiles of 8 bits are uint32 [n, 128 * 128], RGBA from the lowest byte, each with its own bound: radiance is
-(byte / 255 * bound) ** gamma.
+8-bit tiles are uint32 [n, 128 * 128], RGBA with R in the lowest byte. Each tile has its own bound: radiance is (byte /
+255 * bound) ** gamma.
 
 `wlm.lightmap.decode.SheetDecoder.tiles_8bit` computes the same on the host.
 """
@@ -20,7 +20,7 @@ def byte_at(word: wp.uint32, c: int) -> float:
 
 @wp.func
 def with_byte(word: wp.uint32, c: int, share: float) -> wp.uint32:
-    """Returns a word whose channel c is a share of 255."""
+    """Sets channel c of an RGBA word to the fraction `share` of 255 and returns the word."""
     return word | wp.lshift(wp.uint32(int(wp.clamp(share, 0.0, 1.0) * 255.0 + 0.5)), wp.uint32(8 * c))
 
 
@@ -70,21 +70,21 @@ def _blend_shared(
 
 
 def blend(early, late, early_inverse, late_inverse, share: float, gamma: float, out) -> None:
-    """Mixes two decodes in radiance (neural-dynamic-gi, eq. 2).
+    """Interpolates between 8-bit tiles of two times in linear radiance (neural-dynamic-gi, eq. 2).
 
     Args:
         early, late: uint32 [n, 128 * 128], the tiles at two stored times.
-        early_inverse, late_inverse: float [n], 1 / the bound of each tile at those times; 0 for a black one.
-        share: Share of the later time, 0 to 1.
+        early_inverse, late_inverse: float [n], 1 / the bound of each tile at these times; 0 for a black tile.
+        share: Weight of the later time, 0 to 1.
         gamma: Gamma of the colours.
-        out: uint32 [n, 128 * 128], written; its bound is the larger of the two.
+        out: uint32 [n, 128 * 128], written; the bound of a tile is the larger of its two bounds.
     """
     inputs = [early, late, early_inverse, late_inverse, share, gamma]
     wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
 
 
 def blend_shared(early, late, share: float, out) -> None:
-    """Mixes two decodes to RGB9E5 in radiance (neural-dynamic-gi, eq. 2).
+    """Interpolates between RGB9E5 texels of two times in linear radiance (neural-dynamic-gi, eq. 2).
 
     Args:
         early, late: uint32 [n], texels at two stored times.

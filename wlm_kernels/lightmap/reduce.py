@@ -1,6 +1,6 @@
-"""Sums over a CUDA block of samples, in native code: `native/block_sums.cuh` gives the reasons.
+"""Sums network gradients over a CUDA block of samples in native code; `native/block_sums.cuh` explains why.
 
-Read first: `tests/reference/temporal.py`, `losses`, whose gradients by autograd equal these sums.
+Read first: `losses` in `tests/reference/temporal.py`, whose autograd gradients equal these sums.
 """
 
 from typing import Any
@@ -23,16 +23,17 @@ _SHARED = 46 * 1024  # bytes of shared memory that the staged samples of a block
 def reload():
     """Makes the compiler load the weights again for the backward pass.
 
-    Kept from the forward pass they would fill hundreds of registers and spill to memory; a second load hits the cache.
+    If the weights were kept from the forward pass, they would fill hundreds of registers and spill to memory; loading
+    them again hits the cache.
     """
 
 
 def block_reduction(net: mlp.MlpKernels) -> Any:
     """Builds the `wp.func` that sums the gradients of a network over a block of `BLOCK` samples, on CUDA.
 
-    Its arguments are, for each sample, the inputs `f`, `h1`, `h2` of the layers, their deltas `d1`, `d2`, `d3` and the
-    loss `value`; `row`, the row of the outputs that the block fills; and the outputs, written:
-    `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+    Its arguments are, for each sample, the inputs `f`, `h1`, `h2` of the three layers, the gradients `d1`, `d2`, `d3`
+    of the layers' outputs before activation, and the loss `value`; `row`, the row of the outputs that the block fills;
+    and the outputs, written: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
     """
     inputs, hidden = net.inputs, net.hidden
 

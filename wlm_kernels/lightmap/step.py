@@ -1,14 +1,14 @@
-"""One launch that trains temporal lightmap tiles: sample the maps, run the MLP, compute the loss and every gradient.
+"""Training step of lightmap tiles in one launch: samples the maps, runs the MLP, computes the loss and all gradients.
 
 It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 3.4 and 4): draws a valid texel and a
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
 computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
 
-On CUDA networks of up to 64 units, in steps of 16, run on the matrix units in half floats (`matrix_step`), the others
-in float32 as on the CPU.
+On CUDA, networks whose hidden width is a multiple of 16 up to 64 run on the matrix units in half floats
+(`matrix_step`); all other networks run in float32, as on the CPU.
 
 The sums are integers or have a fixed order, so that one seed gives one result on one device. The samples of a tile only
-depend on the seed, the step and the number of the tile, so that a tile fits to the same result in any batch.
+depend on the seed, the step and the number of the tile, so that a tile is trained to the same result in any batch.
 
 Read `train_features` and `losses` in `tests/reference/temporal.py` first; they compute the same loss in torch.
 """
@@ -46,14 +46,14 @@ NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 @dataclass(frozen=True)
 class StepKernels:
-    """The training step of one network shape on one kind of device; see `launch`.
+    """The training step for one network shape on one kind of device; see `launch`.
 
     Attributes:
-        inputs, hidden: I and H of the network.
+        inputs, hidden: Numbers I of inputs and H of hidden units of the network.
         device_kind: "cpu" or "cuda".
-        net: The network's functions.
+        net: Forward and backward functions of the network.
         scalar: Type of the sums of the maps' gradients: int64 on CUDA, float on the CPU.
-        draw: Kernel that writes the samples of the coming step, for tests.
+        draw: Kernel that writes the samples that the next step will draw, for tests.
     """
 
     inputs: int
@@ -65,7 +65,7 @@ class StepKernels:
     _step: Any
 
     def load(self, device: str) -> None:
-        """Compiles the step for a device before its first launch."""
+        """Compiles the training step for a device before its first launch."""
         self._step.module.load(wp.get_device(device))
 
     def launch(
@@ -83,20 +83,21 @@ class StepKernels:
         base: int = 0,
         count: int | None = None,
     ) -> None:
-        """Adds the gradients of B samples of each tile.
+        """Draws B samples of each of N tiles, and sums their losses and gradients.
 
         Args:
             maps: The parameters.
             offsets: Positions of their gradients in `acc`.
-            hidden: vecH [N, I + H + 2], see `wlm_kernels.mlp`.
-            output: vec3 [N, H + 1].
+            hidden: vecH [N, I + H + 2], the hidden layers, see `wlm_kernels.mlp`.
+            output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
-            acc: [lanes, M], gradient sums of the maps: int64 on CUDA (one lane), float on the CPU.
+            acc: [lanes, M], added to: gradient sums of the maps' M parameters; int64 on CUDA (one lane), float on the
+                CPU.
             partial: float [P, N, I + H + 2, H]: written on CUDA, one P per block; added to on the CPU, one P per lane.
-            partial_out: float [P, N, H + 1, 3], likewise.
-            loss: float [P, N], likewise: the sum of weighted squared errors over samples and channels / (3 B).
-            base, count: The samples of a lane on the CPU, base to base + count - 1 of each tile; default all.
+            partial_out: float [P, N, H + 1, 3], written or added to like `partial`.
+            loss: float [P, N], like `partial`: sum of weighted squared errors over samples and channels / (3 B).
+            base, count: The launch takes samples base to base + count - 1 of each tile, on the CPU; default all.
         """
         tiles = hidden.shape[0]
         span = samples if count is None else count
@@ -196,7 +197,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
 
     @wp.struct
     class Pass:
-        """The factors of the gradients: the input and the delta of each layer, and the loss of the sample."""
+        """One sample: inputs of the three layers, gradients of their outputs before activation, and the loss."""
 
         f: vec_in
         h1: vec_hidden

@@ -1,4 +1,4 @@
-"""Builds a lightmap as one RGB9E5 texture with mips from decoded tiles.
+"""Assembles decoded tiles into one RGB9E5 texture with mips.
 
 See `wlm.lightmap.runtime_texture.MapDecoder`.
 """
@@ -77,7 +77,7 @@ def _fill(
 
 
 def place(tiles, corners, texture) -> None:
-    """Puts decoded tiles into the texture.
+    """Copies decoded tiles into the texture of the map.
 
     Args:
         tiles: uint32 [n, 128, 128], RGB9E5.
@@ -88,11 +88,11 @@ def place(tiles, corners, texture) -> None:
 
 
 def paint(colours, corners, side: int, texture) -> None:
-    """Puts tiles of one colour each into the texture.
+    """Fills tiles of the texture with one colour each.
 
     Args:
         colours: vec3 [n], radiance.
-        corners: vec2i [n], as for `place`.
+        corners: vec2i [n], row and column of each tile's first texel.
         side: Texels along a side of a tile.
         texture: uint32 [H, W], changed.
     """
@@ -101,22 +101,22 @@ def paint(colours, corners, side: int, texture) -> None:
 
 
 def halve(fine, weight, coarse) -> None:
-    """Makes the next smaller mip level: weighted means of two by two texels.
+    """Makes the next smaller mip level: weighted means of 2x2 texels.
 
     Args:
-        fine: uint32 [h, w].
+        fine: uint32 [h, w], RGB9E5.
         weight: float [h, w], weight of each texel; 0 in gaps.
-        coarse: uint32 [max(h // 2, 1), max(w // 2, 1)], written; 0 without any weight.
+        coarse: uint32 [max(h // 2, 1), max(w // 2, 1)], written: RGB9E5; 0 where all weights are 0.
     """
     wp.launch(_halve, coarse.shape, inputs=[fine, weight], outputs=[coarse], device=coarse.device)
 
 
 def fill(target, source, texture) -> None:
-    """Gives texels in gaps the light of other texels.
+    """Copies texels within a texture: fills gaps between charts with the light of other texels.
 
     Args:
         target: vec2i [G], row and column of the texels that are filled.
-        source: vec2i [G], row and column of the texels whose light they take; none is a target.
+        source: vec2i [G], row and column of the texels to copy from; none of them is a target.
         texture: uint32 [H, W], changed.
     """
     wp.launch(_fill, target.shape, inputs=[target, source], outputs=[texture], device=texture.device)

@@ -34,7 +34,7 @@ def _rasterize_backward(
     # out:
     grad: wp.array2d[float],
 ):
-    """One pixel per thread."""
+    """Adds the gradients of one pixel's barycentrics to its triangle's corners; one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     if not _readable(triangle, t, position.shape[0]):
@@ -74,7 +74,7 @@ def _interpolate(
     # out:
     out: wp.array3d[float],
 ):
-    """One pixel per thread."""
+    """Interpolates the attributes at one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     if not _readable(triangle, t, attribute.shape[0]):
@@ -102,7 +102,7 @@ def _interpolate_backward(
     grad_attribute: wp.array2d[float],
     grad_barycentric: wp.array2d[wp.vec2],
 ):
-    """One pixel per thread."""
+    """Computes the gradients of one pixel's attributes and barycentrics; one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     grad_u = float(0.0)
@@ -160,12 +160,12 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
 
 def interpolate_backward(attribute, triangle, visible, barycentric, grad_out, grad_attribute, grad_barycentric) -> None:
-    """Backward pass of `interpolate`.
+    """Backward pass of `interpolate`: gradients of the attributes and of the barycentrics.
 
     On CUDA pixels are added to `grad_attribute` in any order, so that the last bits change from run to run.
 
     Args:
-        attribute, triangle, visible, barycentric: As for `interpolate`.
+        attribute, triangle, visible, barycentric: Arguments of `interpolate`.
         grad_out: float [H, W, C].
         grad_attribute: float [V, C], added to; of shape [0, 0]: not computed.
         grad_barycentric: vec2 [H, W], written; of shape [0, 0]: not computed.

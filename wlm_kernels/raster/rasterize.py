@@ -271,8 +271,8 @@ class Raster:
 
     Attributes:
         triangle: int [H, W], number of the visible triangle, -1: none.
-        barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has the rest.
-            0 where there is no triangle, like the attributes below.
+        barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has 1 minus
+            their sum. 0 where there is no triangle, like the attributes below.
         depth: float [H, W], z / w.
         derivative: vec4 [H, W], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right and y
             down; None: not computed.

@@ -35,7 +35,7 @@ def first_hit(mesh: wp.Mesh, origin: wp.array, direction: wp.array, distance: wp
         origin: vec3 [P].
         direction: vec3 [D], of unit length, the same for all points.
         distance: float [P, D], written: distance to the first triangle; infinite if there is none.
-        front: int8 [P, D], written: 1 where its corners run counter-clockwise as seen, -1 clockwise, 0 for none.
+        front: int8 [P, D], written: 1 for a front face (corners counter-clockwise), -1 for a back face, 0 for none.
     """
     wp.launch(
         _first_hit,

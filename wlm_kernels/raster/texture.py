@@ -161,7 +161,7 @@ def _sample(
     # out:
     out: wp.array2d[float],
 ):
-    """One point per thread."""
+    """Samples the texture at one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -181,7 +181,7 @@ def _sample_backward(
     grad_texture: wp.array3d[float],
     grad_uv: wp.array1d[wp.vec2],
 ):
-    """One point per thread."""
+    """Adds one point's gradient to the texture and writes the gradient of uv; one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -242,7 +242,7 @@ def sample_backward(
     On CUDA samples are added to `grad_texture` in any order, so that the last bits change from run to run.
 
     Args:
-        texture, uv, filter, boundary: As for `sample`.
+        texture, uv, filter, boundary: Arguments of `sample`.
         grad_out: float [N, C].
         grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not computed.
         grad_uv: vec2 [N], written; of shape [0]: not computed.

@@ -1,4 +1,4 @@
-"""Kits of compressed lightmaps: textures, the mesh, and a material that reads them.
+"""Kits of compressed lightmaps for engines: textures, the mesh, and a material that reads the textures.
 
 Materials read the lightmaps at their own resolution: a kit has no mips. A kit of one lightmap has the files `atlas.*`,
 and one of shared tiles has `scene.*` with a component that sets the objects' rectangles and states.
@@ -34,11 +34,11 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
     Args:
         bundle: The bundle.
-        folder: The folder; it must exist.
+        folder: The kit's folder, which must exist.
         engine: One of `wlm.export.ENGINES`.
 
     Returns:
-        Entries of the index: shader and textures.
+        Entries for the folder's index: shader and textures.
 
     Raises:
         WlmError: The colours are ASTC, which the engine's kit can't load, the engine can't read the UV set, or a
@@ -87,7 +87,7 @@ def _write_pictures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]
 
 
 def _texts(bundle: Bundle, engine: str, entries: dict[str, Any]) -> dict[str, str]:
-    """Makes the text files of a kit, the shader first."""
+    """Returns the contents of a kit's text files by file name, the shader first."""
     shared, uv_set, place = bundle.document["method"] == "shared", bundle.document["uv_set"], asset_name(bundle.name)
     kind, title = ("scene", "WlmScene") if shared else ("atlas", "WlmAtlas")
     if engine == "three":

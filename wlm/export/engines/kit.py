@@ -1,4 +1,4 @@
-"""Functions that the kits of all systems share."""
+"""Functions that write parts of an engine kit, for the kits of all kinds of models."""
 
 import re
 from importlib import resources

@@ -1,4 +1,4 @@
-"""Kits of lightmaps over time: textures, tables, and a component that decodes them into maps."""
+"""Kits of lightmaps over time for engines: textures, tables, and a component that decodes them into lightmaps."""
 
 import re
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
     """Writes the kit of a lightmap over time for an engine into an existing folder.
 
     Returns:
-        Entries of the index: shader, textures and buffers.
+        Entries for the folder's index: shader, textures and buffers.
 
     Raises:
         WlmError: A texture is larger than the engine accepts.
@@ -90,7 +90,7 @@ _TEXTS: dict[str, Callable[[Bundle], dict[str, str]]] = {"three": _three, "godot
 
 
 def _write_unreal(bundle: Bundle, folder: Path) -> dict[str, Any]:
-    """Writes pictures that Unreal's editor imports, and a script that makes materials of them."""
+    """Writes pictures for Unreal's editor, and a script that imports them and makes materials."""
     pictures = {name: decode_texture(each) for name, each in bundle.textures.items()}
     layers = {name: each.layers for name, each in bundle.textures.items() if each.layers}
     arrays = {f"wlm_lightmap_{name}": (bundle.textures[name].height, count) for name, count in layers.items()}
@@ -126,7 +126,7 @@ def _write_unreal(bundle: Bundle, folder: Path) -> dict[str, Any]:
 
 
 def _as_colours(pixels: np.ndarray) -> np.ndarray:
-    """Extends uint8 [H, W, 1 or 2] to three channels: one channel is repeated, a third is 0."""
+    """Extends uint8 [H, W, 1 or 2] to [H, W, 3]: one channel is repeated, two get a third one of 0."""
     channels = pixels.shape[2]
     if channels == 1:
         return np.repeat(pixels, 3, 2)

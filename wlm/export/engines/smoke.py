@@ -31,14 +31,14 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
     Args:
         bundle: The bundle of a flip book in the layout "unity".
-        folder: The folder; it must exist.
+        folder: The kit's folder, which must exist.
         engine: One of `wlm.export.ENGINES`.
 
     Returns:
-        Entries of the index: shader and textures.
+        Entries for the folder's index: shader and textures.
 
     Raises:
-        WlmError: Another layout, or a texture that is larger than the engine accepts.
+        WlmError: The flip book has another layout, or a texture is larger than the engine accepts.
     """
     if bundle.document["layout"] != _LAYOUT:
         raise WlmError(f"layout: expected {_LAYOUT} for {engine}, got {bundle.document['layout']}")

@@ -32,7 +32,7 @@ class Page:
         note: A sentence that the page shows below its title; may be empty.
         figures: Rows of the panel's table: a name and a text each.
         manifest: JSON values for the script.
-        arrays: Arrays for the script by name, stored byte by byte.
+        arrays: Arrays for the script by name.
         scripts: Further scripts that the main script needs.
     """
 

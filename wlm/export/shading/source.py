@@ -91,7 +91,7 @@ def _split(line: str, blank: bool) -> Iterator[Word]:
 
 
 def _expand(words: Sequence[Word], macros: dict[str, _Macro]) -> list[Word]:
-    """Expands the macros of one line; a call must end in its line."""
+    """Expands the macros in the tokens of one line; a macro's arguments must end on that line."""
     out: list[Word] = []
     i = 0
     while i < len(words):

@@ -1,4 +1,4 @@
-"""Base class of the writers of shading languages."""
+"""Base class of writers that turn a parsed shader into source text of a shading language."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
 def nodes_of(body: tuple[Statement, ...]) -> Iterator[Node]:
-    """Iterates over all nodes of all expressions."""
+    """Iterates over all nodes of all expressions in a function body."""
 
     def within(node: Node) -> Iterator[Node]:
         yield node
@@ -50,7 +50,7 @@ class Writer(ABC):
         self.scope: dict[str, Variable] = {}
 
     def text(self) -> str:
-        """Writes the whole shader."""
+        """Returns the source text of the whole shader."""
         lines: list[str] = []
         for item, blank in self.shader.items:
             if blank and lines:
@@ -64,36 +64,36 @@ class Writer(ABC):
         return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
 
     def head(self) -> list[str]:
-        """Lines before the first item."""
+        """Returns the lines before the first declaration."""
         return []
 
     def foot(self) -> list[str]:
-        """Lines after the last item."""
+        """Returns the lines after the last declaration."""
         return []
 
     @abstractmethod
     def outer(self, variable: Variable) -> list[str]:
-        """Lines of a global constant, texture, uniform or buffer."""
+        """Returns the lines that declare a global constant, texture, uniform or buffer."""
 
     def signature(self, function: Function) -> str:
-        """First line of a function."""
+        """Returns the first line of a function's definition."""
         return f"{self.kind(function.type)} {function.name}({', '.join(map(self.parameter, function.parameters))})"
 
     @abstractmethod
     def parameter(self, variable: Variable) -> str:
-        """Declaration of a parameter."""
+        """Returns the declaration of a parameter."""
 
     def kind(self, name: str) -> str:
-        """Name of a type."""
+        """Returns the language's name of a GLSL type."""
         return self.names.get(name, name)
 
     def function(self, function: Function) -> list[str]:
-        """Lines of a function."""
+        """Returns the lines of a function."""
         self.scope = {each.name: each for each in function.parameters}
         return [self.signature(function), "{", *self.block(function.body, "    "), "}"]
 
     def block(self, body: tuple[Statement, ...], indent: str) -> list[str]:
-        """Lines of statements."""
+        """Returns the lines of statements, indented by `indent`."""
         lines: list[str] = []
         for statement in body:
             if statement.blank and lines:
@@ -102,7 +102,7 @@ class Writer(ABC):
         return lines
 
     def statement(self, statement: Statement) -> list[str]:
-        """Lines of a statement."""
+        """Returns the lines of a statement."""
         tail = f" {statement.tail}" if statement.tail else ""
         if statement.kind == "comment":
             return [statement.text]
@@ -126,13 +126,13 @@ class Writer(ABC):
         return [head, *self.block(statement.bodies[0], "    "), "}"]
 
     def local(self, variable: Variable) -> str:
-        """Declaration of a local variable."""
+        """Returns the declaration of a local variable."""
         size = "" if variable.size is None else f"[{self.write(variable.size)}]"
         value = "" if variable.value is None else f" = {self.write(variable.value)}"
         return f"{self.kind(variable.type)} {variable.name}{size}{value}"
 
     def write(self, node: Node) -> str:
-        """Text of an expression."""
+        """Returns the text of an expression."""
         if node.kind in ("number", "name"):
             return self.plain(node)
         if node.kind == "call":
@@ -155,7 +155,7 @@ class Writer(ABC):
         return f"{self.side(node.text, left)} {node.text} {self.side(node.text, right, right=True)}"
 
     def plain(self, node: Node) -> str:
-        """Text of a name or a number."""
+        """Returns the text of a name or a number."""
         return node.text
 
     def inside(self, node: Node) -> str:
@@ -176,7 +176,7 @@ class Writer(ABC):
         return f"({self.write(node)})"
 
     def call(self, node: Node) -> str:
-        """Text of a call, a texture read or a constructor."""
+        """Returns the text of a call, a texture read or a constructor."""
         arguments = node.parts
         name = node.text
         if name in ("texelFetch", "textureLod"):
@@ -193,36 +193,36 @@ class Writer(ABC):
         return f"{self.names.get(name, name)}({', '.join(self.arguments(name, arguments))})"
 
     def arguments(self, name: str, arguments: tuple[Node, ...]) -> list[str]:
-        """Texts of the arguments of a call."""
+        """Returns the texts of the arguments of a call."""
         return [self.write(each) for each in arguments]
 
     def make(self, name: str, values: list[str]) -> str:
-        """Text of a constructor of a vector or scalar."""
+        """Returns the text of a constructor of a vector or scalar."""
         return f"{self.kind(name)}({', '.join(values)})"
 
     @abstractmethod
     def fetch(self, texture: Variable, place: Node) -> str:
-        """Text that fetches one texel."""
+        """Returns the text that reads one texel of a texture without the filter."""
 
     @abstractmethod
     def filtered(self, texture: Variable, place: Node, level: str) -> str:
-        """Text that reads a texture through the filter at a mip level."""
+        """Returns the text that reads a texture with filtering at a mip level."""
 
     @abstractmethod
     def graded(self, texture: Variable, place: str, dx: str, dy: str) -> str:
-        """Text that reads a texture through the filter, with derivatives that choose the mip level."""
+        """Returns the text that reads a texture with filtering; the derivatives dx, dy choose the mip level."""
 
     @abstractmethod
     def size(self, texture: Variable) -> str:
-        """Text that gives the size of a texture in texels, two integers."""
+        """Returns the text of an expression for a texture's size in texels, two integers."""
 
     @property
     def textures(self) -> list[Variable]:
-        """The textures that the shader declares."""
+        """Returns the variables of all textures that the shader declares."""
         return [each for each in self.bound.values() if each.type in SAMPLERS]
 
     @property
     def filters(self) -> list[str]:
-        """Names of the textures that are read through the filter, one for each read."""
+        """Returns the names of the textures that are read with filtering, one name for each read."""
         nodes = (node for function in self.functions.values() for node in nodes_of(function.body))
         return [node.parts[0].text for node in nodes if node.kind == "call" and node.text in FILTERS]

@@ -1,4 +1,4 @@
-"""The ways in which a tile is stored, one module for each; `encoding_of` finds the one of a kind of tile."""
+"""The encodings in which tiles are stored, one module each; `encoding_of` returns the encoding of a kind of tile."""
 
 from wlm.lightmap.encodings.base import Encoding
 from wlm.lightmap.encodings.constant import Constant
@@ -13,5 +13,5 @@ _BY_KIND = {kind: encoding for encoding in ENCODINGS for kind in encoding.kinds}
 
 
 def encoding_of(kind: int) -> Encoding | None:
-    """Returns the encoding of tiles of a kind; None for empty tiles."""
+    """Returns the encoding that stores tiles of a kind; None for empty tiles."""
     return _BY_KIND.get(TileKind(int(kind)))

@@ -1,4 +1,4 @@
-"""The interface of the ways in which a tile is stored, and of its tiles on a device."""
+"""Base classes of the ways to store a tile: `Encoding` on the host, `DeviceTiles` for decoding on a device."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wlm.lightmap.tiles import TileKind
 
 
 class DeviceTiles(ABC):
-    """The tiles of a sheet that have one encoding, on a device.
+    """All tiles of a sheet that are stored with the same encoding, uploaded to a device.
 
     Attributes:
         numbers: int [n], numbers of the tiles in the grid, rising.
@@ -24,30 +24,30 @@ class DeviceTiles(ABC):
     device_bytes = 0
 
     def __init__(self, numbers: np.ndarray) -> None:
-        """Takes the numbers of the tiles."""
+        """Takes the numbers of the tiles in the grid, in increasing order."""
         self.numbers = numbers
         self._row_of = {int(number): row for row, number in enumerate(numbers)}
 
     def among(self, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Finds own tiles among `numbers`: their positions in `numbers` and in `self.numbers`, int32 [k] each."""
+        """Finds the tiles of this encoding among `numbers`: indices in `numbers` and `self.numbers`, int32 [k]."""
         pairs = [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
         places, rows = np.array(pairs, np.int32).reshape(-1, 2).T
         return places, np.ascontiguousarray(rows)
 
     @abstractmethod
     def bounds(self, time: float) -> np.ndarray:
-        """Returns an upper bound of the colour of each tile in gamma space, float32 [n].
+        """Returns an upper bound of each tile's colour at one time, in gamma space, float32 [n].
 
-        Between two stored times it is the larger of both bounds, since a texel may follow either time.
+        Between two stored times it is the larger of the bounds at these two times.
         """
 
     @abstractmethod
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles at positions [k] of `numbers` to linear radiance, float32 [k, 128, 128, 3]; gaps stay empty."""
+        """Decodes tiles `rows` (indices into `numbers`, [k]) to radiance, float32 [k, 128, 128, 3]; gaps stay empty."""
 
     @abstractmethod
     def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles to 8 bits, uint8 [k, 128, 128, 4]: radiance = (byte / 255 * bound) ** gamma; alpha is 255."""
+        """Decodes tiles to RGBA, uint8 [k, 128, 128, 4]: radiance = (byte / 255 * bound) ** gamma; alpha is 255."""
 
 
 class Encoding(ABC):
@@ -55,66 +55,66 @@ class Encoding(ABC):
 
     Attributes:
         kinds: The kinds of tiles that are stored in this way.
-        codes: For each of them its code in the shader's table of an hour.
+        codes: For each of these kinds, its code in the tables of `wlm.lightmap.bundle.hour_tables`.
     """
 
     kinds: ClassVar[tuple[TileKind, ...]]
     codes: ClassVar[tuple[int, ...]]
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
-        """Returns the number of bytes of `pack`."""
+        """Returns the number of bytes that `pack` gives for a tile."""
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        """Returns the maps, the network or the frames of a tile in pieces that a general packer models separately."""
+        """Returns a tile's maps and network, or its frames, as byte arrays that a packer compresses separately."""
         return []
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
-        """Writes the bytes of `pack`, uint8, into the arrays of a sheet.
+        """Writes a tile, given as the bytes of `pack`, uint8, into the arrays of a sheet.
 
         Raises:
-            WlmError, ValueError: The bytes are not those of such a tile.
+            WlmError, ValueError: The bytes are not a valid tile of this encoding.
         """
 
     @abstractmethod
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
-        """Puts the tiles of this encoding on a device; the list is empty if the sheet has none.
+        """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none.
 
         Args:
             sheet: The arrays.
             device: As `wlm.interop.check_device` returns it.
-            gelu: Form of the GELU of networks, see `wlm_kernels.mlp`.
+            gelu: GELU variant of the networks, see `wlm_kernels.mlp`.
         """
 
     def textures(self, sheet: SheetModel) -> dict[str, Texture]:
-        """Returns the textures that the shader reads, by name, with the images of all tiles of this encoding."""
+        """Returns the textures that the shader reads for tiles of this encoding, by name."""
         return {}
 
     @abstractmethod
     def describe(self, sheet: SheetModel, number: int) -> dict[str, Any]:
-        """Returns the description of a tile in the document of a bundle, as JSON values."""
+        """Returns the entry of a tile in the JSON document of a bundle, as JSON values."""
 
     @abstractmethod
     def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
-        """Writes the records of all tiles of this encoding into the shader's tables of some hours.
+        """Writes the records of all tiles of this encoding into the shader's tables, one table for each given time.
 
-        Times are stored ones, or any if networks interpolate. `records`, float32 [times, tiles, fours, 4], is written;
-        the first number of each record is set already.
+        `times` are stored times, or any times if the networks can evaluate them. `records`, float32 [times, tiles,
+        fours, 4], is written; the first number of each record is already set.
         """
 
 
 def inverse_of(bounds: np.ndarray) -> np.ndarray:
-    """Returns 1 / each bound, float32; 0 for the bound 0 of a black tile."""
+    """Returns 1 / bound for each bound, float32; 0 where the bound is 0, as for black tiles."""
     return np.divide(1.0, bounds, out=np.zeros_like(bounds), where=bounds > 0)
 
 
 def columns(count: int, height: int, width: int) -> int:
-    """Returns how many of `count` images form a row of a texture that is about as wide as high."""
+    """Returns how many images to put in a row so that a texture of `count` images is about as wide as high."""
     return max(int(np.ceil(np.sqrt(count * height / width))), 1)
 
 
 def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[str, Any]:
-    """Arranges images in rows of one texture.
+    """Arranges images side by side, in several rows, in one texture.
 
     Args:
         images: [n, rows, columns, bytes] of texels or blocks.

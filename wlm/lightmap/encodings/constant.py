@@ -1,4 +1,4 @@
-"""Constant tiles: one colour at each time."""
+"""Encoding of constant tiles, whose texels all have the same colour at a time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +15,7 @@ class ConstantTiles(DeviceTiles):
     """The constant tiles of a sheet. They need no memory on the device."""
 
     def __init__(self, sheet: SheetModel) -> None:
-        """Takes the colours."""
+        """Takes the colours of the sheet's constant tiles."""
         super().__init__(sheet.numbers(TileKind.CONSTANT))
         self._axis, self._colours = sheet.axis, sheet.constant.astype(np.float32)
         self._exponent = 1.0 / sheet.profile.gamma
@@ -40,7 +40,7 @@ class ConstantTiles(DeviceTiles):
 
 
 class Constant(Encoding):
-    """Stores one colour at each time; nothing is packed."""
+    """Stores one colour for each time in the arrays of the sheet; `pack` gives no bytes."""
 
     kinds = (TileKind.CONSTANT,)
     codes = (0,)

@@ -1,11 +1,12 @@
-"""Frames: the lightmap of each time as plain BC7, for tiles where a network would not be smaller.
+"""Encoding of tiles as frames: plain BC7 at each time, for tiles where a network would not be smaller.
 
-A frame holds levels between the least and the greatest colour of its tile, channel and time, in gamma space:
+The texels of a frame are levels from 0 to 1 between the tile's least and greatest colour at that time, per channel, in
+gamma space:
 
     colour = least + level (greatest - least),     radiance = colour ** gamma
 
-as an engine's own BC7 does, so that a set of few times is never worse than that. Unlike a network's maps, the bytes
-grow in proportion to the number of times.
+This is how engines store lightmaps in BC7, so that even a set with few times is about as small and exact as theirs.
+Unlike a network with its maps, frames take bytes in proportion to the number of times.
 """
 
 import importlib.util
@@ -60,10 +61,10 @@ def missing_encoder(count: int) -> str | None:
 def choose_frames(
     kinds: np.ndarray, numbers: Sequence[int] | np.ndarray, mask: np.ndarray, times: int, profile: Profile
 ) -> np.ndarray:
-    """Chooses the tiles that are stored as frames, see `Profile.frames`, bool [N].
+    """Returns which of N tiles are stored as frames, see `Profile.frames`, bool [N].
 
     Args:
-        kinds, numbers: Kinds of N tiles and their numbers in the grid.
+        kinds, numbers: `TileKind` and number in the grid of each of the N tiles.
         mask: bool [H, W], the valid texels of the map.
         times: Number of stored times.
         profile: The settings.
@@ -78,7 +79,7 @@ def choose_frames(
 
 
 def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Finds the blocks of a tile within `REACH` of a texel of a mask [H, W], which filtered reads reach, [32, 32]."""
+    """Returns the blocks of a tile that filtered reads touch: within `REACH` of a mask [H, W], bool [32, 32]."""
     y, x = TileGrid.of(*mask.shape).origin(number)
     near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
     part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
@@ -94,7 +95,7 @@ def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
 
 
 def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """Replaces the blocks [T, 32, 32, 16] of a tile that are not needed, bool [32, 32], by black ones."""
+    """Replaces blocks [T, 32, 32, 16] of a tile by black ones where `needed`, bool [32, 32], is false."""
     return np.where(needed[..., None], blocks, _BLACK)
 
 
@@ -107,10 +108,10 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
         needed: bool [32, 32], from `needed_blocks`.
 
     Returns:
-        Blocks uint8 [T, 32, 32, 16], and least and greatest colours, half [T, 2, 3].
+        BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16 [T, 2, 3].
 
     Raises:
-        WlmError: The encoder is missing.
+        WlmError: The BC7 encoder is not installed.
     """
     texels = colour[:, valid]
     ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)
@@ -130,17 +131,17 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
 
 
 def round_half(values: np.ndarray, toward: float) -> np.ndarray:
-    """Rounds to half floats toward infinity, for upper bounds, or minus infinity, for lower bounds."""
+    """Rounds values to half floats toward `toward`: infinity for upper bounds, minus infinity for lower bounds."""
     nearest = values.astype(np.float16)
     wrong = nearest > values if toward < 0 else nearest < values
     return np.where(wrong, np.nextafter(nearest, np.float16(toward)), nearest)
 
 
 class FrameTiles(DeviceTiles):
-    """The frames of a sheet on a device."""
+    """The tiles of a sheet that are stored as frames, on a device."""
 
     def __init__(self, sheet: SheetModel, device: str) -> None:
-        """Uploads the frames."""
+        """Uploads the frames of a sheet."""
         super().__init__(sheet.numbers(TileKind.FRAMES))
         if not len(self.numbers):
             raise WlmError(f"{sheet.name}: expected at least one tile of frames, found none")
@@ -167,12 +168,12 @@ class FrameTiles(DeviceTiles):
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
     def decode(self, time: float, rows: wp.array, out: wp.array, inverse_bounds: wp.array | None = None) -> None:
-        """Decodes tiles with one launch, which can be captured.
+        """Decodes tiles with one kernel launch, which a CUDA graph can capture.
 
         Args:
-            time: A stored time, or one between, where the radiance of both is mixed (eq. 2).
-            rows: int [k], positions in `numbers`.
-            out: [k, 128, 128], radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` uint32 of 8 bits.
+            time: A stored time, or a time between two, whose radiance is then interpolated (eq. 2).
+            rows: int [k], indices into `numbers`.
+            out: [k, 128, 128]: radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds` 8-bit colour, uint32 (RGBA).
             inverse_bounds: float [n], 1 / the bound of each tile.
         """
         frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out, inverse_bounds)
@@ -190,7 +191,7 @@ class FrameTiles(DeviceTiles):
 
 
 class Frames(Encoding):
-    """Stores a tile as BC7 blocks at each time; blocks that no read reaches are left out of the file."""
+    """Stores a tile as BC7 blocks at each time; blocks that no filtered read touches are left out of the file."""
 
     kinds = (TileKind.FRAMES,)
     codes = (3,)

@@ -1,8 +1,8 @@
-"""Feature maps and a network: static tiles (F_uv alone) and dynamic tiles (F_uv, F_uvt, F_ut and F_vt).
+"""Encoding of tiles as feature maps and a network: static (F_uv alone), dynamic (F_uv, F_uvt, F_ut and F_vt).
 
 In the file each tile is one zstd frame (`wlm.lightmap.codec`). Before packing, the blocks of BC7 mode 6 are split into
-bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. Texels that no
-valid texel reads at a stored time are zero, which the fit sees to, so that they cost nothing.
+bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. The fit sets texels
+of the maps that no valid texel of the lightmap reads at a stored time to zero, so that they take almost no bytes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynam
 
 
 def tile_bytes(profile: Profile, temporal: bool) -> int:
-    """Returns the bytes of the maps and the network of one tile before packing: the arithmetic of table 3."""
+    """Returns the bytes of the maps and the network of one tile before packing, as in table 3 of the paper."""
     inputs, hidden = profile.inputs(temporal), profile.hidden
     if profile.net_bits == 16:
         size = TILE * TILE + 2 * mlp.parameter_count(inputs, hidden)
@@ -55,13 +55,13 @@ def tile_bytes(profile: Profile, temporal: bool) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Reads:
-    """The texels of the temporal maps that the valid texels of a dynamic tile read at the times that are evaluated.
+    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times.
 
     Attributes:
-        slices: bool [S], slices of F_uvt.
-        texels: bool [R, R], texels of each of these slices.
-        rows: bool [rows] of F_ut and F_vt.
-        columns: bool [2, columns], columns of F_ut and of F_vt.
+        slices: bool [S], slices of F_uvt that are read.
+        texels: bool [R, R], texels that are read in each of these slices.
+        rows: bool [rows], rows of F_ut and F_vt that are read.
+        columns: bool [2, columns], columns of F_ut and of F_vt that are read.
     """
 
     slices: np.ndarray
@@ -71,7 +71,7 @@ class Reads:
 
     @classmethod
     def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
-        """Finds the reads of the valid texels of a tile, bool [128, 128], given the sizes of F_uvt and the planes."""
+        """Finds what the valid texels (`used`, bool [128, 128]) of a tile read; the last arguments are map sizes."""
         centres = (np.arange(TILE) + 0.5) / TILE
         across = _cells(centres, resolution).astype(np.int64)
         along = _cells(centres, columns)
@@ -91,7 +91,7 @@ class Reads:
 
 
 def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray:
-    """Returns the texels of an axis that linear filtering reads at places in [0, 1], bool [places, count]."""
+    """Returns which of an axis's `count` texels a linear filter reads at each place in [0, 1], bool [places, count]."""
     x = np.asarray(places, np.float64) * count - 0.5
     first, last = np.floor(x - _SLACK), np.floor(x + _SLACK) + 1
     cells = np.zeros((len(x), count), bool)
@@ -102,9 +102,9 @@ def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray
 
 
 def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads | None) -> dict[str, np.ndarray]:
-    """Sets texels of a tile that no valid texel, bool [128, 128], reads to zero; the decoded light stays the same.
+    """Zeroes the map texels that no valid texel (`used`, bool [128, 128]) reads; the decoded light does not change.
 
-    The parts are `uv`, uint8 [32, 32, 16], and with the reads of a dynamic tile `uvt`, `ut` and `vt`.
+    `parts` has the map `uv`, uint8 [32, 32, 16], and for a dynamic tile, which has `reads`, also `uvt`, `ut` and `vt`.
     """
     result = dict(parts)
     result["uv"] = _cleared(parts["uv"].reshape(-1, BLOCK_BYTES), _by_block(used)).reshape(parts["uv"].shape)
@@ -118,13 +118,13 @@ def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads
 
 
 def _by_block(texels: np.ndarray) -> np.ndarray:
-    """Rearranges texels [4 h, 4 w] block by block, [h w, 16]."""
+    """Rearranges texels [4 h, 4 w] into 4x4 blocks, [h w, 16]."""
     h, w = texels.shape
     return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
 
 
 def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Clears the unused texels, bool [n, 16], of blocks [n, 16]."""
+    """Zeroes the texels of BC7 blocks, uint8 [n, 16], that are not `used`, bool [n, 16]."""
     ends, indices = _unpacked(blocks)
     ends, indices = ends * used.any(1)[:, None, None], indices * used
     # The first index of a block is below 8, which fixes the order of its endpoints; if it is unused, they are sorted.
@@ -138,7 +138,7 @@ def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
-    """Checks that maps and networks from a trainer are blocks of mode 6, and networks on the levels of the settings."""
+    """Raises WlmError unless maps from a trainer are BC7 mode 6 and its networks are on the settings' weight levels."""
     for name in ("uv", "uvt") if dynamic else ("uv",):
         _unpacked(parts[name].reshape(-1, BLOCK_BYTES))
     if profile.net_bits == 8:
@@ -147,7 +147,7 @@ def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: b
 
 
 def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Splits blocks [n, 16] into endpoints, uint8 [n, 2, 4], and indices [n, 16]."""
+    """Splits BC7 mode 6 blocks, uint8 [n, 16], into endpoints, uint8 [n, 2, 4], and texel indices [n, 16]."""
     try:
         return unpack_mode6(blocks)
     except WlmError as error:
@@ -166,7 +166,7 @@ def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
 
 
 def _join_blocks(data: np.ndarray) -> np.ndarray:
-    """Returns the blocks, uint8 [n, 16], of the bytes of `_split_blocks`, uint8 [16 n]."""
+    """Inverts `_split_blocks`: returns the blocks, uint8 [n, 16], of its bytes, uint8 [16 n]."""
     ends, indices = data.reshape(2, -1, 8)
     if (ends[:, 1:] > 127).any():
         raise ValueError("expected endpoints of 7 bits")
@@ -180,7 +180,7 @@ def _join_blocks(data: np.ndarray) -> np.ndarray:
 
 
 def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
-    """Returns a network with 8-bit weights as bytes: the integers of all weights, then the magnitudes and biases.
+    """Packs a network with 8-bit weights into bytes: the integer weights, then the largest magnitudes and the biases.
 
     The weights into one unit share the largest magnitude m among them, a half float; a weight is q m / 127 with an
     integer q from -127 to 127, rounded to a half float. Biases are half floats. The fit evaluates exactly these numbers
@@ -199,7 +199,7 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
 
 
 def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
-    """Returns the network, float16 [P], of the bytes of `pack_network`."""
+    """Inverts `pack_network`: returns the network, float16 [P], of its bytes."""
     shapes = (inputs, hidden), (hidden, hidden), (hidden, 3)
     count = sum(rows * units for rows, units in shapes)
     whole, halves = data[:count].view(np.int8), _together(data[count:])
@@ -222,12 +222,12 @@ def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray,
 
 
 def _apart(halves: np.ndarray) -> np.ndarray:
-    """Returns half floats as their low bytes and then their high bytes, which resemble each other."""
+    """Returns the low bytes of all half floats, then all high bytes: similar bytes side by side compress better."""
     return np.ascontiguousarray(halves, "<f2").view(np.uint8).reshape(-1, 2).T.ravel()
 
 
 def _together(data: np.ndarray) -> np.ndarray:
-    """Returns the half floats of the bytes of `_apart`."""
+    """Inverts `_apart`: returns the half floats of its bytes."""
     return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
 
 
@@ -239,8 +239,8 @@ class MapTiles(DeviceTiles):
 
     Attributes:
         model: The sheet.
-        places: int [n], 0 to n - 1 on the device: positions of the tiles in the arrays of a `TimeState`.
-        arguments: First arguments of each decode kernel: `Stored`, hidden vecH [n, I + H + 2], output vec3 [n, H + 1].
+        places: int [n] on the device, 0 to n - 1: indices of the tiles in the arrays of a `TimeState`.
+        arguments: First arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
     """
 
     def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
@@ -285,7 +285,7 @@ class MapTiles(DeviceTiles):
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns the numbers that kernels need for one time, written into an earlier state or, for None, a new one."""
+        """Returns what the decode kernels need for one time; `state` is overwritten, and None allocates a new one."""
         before, after, share = self._axis.neighbours(time)
         if state is None:
             state = decode_kernels.TimeState()
@@ -299,12 +299,12 @@ class MapTiles(DeviceTiles):
         return state
 
     def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
-        """Decodes tiles in training's order of operations, one thread a texel.
+        """Decodes tiles with the same order of operations as the training, one thread per texel.
 
         Args:
             state: From `state`.
-            rows: int [k], positions in `numbers`.
-            form: 0 for radiance (vec3), 1 for 8 bits, 2 for RGB9E5 (uint32).
+            rows: int [k], indices into `numbers`.
+            form: Output: 0 for radiance (vec3), 1 for 8 bits, 2 for RGB9E5 (uint32).
             out: [k, 128, 128], written.
         """
         inputs = [*self.arguments, state, self.places, rows]
@@ -336,15 +336,16 @@ class MapTiles(DeviceTiles):
 
 
 def fours(profile: Profile) -> int:
-    """Returns how many groups of four numbers a layer of the networks has, the last one filled up with zeros."""
+    """Returns the number of groups of four that hold one value per hidden unit; the last is padded with zeros."""
     return -(-profile.hidden // 4)
 
 
 def shader_networks(sheet: SheetModel) -> np.ndarray:
-    """Returns the networks of all tiles as the shader reads them: W1, b1, W2, b2, W3, b3, a row of W for each input.
+    """Returns all networks as the shader reads them: weights W and bias b of layers 1 to 3, one row of W per input.
 
-    Dynamic tiles come first, then static ones. Rows are filled up with zeros to groups of four, and rows of zeros are
-    added for the units that this adds. The centring of features from textures, (f - 1/2) sqrt(12), is in W1 and b1.
+    Dynamic tiles come first, then static ones. Rows are padded with zeros to groups of four, and so are the inputs of
+    the next layer. The shader passes features f as the textures hold them: their centring, (f - 1/2) sqrt(12), is part
+    of W1 and b1.
 
     Returns:
         float32 [n, 4]; `network_starts` says where each network begins.
@@ -378,7 +379,7 @@ def network_starts(sheet: SheetModel) -> np.ndarray:
 
 
 def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns the index of each mapped tile among the images, of which those of dynamic tiles are first, int [N_m]."""
+    """Returns the index of each mapped tile's image in the textures, where dynamic tiles come first, int [N_m]."""
     static = sheet.kind[sheet.mapped] == TileKind.STATIC
     rows = np.empty(len(static), int)
     rows[np.argsort(static, kind="stable")] = np.arange(len(static))
@@ -386,7 +387,7 @@ def image_rows(sheet: SheetModel) -> np.ndarray:
 
 
 class Maps(Encoding):
-    """Stores feature maps and a network."""
+    """Stores a tile as feature maps and a network."""
 
     kinds = (TileKind.STATIC, TileKind.DYNAMIC)
     codes = (1, 2)
