@@ -1,8 +1,8 @@
-"""The rivals of each system. Block codecs need the extra `baselines`.
+"""Other compression and rendering methods with which each system is compared. Block codecs need the extra `baselines`.
 
-Each module has `RIVALS`, the methods by name, and they are scored by the system's evaluation: a method makes a
-`Rival` of an input, and `evaluate_rivals` scores it. The rivals of smoke make no file: each is what
-`wlm.smoke.evaluation.compare` takes beside a network. No system imports a baseline.
+Each module has the methods by name in `RIVALS`. A method compresses an input and returns a `Rival`, whose error
+`evaluate_rivals` then measures as for our own methods. The rivals of smoke have no file: `wlm.smoke.evaluation.compare`
+takes each of them beside a network. The package `wlm` itself imports no rival.
 """
 
 from benchmarks.rivals.rival import Rival

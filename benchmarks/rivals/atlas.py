@@ -36,7 +36,7 @@ _EXTRA = "baselines"
 
 
 def share_of(rival: Rival, scene: LightmappedScene) -> float:
-    """Returns the bits of a rival over the bits of the lightmap at 48 per texel."""
+    """Returns the compressed size as a fraction of the lightmap's bits at 48 per texel."""
     return rival.bytes * 8 / (scene.texels * SOURCE_BITS)
 
 
@@ -45,11 +45,11 @@ def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) 
 
     Args:
         scene: A scene of one lightmap.
-        share: The budget; at 2/3 and above the lightmap keeps its size, and only rounding to 9 bits is left.
-        bilinear: Whether the smaller texels are bilinear reads, as the paper's, instead of the least squares.
+        share: Budget as a share of the lightmap's bits; from 2/3 on the lightmap keeps its full resolution.
+        bilinear: Whether to downsample bilinearly as in the paper, instead of by least squares.
 
     Raises:
-        ValueError: A share that has no room for one texel.
+        ValueError: The share has no room for one texel.
     """
     start, (sheet,) = time.perf_counter(), scene.sheets
     size, count = _fitting_size(sheet, share, (1, 1), COLOUR_BITS[TEXELS])
@@ -68,13 +68,13 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
 
     Args:
         scene: A scene of one lightmap.
-        share: The budget.
-        codec: "bc6h", by Intel's encoder at its second best setting; "bc6h own", by ours; or "astcWxH" with one of
-            `hdr_blocks.ASTC_BLOCKS`, "astc6x5" for example.
+        share: Budget as a share of the lightmap's bits.
+        codec: "bc6h" (Intel's encoder at its second best setting), "bc6h own" (our encoder), or "astcWxH" with one of
+            `hdr_blocks.ASTC_BLOCKS`, such as "astc6x5".
 
     Raises:
-        ValueError: No such codec, or a share that has no room for one block.
-        WlmError: A package is missing; the line names the extra.
+        ValueError: The codec is unknown, or the share has no room for one block.
+        WlmError: A package is missing; the message names the extra that installs it.
     """
     sides = {f"astc{w}x{h}": (w, h) for w, h in hdr_blocks.ASTC_BLOCKS} | {"bc6h": _BC6H, "bc6h own": _BC6H}
     if codec not in sides:
@@ -96,9 +96,9 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
 
 
 def best_astc(scene: LightmappedScene, share: float) -> Rival:
-    """Stores the lightmap in the smallest ASTC blocks that keep its size within the budget, else in `astc12x12`.
+    """Stores the lightmap in the smallest ASTC blocks with which its full resolution fits the budget.
 
-    Resizing a lightmap by little costs more than larger blocks do.
+    If none do, it is downsampled and stored as `astc12x12`: larger blocks lose less than a slight downsampling does.
     """
     (sheet,) = scene.sheets
     most = share * sheet.mask.size * SOURCE_BITS / _BLOCK_BITS
@@ -108,8 +108,8 @@ def best_astc(scene: LightmappedScene, share: float) -> Rival:
 
 
 def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int) -> tuple[tuple[int, int], int]:
-    """Finds a large size of the lightmap's shape, up to its own, of which charts read few enough blocks (width,
-    height); and the number of these blocks."""
+    """Finds the largest resolution at which the blocks that the charts read fit the budget. Returns width, height and
+    the number of these blocks."""
     if not 0.0 < share < math.inf:
         raise ValueError(f"share: expected above 0, got {share}")
     most = int(share * sheet.mask.size * SOURCE_BITS) // bits
@@ -133,7 +133,7 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
 
 
 def _read_blocks(sheet: Sheet, size: tuple[int, int], block: tuple[int, int]) -> int:
-    """Counts the blocks (width, height) of a texture that bilinear reads at the centres of the charts' texels touch."""
+    """Counts the blocks of a texture of some size that bilinear reads at the centres of the chart texels touch."""
     place = (np.argwhere(sheet.mask) + 0.5) * (np.array(size) / sheet.mask.shape) - 0.5
     low = np.floor(place).astype(np.int64)
     # A read at a texel's centre touches only this texel.
@@ -146,7 +146,7 @@ def _read_blocks(sheet: Sheet, size: tuple[int, int], block: tuple[int, int]) ->
 
 
 def _texture(name: str, texels: np.ndarray, bytes: int, start: float) -> Rival:
-    """Makes the rival of a texture under the lightmap's UVs."""
+    """Makes the `Rival` of a decoded texture that is read at the lightmap's UVs."""
     image = np.ascontiguousarray(texels, np.float32)
 
     def sample(points: Points, state: int) -> torch.Tensor:

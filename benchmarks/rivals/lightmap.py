@@ -29,11 +29,11 @@ class Method:
     """One way to compress a set of lightmaps.
 
     Attributes:
-        title, option: What a table calls it.
-        encode: Makes a `Rival` of lightmaps and their mask [H, W].
-        alone: Whether it takes one lightmap [H, W, 3] at a time; else all, [T, H, W, 3].
-        fitted: Whether `encode` takes the `device` on which it fits and decodes; the others need none.
-        random_access: Whether a GPU reads a texel at an hour from what it holds.
+        title, option: Names of the method and of its setting, as the results table prints them.
+        encode: Function that compresses lightmaps with their mask [H, W] and returns a `Rival`.
+        alone: Whether `encode` takes one lightmap [H, W, 3] at a time, instead of all T lightmaps [T, H, W, 3].
+        fitted: Whether `encode` takes the argument `device`, on which it fits and decodes.
+        random_access: Whether a GPU can read a single texel at any hour without decoding more.
     """
 
     title: str
@@ -45,7 +45,7 @@ class Method:
 
     @property
     def label(self) -> str:
-        """Returns title and option."""
+        """Title and option as one text, for lines of progress."""
         return f"{self.title} {self.option}".strip()
 
 
@@ -92,11 +92,11 @@ _FEW_FITTED = ("ntc-medium",)
 
 
 def usual(device: str, quick: bool = False) -> tuple[str, ...]:
-    """Returns the default methods of a run: on a CPU without fitted ones, which take hours there.
+    """Returns the names of the default methods; on a CPU without the fitted methods, which take hours there.
 
     Args:
         device: "cpu", "cuda" or "cuda:N".
-        quick: A third of them.
+        quick: Whether to return only a third of the methods.
     """
     names = FEW + _FEW_FITTED if quick else tuple(RIVALS)
     return tuple(name for name in names if device != "cpu" or not RIVALS[name].fitted)
@@ -116,7 +116,7 @@ def encode_set(
     *,
     device: str = "cpu",
 ) -> tuple[Rival, list[_Scored]]:
-    """Encodes and decodes a set with a method.
+    """Encodes and decodes a lightmap set with one method, and calls `visit` with each decoded lightmap.
 
     Args:
         name: A key of `RIVALS`.
@@ -127,7 +127,7 @@ def encode_set(
         device: "cpu", "cuda" or "cuda:N", for methods that are fitted.
 
     Returns:
-        The rival, with bytes and seconds of all times and without what was decoded, and what the visits returned.
+        The rival, with the size and the seconds of all times but no decoded lightmaps, and the results of `visit`.
 
     Raises:
         WlmError: An unknown name, a package is missing, or there is no such device.

@@ -1,15 +1,15 @@
-"""Block codecs that engines ship lightmaps in: BC6H, BC7 and ASTC, each at its best; and plain 8 bits.
+"""Block codecs that engines use for lightmaps: BC6H, BC7 and ASTC, each at its best quality; and plain 8 bits.
 
 Each encoder takes one lightmap [H, W, 3] in linear RGB and its mask [H, W], true where a texel is valid, and returns a
 `Rival` whose `decoded` is the lightmap, float32 [H, W, 3]. Negative radiance becomes 0, and values above 65,504,
-half float's largest, become that; with an empty mask a black lightmap is encoded. Gaps between charts are dilated from
-the nearest valid texel first, as every engine does: zeros there cost 10 dB at the edges of charts. Blocks that no read
-reaches are black. 8 bits and the LDR formats store levels between the least and the greatest of each tile, with a gamma
+the largest half float, are clamped; with an empty mask a black lightmap is encoded. Gaps between charts are dilated
+from the nearest valid texel first, as every engine does: zeros there cost 10 dB at the edges of charts. Blocks that no
+read reaches are black. 8 bits and the LDR formats store levels between minimum and maximum of a tile, with a gamma
 (`benchmarks.rivals.lightmap_levels`). Times are those of the codec alone on one thread, without the preparation. A
 size includes the padding to whole blocks.
 
 BC6H and BC7 can be optimised for rate and distortion (`wlm.formats.block_reuse`): `loss` is the root mean square error,
-in levels of 255, that the seen texels of a block may gain; 0 leaves the blocks as the encoder writes them.
+in levels of 255, by which a block may become worse to compress better; 0 leaves the encoder's blocks as they are.
 
 All functions raise a `WlmError` if shapes do not fit, a valid texel is NaN or infinite, a setting is out of range, or a
 package is missing.
@@ -124,7 +124,7 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: s
 
 
 def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
-    """Encodes as three bytes a texel with gamma 2.2 and the range of each tile: about BC7's upper bound."""
+    """Encodes as 3 bytes per texel with gamma 2.2 and the range of each tile: about the best that BC7 can reach."""
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, 1)
     rival = _measured(
@@ -164,7 +164,7 @@ def _astc_codec(codec: ModuleType, block: int, ldr: bool) -> hdr_blocks.Astc:
 def _measured(
     name: str, encode: Callable[[], bytes], decode: Callable[[bytes], np.ndarray], ranges: bytes = b""
 ) -> Rival:
-    """Measures a codec whose decoder needs the ranges of tiles besides the encoded blocks."""
+    """Encodes, decodes and times a codec. `ranges` are further bytes that its decoder needs: the ranges of tiles."""
     return measure(
         name,
         encode,
@@ -186,7 +186,7 @@ def _with_loss(name: str, loss: float) -> str:
 
 
 def _weight(mask: np.ndarray) -> np.ndarray:
-    """Returns the weight of squared errors, float32 [H, W, 3] padded to blocks: some bilinear reads reach the ring."""
+    """Returns weights of squared errors, float32 [H, W, 3] padded to blocks; texels just outside charts count less."""
     valid = np.asarray(mask).astype(bool)
     weight = np.where(valid, 1.0, np.where(seen_texels(valid, ring=1), _RING_WEIGHT, 0.0)).astype(np.float32)
     height, width = valid.shape
@@ -195,7 +195,7 @@ def _weight(mask: np.ndarray) -> np.ndarray:
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:
-    """Returns levels [H, W, 3] of a lightmap for blocks of this side, and the ranges that they are relative to."""
+    """Returns a lightmap as levels [H, W, 3] in [0, 1] relative to the range of each tile, and these ranges."""
     codes, seen = to_codes(image), seen_texels(mask)
     ranges = TileRanges.of(codes, seen)
     return clear_unseen(ranges.levels(codes), seen, block), ranges
@@ -206,13 +206,13 @@ def _to_bytes(levels: np.ndarray) -> np.ndarray:
 
 
 def _pad(image: np.ndarray) -> np.ndarray:
-    """Repeats the last row and column up to whole BC blocks."""
+    """Pads an image to whole blocks of 4 x 4 texels by repeating its last row and column."""
     height, width = image.shape[:2]
     return np.pad(image, ((0, -height % _BC_BLOCK), (0, -width % _BC_BLOCK), (0, 0)), mode="edge")
 
 
 def _cropped(rival: Rival, image: np.ndarray) -> Rival:
-    """Removes the padding of blocks."""
+    """Returns the rival with its decoded lightmap cropped to the size of `image`, without the padding of blocks."""
     height, width = image.shape[:2]
     decoded = np.ascontiguousarray(rival.decoded[:height, :width], dtype=np.float32)
     return replace(rival, decoded=decoded, size=(height, width))

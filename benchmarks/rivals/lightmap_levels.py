@@ -1,12 +1,12 @@
 """Preparation of lightmaps for rivals: gaps filled, a gamma, and levels relative to the range of a tile.
 
-A lightmap is float32 [H, W, 3] in linear RGB. Its codes are radiance ^ (1 / 2.2), and its levels are the codes in
-[0, 1] between the least and the greatest of their tile and channel, as ours has a scale per tile. These two are half
-floats, rounded outwards, and part of the rival's bytes. On 128 x 128 tiles of `unity_game_0` they raise BC7 by 9 dB
-over one scale for the whole map, and ASTC by 1 to 9.
+A lightmap is float32 [H, W, 3] in linear RGB. Its codes are radiance ^ (1 / 2.2). Its levels are the codes mapped to
+[0, 1] between the minimum and the maximum of a tile and channel, as our codec has a scale for each tile. Minimum and
+maximum are half floats, rounded outwards, and count in the rival's bytes. On 128 x 128 tiles of `unity_game_0` they
+raise BC7 by 9 dB over one scale for the whole map, and ASTC by 1 to 9 dB.
 
-A texel is seen if it is valid or within two texels of one that is: a bilinear read of the map reaches one texel, and
-that of a mip twice as far.
+A texel is called seen if it is valid or within two texels of a valid one: a bilinear read of the map reaches one texel
+beyond a chart, and a bilinear read of its first mip two texels.
 """
 
 from dataclasses import dataclass
@@ -47,13 +47,13 @@ def prepare(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def seen_texels(mask: np.ndarray, ring: int = 2) -> np.ndarray:
-    """Returns the texels that can be seen, bool [H, W]: the valid ones and a ring of this many around them."""
+    """Returns which texels renderers can read, bool [H, W]: valid texels and `ring` texels around them."""
     side = 2 * ring + 1
     return binary_dilation(np.asarray(mask).astype(bool), np.ones((side, side), bool))
 
 
 def clear_unseen(image: np.ndarray, seen: np.ndarray, block: int) -> np.ndarray:
-    """Makes blocks without a texel that can be seen black, [H, W, C]; they take few bytes on disk.
+    """Makes all blocks black that hold no seen texel, as these compress to few bytes. Returns the image [H, W, C].
 
     Args:
         image: [H, W, C].
@@ -69,19 +69,19 @@ def clear_unseen(image: np.ndarray, seen: np.ndarray, block: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TileRanges:
-    """The least and the greatest code of each tile and channel, half [..., rows, columns, 3]."""
+    """The minimum and maximum code of each tile and channel, half floats [..., rows, columns, 3] each."""
 
     low: np.ndarray
     high: np.ndarray
 
     @classmethod
     def of(cls, codes: np.ndarray, seen: np.ndarray, by_channel: bool = True) -> "TileRanges":
-        """Computes the ranges over the texels that are seen; 0 and 0 for a tile without one.
+        """Computes the ranges over the seen texels of each tile; minimum and maximum are 0 for a tile without any.
 
         Args:
             codes: float32 [..., H, W, 3], finite.
             seen: bool [H, W].
-            by_channel: Whether each channel has its own; else all three share the least and the greatest.
+            by_channel: Whether each channel has its own range; otherwise the three channels share one range.
         """
         height, width = seen.shape
         shape = (*codes.shape[:-3], -(-height // TILE), -(-width // TILE), 3)
@@ -98,12 +98,12 @@ class TileRanges:
 
     @classmethod
     def over_times(cls, codes: np.ndarray, seen: np.ndarray, by_channel: bool = True) -> "TileRanges":
-        """Computes the ranges over all times of codes [T, H, W, 3]: [rows, columns, 3]."""
+        """Computes ranges that hold for all T times of codes [T, H, W, 3]; the ranges are [rows, columns, 3]."""
         ends = cls.of(np.stack([codes.min(axis=0), codes.max(axis=0)]), seen, by_channel)
         return cls(ends.low[0], ends.high[1])
 
     def tobytes(self) -> bytes:
-        """Returns the bytes that a decoder needs."""
+        """Returns the ranges as the bytes that a decoder needs."""
         return self.low.tobytes() + self.high.tobytes()
 
     def levels(self, codes: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ class TileRanges:
         return np.clip((codes - low) / self.span(*codes.shape[-3:-1]), 0.0, 1.0)
 
     def span(self, height: int, width: int) -> np.ndarray:
-        """Returns the greatest less the least over their texels, float32 [..., H, W, 3]; 1 where they are equal."""
+        """Returns maximum minus minimum for each texel, float32 [..., H, W, 3]; 1 where both are equal."""
         low, high = self._spread(height, width)
         return np.where(high > low, high - low, np.float32(1.0))
 
@@ -123,15 +123,15 @@ class TileRanges:
         return np.minimum(codes**GAMMA, HALF_MAX).astype(np.float32)
 
     def _spread(self, height: int, width: int) -> list[np.ndarray]:
-        """Returns both over their texels, float32 [..., H, W, 3]."""
+        """Returns the minimum and the maximum that apply to each texel, float32 [..., H, W, 3] each."""
         return [_over_texels(values.astype(np.float32), TILE, height, width) for values in (self.low, self.high)]
 
 
 def to_codes(image: np.ndarray) -> np.ndarray:
-    """Converts radiance to codes, float32."""
+    """Converts radiance to gamma-encoded codes, radiance ^ (1 / 2.2), float32."""
     return np.power(image, np.float32(1.0 / GAMMA), dtype=np.float32)
 
 
 def _over_texels(values: np.ndarray, side: int, height: int, width: int) -> np.ndarray:
-    """Repeats values [..., rows, columns, C] of squares of this side over their texels, [..., height, width, C]."""
+    """Repeats values [..., rows, columns, C] of square tiles for each of their texels: [..., height, width, C]."""
     return values.repeat(side, axis=-3).repeat(side, axis=-2)[..., :height, :width, :]

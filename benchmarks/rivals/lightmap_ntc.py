@@ -54,8 +54,8 @@ class Latents:
     """Sizes of the two grids.
 
     Attributes:
-        fine_step, coarse_step: Texels along the side of a cell.
-        fine, coarse: Latents at each node.
+        fine_step, coarse_step: Texels along the side of a cell of the fine and of the coarse grid.
+        fine, coarse: Number of latents at each node of the fine and of the coarse grid.
     """
 
     fine_step: int
@@ -65,7 +65,7 @@ class Latents:
 
     @property
     def bits(self) -> float:
-        """Returns the bits of latents for each texel."""
+        """Returns the bits per texel that the latents of both grids take."""
         return self.fine * _FINE_BITS / self.fine_step**2 + self.coarse * _COARSE_BITS / self.coarse_step**2
 
     @property
@@ -88,10 +88,10 @@ class _Region:
     """The part of the map that one network covers.
 
     Attributes:
-        area: Its place in the map.
-        inside: bool [h, w], the N texels that are seen.
-        fine, coarse: uint8 [rows, columns, latents], levels of the latents; 0 where no texel that is seen reads them.
-        network: half, weights [inputs, outputs] and biases [outputs] of three layers.
+        area: Slices of the map's rows and columns that the region covers.
+        inside: bool [h, w], which texels of the region are decoded: N texels at and just around charts.
+        fine, coarse: Quantised latents, uint8 [rows, columns, latents]; 0 where no decoded texel reads them.
+        network: Weights [inputs, outputs] and biases [outputs] of three layers, half floats.
     """
 
     area: tuple[slice, slice]
@@ -116,10 +116,10 @@ def encode_ntc(
     Args:
         frames: [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
-        latents: A key of `LADDER`, or sizes.
-        steps: Of each network's fit, at least 1.
-        samples: Random texels of a step, at all hours.
-        seed: Of everything random; one seed gives one result on the CPU.
+        latents: A key of `LADDER`, or the sizes of the two grids.
+        steps: Steps of each network's fit, at least 1.
+        samples: Random texels of each step, at all hours.
+        seed: Seed of all random numbers; on the CPU the same seed gives the same result.
         device: "cpu", "cuda" or "cuda:N", for encoding and decoding.
 
     Returns:
@@ -167,7 +167,7 @@ def encode_ntc(
 
 
 def _weight(images: np.ndarray, codes: np.ndarray, ranges: TileRanges, mask: np.ndarray) -> np.ndarray:
-    """Returns the weight of squared errors of levels, float32 [T, H, W, 3], up to a factor."""
+    """Returns relative weights of the squared errors of levels, float32 [T, H, W, 3]."""
     height, width = mask.shape
     valid = np.asarray(mask).astype(bool)
     # PSNR is relative to a tile's range of radiance at that hour, over its valid texels.
@@ -185,7 +185,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 class _Places:
-    """Places at which the N seen texels of a region read the grids, in rows and columns of the region."""
+    """Rows and columns, within a region, of its N decoded texels, at which these read the grids of latents."""
 
     def __init__(self, inside: np.ndarray, sizes: Latents, device: str) -> None:
         self.texels = np.nonzero(inside)
@@ -197,7 +197,7 @@ class _Places:
         self.fine, self.coarse = (torch.from_numpy(a).to(device) for a in (self.fine, self.coarse))
 
     def _nodes(self, shape: tuple[int, int], step: int) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-        """Returns rows and columns of a grid, numbers of each texel's nodes [N, 4] and their bilinear shares [N, 4]."""
+        """Returns rows and columns of a grid, and each texel's 4 node indices [N, 4] and bilinear weights [N, 4]."""
         rows, columns = (-(-size // step) + 1 for size in shape)
         at = [(i + 0.5) / step for i in self.texels]
         (y, x), (fy, fx) = ([part(a) for a in at] for part in (lambda a: a.astype(np.int64), lambda a: a % 1.0))
@@ -207,7 +207,7 @@ class _Places:
 
 
 class _Fit:
-    """The fit of one region."""
+    """Fits the latents and the network of one region to its lightmaps."""
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class _Fit:
         return torch.rand(*shape, device=self._device, generator=self._random)
 
     def run(self, area: tuple[slice, slice], steps: int) -> _Region:
-        """Fits latents and network, then the network to rounded latents."""
+        """Fits latents and network together, then the network alone to the rounded latents. Returns the region."""
         freeze = math.ceil(_FREEZE_FROM * steps)
         groups = [{"params": self._latents}, {"params": self._network}]
         adam = torch.optim.Adam(groups, fused=True, eps=1e-10, betas=_BETAS)
@@ -300,7 +300,7 @@ def _answer(
     chosen: torch.Tensor,
     random: torch.Generator | None,
 ) -> torch.Tensor:
-    """Computes levels [B, 3 T] of texels [B] of latents [nodes, count] in [0, 1], noisy if a generator is given."""
+    """Computes levels [B, 3 T] of B texels from latents [nodes, count] in [0, 1]; a generator adds training noise."""
 
     def read(latents: torch.Tensor, nodes: torch.Tensor, top: int) -> torch.Tensor:
         values = functional.embedding(nodes[chosen], latents)  # [B, 4, count]
@@ -319,7 +319,7 @@ def _answer(
 
 @torch.no_grad()
 def _decode(region: _Region, sizes: Latents, device: str) -> np.ndarray:
-    """Decodes levels of the N texels that are seen, float32 [T, N, 3]."""
+    """Decodes the levels of a region's N texels `inside` at all T times, float32 [T, N, 3]."""
     places = _Places(region.inside, sizes, device)
     grids = zip((region.fine, region.coarse), _TOPS, strict=True)
     latents = [torch.from_numpy(a.reshape(-1, a.shape[-1])).to(device).float() / top for a, top in grids]
@@ -330,7 +330,7 @@ def _decode(region: _Region, sizes: Latents, device: str) -> np.ndarray:
 
 
 def _stored(ranges: TileRanges, regions: list[_Region]) -> bytes:
-    """Returns the bytes that a GPU stores: latents with their bits, networks and ranges."""
+    """Returns the data that a GPU stores, as bytes: packed latents, networks and ranges."""
     parts = [ranges.tobytes()]
     for region in regions:
         parts += [_nibbles(region.fine), region.coarse.tobytes(), *(values.tobytes() for values in region.network)]
@@ -338,13 +338,13 @@ def _stored(ranges: TileRanges, regions: list[_Region]) -> bytes:
 
 
 def _nibbles(levels: np.ndarray) -> bytes:
-    """Packs levels below 16, two in a byte."""
+    """Packs integers below 16 as 4 bits each, two in a byte."""
     flat = np.append(levels.ravel(), np.zeros(levels.size % 2, np.uint8))
     return (flat[::2] | flat[1::2] << 4).tobytes()
 
 
 def _disk_bytes(ranges: TileRanges, regions: list[_Region]) -> int:
-    """Returns the size under LZMA with a byte for each latent, plane by plane, which is smaller than two in a byte."""
+    """Returns the size in bytes under LZMA; 4-bit latents take a byte each first, which compresses better."""
     rest = [ranges.tobytes(), *(values.tobytes() for region in regions for values in region.network)]
     planes = [np.moveaxis(grid, -1, 0).tobytes() for region in regions for grid in (region.fine, region.coarse)]
     packed = sum(len(lzma.compress(part)) for part in (*planes, b"".join(rest)))

@@ -31,14 +31,14 @@ _MOST_LEVELS = 255  # levels of a map in bytes
 
 @dataclass(frozen=True, eq=False)
 class _Tile:
-    """The seen texels of a tile, and its axes.
+    """The principal components of one tile over T times.
 
     Attributes:
-        area: Its place in the map.
-        inside: bool [h, w], the texels seen.
-        mean: half [3 T].
-        axes: half [K, 3 T], the axis of the greatest variance first.
-        coefficients: float32 [N, K] of the texels seen.
+        area: Slices of the map's rows and columns that the tile covers.
+        inside: bool [h, w], which texels of the tile are coded: N texels at and just around charts.
+        mean: Mean vector, half [3 T].
+        axes: K principal axes, half [K, 3 T], the axis of the largest variance first.
+        coefficients: Coefficients of the N coded texels, float32 [N, K].
     """
 
     area: tuple[slice, slice]
@@ -52,7 +52,7 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
     """Encodes K coefficients per texel as BC4 textures, whose 256 levels span the map's range in the tile.
 
     Args:
-        frames, mask: The lightmaps.
+        frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
         components: K, at least 1; a tile has no more than 3 T.
     """
     if components < 1:
@@ -88,8 +88,9 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
     """Encodes coefficients rounded to a step, without the maps that are all zero.
 
     Args:
-        frames, mask: The lightmaps.
-        step: Of the rounding, in levels of 0 to 1, above 0. Where a map has more than 256 steps, they are wider.
+        frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
+        step: Step of the rounding, above 0, where levels range from 0 to 1. A map that would need more than 256 steps
+            gets wider ones.
     """
     if not 0.0 < step < np.inf:
         raise WlmError(f"pca: expected a step above 0, got {step:g}")
@@ -106,7 +107,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
         return _decode(read, ranges, images.shape)
 
     def size(payload: tuple) -> int:
-        """Returns the bytes on a GPU: one for each texel and map."""
+        """Returns the size in bytes on a GPU: one byte for each texel and map."""
         ranges, tiles = payload
         texels = sum(tile.inside.size * planes.shape[1] for tile, planes, _ in tiles)
         rest = sum(len(_basis(tile, planes.shape[1])) + scale.nbytes for tile, planes, scale in tiles)
@@ -122,7 +123,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
 
 
 def _tiles(images: np.ndarray, mask: np.ndarray) -> tuple[TileRanges, list[_Tile]]:
-    """Computes the ranges, and the axes of every tile with a texel that is seen."""
+    """Computes the ranges of all tiles, and the principal components of every tile that has a texel to code."""
     seen = seen_texels(mask)
     codes = to_codes(images)
     ranges = TileRanges.over_times(codes, seen)
@@ -143,7 +144,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 def _principal(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes mean half [D], axes half [D, D] and coefficients float32 [N, D] of vectors [N, D]."""
+    """Computes the PCA of N vectors [N, D]. Returns mean half [D], axes half [D, D], coefficients float32 [N, D]."""
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float16)
     centred = vectors - mean.astype(np.float32)
     _, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred)
@@ -156,7 +157,7 @@ def _basis(tile: _Tile, components: int) -> bytes:
 
 
 def _rounded(tile: _Tile, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns bytes [N, K] of the coefficients that are not 0, and float32 [K, 2]: least value and step of each."""
+    """Rounds K maps, without those that are all zero: bytes [N, K], and minimum and step of each, float32 [K, 2]."""
     span = np.ptp(tile.coefficients, axis=0)
     steps = np.maximum(np.float32(step), span / np.float32(_MOST_LEVELS - 1))
     whole = np.rint(tile.coefficients / steps)
@@ -171,14 +172,14 @@ def _lossless(plane: np.ndarray, tile: _Tile) -> bytes:
 
 
 def _over_tile(values: np.ndarray, tile: _Tile) -> np.ndarray:
-    """Returns a map [h, w] of the values [N] of the seen texels; other texels take the nearest value."""
+    """Returns a map [h, w] of the N coded texels' values [N]; other texels take the nearest value."""
     texels = np.zeros(tile.inside.shape, values.dtype)
     texels[tile.inside] = values
     return fill_gaps(texels[..., None], tile.inside)[..., 0]
 
 
 def _bc4(plane: np.ndarray, tile: _Tile) -> tuple[bytes, np.ndarray]:
-    """Encodes a map [N] as blocks and float32 [2], its least value and its range."""
+    """Encodes a map of N values [N] as BC4. Returns the blocks, and minimum and range of the map, float32 [2]."""
     least = plane.min()
     span = plane.max() - least
     texels = _over_tile(np.rint((plane - least) / (span or 1.0) * 255.0).astype(np.uint8), tile)

@@ -34,10 +34,10 @@ class Features:
 
     Attributes:
         uv: Maps F_uv, each of 128 x 128 texels and 4 channels.
-        uvt: Texels of F_uvt along u and along v, a multiple of 4; 0: there is none.
+        uvt: Texels of F_uvt along u and along v, a multiple of 4; 0: there is no F_uvt.
         slices: Slices of F_uvt along time.
         columns, rows: Size of F_ut and F_vt: along u or v, and along time.
-        channels: Of each of these two; 0: there are none.
+        channels: Channels of F_ut and of F_vt; 0: there are no such maps.
         blocks: Whether F_uv and F_uvt are trained as endpoints and weights of BC7 blocks (eq. 7 and 8). Otherwise
             their texels are trained, and a BC7 encoder runs when they are frozen (extra `baselines`).
     """
@@ -73,7 +73,7 @@ class PlainFit:
 
     Attributes:
         parameters: The tensors that the optimiser moves, maps first.
-        tile_bytes: Of a tile's maps, network in half floats, scales, bounds, shift and spread.
+        tile_bytes: Size in bytes of a tile: maps, network in half floats, and the parameters that scale its values.
     """
 
     def __init__(
@@ -86,14 +86,14 @@ class PlainFit:
         seed: int = 0,
         device: str = "cpu",
     ):
-        """Draws the first parameters.
+        """Initialises the parameters at random.
 
         Args:
             profile: The settings; those of the maps count only without `features`.
             axis: The time axis.
             targets: What to fit, of N tiles.
             features: The maps; None: the profile's.
-            seed: Of everything random.
+            seed: Seed of all random numbers.
             device: "cpu" or "cuda:0".
         """
         self._random = torch.Generator(device).manual_seed(seed)
@@ -148,7 +148,7 @@ class PlainFit:
         """Does one step, in the stages of `Profile.quantise_from` and `freeze_from`.
 
         Returns:
-            Its loss, the mean over tiles, samples and channels, still on the device.
+            The loss of the step, the mean over tiles, samples and channels, a tensor on the device.
         """
         p, n, t = self._profile, *self._colour.shape[:2]
         quantised = self._step >= round(p.quantise_from * p.steps)
@@ -201,7 +201,7 @@ class PlainFit:
 
     @torch.no_grad()
     def _stored(self) -> list[torch.Tensor]:
-        """Returns the same on the levels of a file."""
+        """Returns the maps as `_maps` does, with the quantised values that a file would hold."""
         maps = self._maps(quantised=True)
         count = len(maps) - len(self._planes)
         if self._features.blocks:
@@ -228,7 +228,7 @@ class PlainFit:
         return x.transpose(1, 2)
 
     def _sample(self, values, tau, *place):
-        """Reads [N, C, rows of time, ...] at places [N, B] along its axes in [0, 1], time first: [N, C, B]."""
+        """Interpolates maps [N, C, times, ...] at B places in [0, 1], one [N, B] for each axis; returns [N, C, B]."""
         if self._periodic:
             rows = values.shape[2]
             values = torch.cat([values[:, :, -1:], values, values[:, :, :1]], 2)

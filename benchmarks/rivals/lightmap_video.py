@@ -115,7 +115,7 @@ def fill_smoothly(images: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _stream_bytes(data: bytes) -> int:
-    """Returns the bytes of the AV1 stream alone, without AVIF's boxes."""
+    """Returns the size in bytes of the AV1 stream alone, without the boxes of the AVIF file."""
     at = 0
     while data[at + 4 : at + 8] != b"mdat":
         at += int.from_bytes(data[at : at + 4], "big")

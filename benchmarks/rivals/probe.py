@@ -55,7 +55,7 @@ def clustered_pca(
 
     Args:
         position, values, components, bits: See the module.
-        clusters: At least 1. Fewer come out where there are fewer distinct probes, or where a cluster ends empty.
+        clusters: Number of clusters, at least 1; clusters that end up empty are dropped.
         seed: Seed of the initial centres.
         signal: False clusters the positions with k-means (gaussian-probe-compression, section 5.1): the centres are
             stored, and a probe needs no index. True assigns each probe to the cluster that reconstructs it best (Sloan
@@ -107,7 +107,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
     as it is decoded, which costs nothing and is closer than the engine's own ratio.
 
     Args:
-        position: Only their number counts.
+        position: Positions of the probes; only their number is used.
         values: SH coefficients from L00, each red, green and blue: 3, 12 or 27 numbers take 4, 13 or 28 bytes. Any
             other count raises a `WlmError`.
     """
@@ -148,7 +148,7 @@ def at_bytes(
     budget_bytes: int,
     bits: Sequence[int | None] = WEIGHT_BITS,
 ) -> Rival:
-    """Searches for the settings of one method with the least squared error at a size.
+    """Searches for the settings of one method that have the least squared error within a size.
 
     For each number of bits the component counts are tried from the largest downwards until two in a row gain
     nothing, each with as many parts as fit, at most `MAX_PARTS` or `MAX_GRID` cells.
@@ -156,7 +156,7 @@ def at_bytes(
     Args:
         name: A key of `RIVALS`.
         position, values: See the module.
-        budget_bytes: The largest size.
+        budget_bytes: The maximum size in bytes.
         bits: Bits of a weight to try; `(None,)` keeps to half floats as gaussian-probe-compression's table has them.
 
     Returns:
@@ -182,10 +182,10 @@ def _search(
     largest: Callable[[int, int | None], int],
     make: Callable[[int, int, int | None], Rival],
 ) -> tuple[Rival, tuple[int, int, int | None]] | None:
-    """`at_bytes` for a method with components, parts and bits.
+    """Searches numbers of components, parts and bits for the result of least squared error, for `at_bytes`.
 
-    `largest` gives the most parts for components and bits, 0 where nothing fits; `make` a result for all three.
-    Returns the best result with its three settings, or None.
+    `largest` returns how many parts fit for components and bits, 0 if none; `make` compresses with all three settings.
+    Returns the best result and its three settings, or None if nothing fits.
     """
     tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []
     for number in bits:
@@ -289,7 +289,7 @@ def _weights(bits: int | None) -> str:
 def _checked(
     position: np.ndarray, values: np.ndarray, components: int = 1, bits: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Checks both and returns them as float64, with the values rounded to float32."""
+    """Checks positions and values, and returns them as float64 arrays, with the values rounded to float32."""
     position = np.asarray(position, np.float64)
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is refused as that
         values = np.asarray(values).astype(np.float32).astype(np.float64)

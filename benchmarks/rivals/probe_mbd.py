@@ -52,7 +52,7 @@ class Solver:
     """
 
     def __init__(self, position: np.ndarray, values: np.ndarray, components: int, grid: int) -> None:
-        """Starts from PCA.
+        """Initialises weights and corners by the PCA of all probes.
 
         Args:
             position: float64 [N, 3].
@@ -67,7 +67,7 @@ class Solver:
         self.weight = (values - mean) @ basis[0].T
 
     def step(self, rounds: int = 1) -> None:
-        """Improves weights and corners in turn."""
+        """Improves weights and corners alternately, `rounds` times."""
         for _ in range(rounds):
             self.solve_corners()
             self.solve_weights()
@@ -127,7 +127,7 @@ def encode(
         bits: Bits of a weight, 1 to 16, over the range of each cell and component; None for half floats.
 
     Returns:
-        The layout of this module.
+        The bytes in the layout that the module's docstring describes.
     """
     scale = scale_of(values)
     solver = Solver(position, values / scale, components, grid)

@@ -61,7 +61,7 @@ class Partition:
 
     @property
     def members(self) -> list[np.ndarray]:
-        """The probes of each part, in order."""
+        """The indices of the probes of each part, in ascending order."""
         return _members(self.label, self.count)
 
 
@@ -231,7 +231,7 @@ def rescale(decoded: np.ndarray, scale: float) -> np.ndarray:
 
 
 def weight_bytes(probes: int, components: int, count: int, bits: int | None) -> int:
-    """Returns the bytes of `write_weights` for N probes in C parts."""
+    """Returns the number of bytes that `write_weights` makes for N probes with K weights each, in C parts."""
     if bits is None:
         return probes * components * 2
     return count * components * 4 + -(-probes * components * bits // 8)
@@ -306,7 +306,7 @@ def _read_partition(kind: int, data: bytes, position: np.ndarray, count: int) ->
 
 
 def _levels(bounds: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns lowest value and step [C, K] of bounds [C, 2, K]."""
+    """Returns minimum and quantisation step [C, K] for the bounds [C, 2, K] of C parts and K components."""
     low, high = bounds.astype(np.float64).transpose(1, 0, 2)
     return low, (high - low) / (2**bits - 1)
 
@@ -332,13 +332,13 @@ def _members(label: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def compact(label: np.ndarray) -> tuple[np.ndarray, int]:
-    """Numbers the labels in use from 0 in their order."""
+    """Renumbers labels from 0 without gaps, in the same order."""
     used, compact = np.unique(label, return_inverse=True)
     return compact.astype(np.int64), len(used)
 
 
 def _nearest(position: np.ndarray, code: np.ndarray) -> np.ndarray:
-    """Returns the nearest of the stored centres, int64 [N]."""
+    """Returns the index of the nearest stored centre for each of N positions, int64 [N]."""
     centre = position.min(0) + code.astype(np.float64) * (extent_of(position) / _CENTRE_LEVELS)
     return cKDTree(centre).query(position)[1].astype(np.int64)
 
@@ -348,7 +348,7 @@ def _sums(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
 
 
 def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
-    """k-means++: points drawn with the square of their distance to those drawn so far as the chance."""
+    """Draws initial centres by k-means++: with chances by squared distance to the nearest centre drawn so far."""
     chosen = [points[random.integers(len(points))]]
     distance = np.square(points - chosen[0]).sum(1)
     while len(chosen) < count and distance.sum() > 0.0:
@@ -358,7 +358,7 @@ def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.nd
 
 
 def _closest(values: np.ndarray, mean: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the subspace of least error for each of [N, D], int64 [N], and the sum of the squared errors."""
+    """Returns the index of the subspace of least error for each of N values, int64 [N], and the total squared error."""
     count, rank, width = basis.shape
     flat = basis.reshape(count * rank, width)
     offset = np.einsum("ckd,cd->ck", basis, mean)

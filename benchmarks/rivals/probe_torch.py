@@ -115,7 +115,7 @@ class DenseFit:
         return loss.detach()
 
     def run(self, steps: int) -> None:
-        """Does some steps, waits for the device, and adds the time to `seconds`."""
+        """Does `steps` steps, waits for the device, and adds the elapsed time to `seconds`."""
         self._wait()
         start = time.perf_counter()
         for _ in range(steps):
@@ -125,7 +125,7 @@ class DenseFit:
 
     @torch.no_grad()
     def decoded(self) -> np.ndarray:
-        """Decodes the probes from Gaussians on the levels of a file, float32 [N, D]."""
+        """Decodes the probes from Gaussians quantised as in a file, float32 [N, D]."""
         return (self._answer(quantised=True) * self._spread + self._mean).cpu().numpy()
 
     def _put(self, array: np.ndarray) -> torch.Tensor:
@@ -146,7 +146,7 @@ class DenseFit:
 
 
 def _features(x, centre, log_scale, rotation, latent):  # [N, 3], [K, 3], [K, 3], [K, 4], [K, L] -> [N, L]
-    """Evaluates eq. 2 to 5."""
+    """Evaluates eq. 2 to 5 of the paper: the features of N probes as sums over all Gaussians."""
     whiten = _matrices(rotation).transpose(1, 2) * torch.exp(-log_scale)[:, :, None]  # [K, 3, 3], S^-1 R^T
     u = torch.einsum("kij,nj->nki", whiten, x) - torch.einsum("kij,kj->ki", whiten, centre)
     return torch.exp(-0.5 * (u * u).sum(-1)) @ latent

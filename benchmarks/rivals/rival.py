@@ -1,4 +1,4 @@
-"""The result of a rival of any system, and its measurement."""
+"""The result of a rival compression method, with its sizes and times, and how these are measured."""
 
 import time
 from collections.abc import Callable
@@ -20,17 +20,16 @@ class Rival:
     """An input compressed and decoded by one method.
 
     Attributes:
-        name: The method, a key of its module's `RIVALS`.
-        bytes: Size of everything that a decoder needs.
+        name: Name of the method, a key of `RIVALS` in its module.
+        bytes: Size in bytes of everything that a decoder needs.
         encode_seconds: Wall-clock time from the input to these bytes, on the CPU unless the method is given a device.
-        decode_seconds: Wall-clock time from these bytes to `decoded`, likewise; None where it isn't measured. A GPU
-            decodes block formats in its texture unit: this says nothing of what they cost there.
-        decoded: What the system's evaluation scores: a lightmap float32 [H, W, 3], an atlas' `Sampler`, probes
-            float32 [N, D].
-        option: Settings that the method chose, for a table.
-        size: Rows and columns of its texture; None where it has none.
-        disk_bytes: Size of the same after lossless compression, where it is kept on a disk; None where that isn't
-            measured.
+        decode_seconds: Wall-clock time from these bytes to `decoded` on the same device; None: not timed. For block
+            formats it says nothing about a GPU, whose texture unit decodes them.
+        decoded: The decompressed data whose error is measured: a lightmap float32 [H, W, 3], a `Sampler` of an atlas,
+            or probes float32 [N, D].
+        option: Settings that the method chose, as the results table prints them.
+        size: Rows and columns of the method's texture; None if it has no texture.
+        disk_bytes: Size in bytes after lossless compression, as kept on disk; None if not measured.
     """
 
     name: str
@@ -52,15 +51,15 @@ def measure(
     disk_bytes: Callable[[_Payload], int] | None = None,
     option: Callable[[_Payload], str] = lambda payload: "",
 ) -> Rival:
-    """Encodes and decodes, and takes the time of both.
+    """Encodes and decodes by a method, times both, and returns the `Rival`.
 
     Args:
-        name: The method.
-        encode: Makes the payload.
-        decode: Reads it.
-        bytes: The payload's size.
-        disk_bytes: Its size on a disk; compressing for that takes no part in the times.
-        option: Describes the settings of the payload.
+        name: Name of the method.
+        encode: Function that makes the encoded payload.
+        decode: Function that decodes a payload.
+        bytes: Function that returns a payload's size in bytes.
+        disk_bytes: Function that returns its size in bytes on disk; lossless compression for that is not timed.
+        option: Function that returns the settings of a payload as text.
     """
     start = time.perf_counter()
     payload = encode()
@@ -72,7 +71,7 @@ def measure(
 
 
 def disk_size(data: bytes) -> int:
-    """Returns the size of some bytes under zstd, as in KTX2 files and packages of engines, or uncompressed if smaller.
+    """Returns the size in bytes of data under zstd, as in KTX2 files and game packages; at most its plain size.
 
     Raises:
         WlmError: imagecodecs, of the extra `baselines`, is missing.

@@ -1,7 +1,7 @@
-"""A scene's parts: each lightmap, of one object in one state, compressed alone as `standard` does it.
+"""Compresses each lightmap of a scene, of one object in one lighting state, alone, by the profile `standard`.
 
-They are the rival of shared tiles: each part has its own tiles and textures, and its share of the bits by its texels.
-Tiles are fitted in all parts at once, with the weights of the scene's views, in which the parts are scored.
+These parts are the rival of one model whose tiles all objects share: each part has its own tiles and textures, and a
+share of the bits in proportion to its texels. All parts are fitted at once, weighted for views of the whole scene.
 """
 
 import math
@@ -30,7 +30,7 @@ _TRIES, _CLOSE = (
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A sheet's lightmap in one state, as a scene, and the range of its tiles among those of all parts."""
+    """One sheet's lightmap in one lighting state, as a scene, and the range of its tile numbers among all parts."""
 
     scene: LightmappedScene
     sheet: int
@@ -38,10 +38,10 @@ class _Part:
 
 
 class SceneParts:
-    """Models of all parts.
+    """The compressed models of all parts of a scene.
 
     Attributes:
-        models: By sheet and state.
+        models: The model of each part, by sheet and lighting state.
         share: The budget of each part, as a fraction of its lightmap's bits at 48 per texel.
     """
 
@@ -51,12 +51,12 @@ class SceneParts:
 
     @property
     def bits(self) -> float:
-        """The bits of all textures."""
+        """The total number of bits of all textures."""
         models = (model for of_sheet in self.models for model in of_sheet)
         return sum(model.bits for model in models)
 
     def __call__(self, points: Points, state: int) -> torch.Tensor:
-        """Reads light at points; a `Sampler`."""
+        """Returns the decoded light at surface points in one lighting state, as a `Sampler` does."""
         light = torch.zeros((len(points), 3), dtype=torch.float32, device=points.uv.device)
         for number in torch.unique(points.sheet).tolist():
             at = points.sheet == number
@@ -71,17 +71,18 @@ def scene_parts(
     colour: str = "mixed",
     device: str = "cpu",
 ) -> SceneParts:
-    """Compresses each part alone.
+    """Compresses each lightmap of a scene alone, with a share of the given bits.
 
     Args:
         scene: The scene.
         weights: For each sheet [2 H, 2 W], how much each quarter of a texel counts, `scene_weights`.
-        bits: Bits of all parts; except for plain ones they have at least these, and as few more as their sizes allow.
-        colour: The colour in place of that of `standard`.
+        bits: Total bits of all parts. The result has as many or a few more, as texture sizes allow, unless some parts
+            become plain smaller lightmaps.
+        colour: The storage of colour, which replaces the setting of `standard`.
         device: "cpu" or "cuda:N".
 
     Returns:
-        The parts; one of them is a plain smaller lightmap where that is no worse, or where tiles don't fit its share.
+        The parts. A part is a plain smaller lightmap if that is no worse, or if tiles don't fit its share of the bits.
     """
     with one_thread(device):
         return _compressed(scene, weights, bits, Profile.load("standard").override({"colour": colour}), device)
@@ -122,7 +123,7 @@ def _compressed(
 def _cut(
     scene: LightmappedScene, weights: Sequence[np.ndarray], profile: Profile, device: str
 ) -> tuple[Tiles, list[_Part]]:
-    """Cuts the tiles of all parts, each with weights that add up to 1; and lists the parts, sheet by sheet."""
+    """Cuts all parts into tiles, the weights of each part adding up to 1. Returns tiles and parts, sheet by sheet."""
     pieces, parts, first = [], [], 0
     for number, (sheet, weight) in enumerate(zip(scene.sheets, weights, strict=True)):
         for state, lightmap in zip(scene.states, sheet.lightmaps, strict=True):
@@ -147,7 +148,7 @@ def _placed(error: torch.Tensor, sizes: list[Size], part: _Part, share: float, p
 
 
 def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) -> float:
-    """Bits of a part's textures; an estimate where it becomes a smaller lightmap."""
+    """Returns the bits of a part's textures, or an estimate if the part becomes a smaller lightmap."""
     size = part.scene.sheets[0].mask.shape
     if placed is None:
         return share * part.scene.texels * SOURCE_BITS

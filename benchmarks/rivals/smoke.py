@@ -1,4 +1,4 @@
-"""A rival of the network: a flip book that was baked from one side, on a billboard."""
+"""A rival of neural six-way lightmaps of smoke: a flip book that was baked from one side, shown on a billboard."""
 
 import numpy as np
 import torch
@@ -11,13 +11,13 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
     """Shows lightmaps that were baked from one side on a billboard that turns to the camera, as a flip book does.
 
     The billboard stands at the pivot and always faces the camera, so that a turn about the pivot changes nothing but
-    the directions of its axes: the smoke keeps the look of the side that was baked. Lights are weighted in the axes of
-    the new camera, as engines do.
+    the directions of its axes: the smoke always looks as from the side that was baked. Lights are weighted in the axes
+    of the new camera, as engines do.
 
     Args:
-        baked: From `source`.
-        source: Orthographic.
-        camera: Orthographic, from where the billboard is seen.
+        baked: The lightmaps that were baked for the camera `source`.
+        source: Orthographic camera of the bake.
+        camera: Orthographic camera that sees the billboard.
         pivot: [3], the point of the world about which the billboard turns: the smoke's centre.
 
     Returns:
@@ -47,6 +47,6 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:
-    """Returns the offset of a point from the middle of the image, to the right and up, in units of the world."""
+    """Returns a point's offset from the image centre, to the right and up, in world units."""
     right, up, _ = camera.axes @ (np.asarray(pivot, np.float64) - np.asarray(camera.position, np.float64))
     return float(right), float(up)

@@ -1,8 +1,8 @@
-"""Rivals of light of all orders: octaves of light scattered once, a linear filter, and diffusion alone.
+"""Rival approximations of multiple scattering in smoke: octaves of single scattering, a linear filter, and diffusion.
 
-Octaves: Wrenninge et al. 2013, "Oz: the great and volumetric"; light scattered more often is light scattered once in
-thinner smoke. Filter: light that is scattered on comes out blurred, so planes blurred at several scales have most of
-it.
+Octaves (Wrenninge et al. 2013, "Oz: the great and volumetric") approximate light that is scattered several times by
+single scattering in thinner smoke. The filter approximates it, as scattering blurs light, by a weighted sum of image
+planes blurred at several scales.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _REACH = 3.0  # standard deviations
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Makes a picture by three octaves, float32 [H, W, 3]."""
+    """Returns a picture with multiple scattering approximated by three octaves, float32 [H, W, 3]."""
     march = orders_march(volume)
     picture = light_smoke(volume, camera, lights, march).shade(albedo=(albedo,) * 3)
     for share, shadow in CLASSIC:
@@ -42,7 +42,7 @@ def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
 
 def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """Makes a picture by each octave of `FITTED` alone, at albedo 1, float32 [O, H, W, 3]."""
+    """Returns the picture of each of the O octaves of `FITTED` alone, at albedo 1, float32 [O, H, W, 3]."""
     march = orders_march(volume)
     made = []
     for seen, shadow in FITTED:
@@ -52,17 +52,17 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
 
 
 def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Makes a picture by single scattering and diffusion, the inputs of the learned mix, float32 [H, W, 3]."""
+    """Returns a picture by single scattering plus diffusion, the inputs of our learned model, float32 [H, W, 3]."""
     with stream(device_name(volume.device)):
         lit, inputs = make_inputs(volume, camera, lights, [albedo], orders_march(volume))
         return lit.compose(inputs.by_diffusion(albedo)[..., None].expand(-1, -1, -1, 3))
 
 
 def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """Makes the planes that a linear filter mixes for each light of irradiance 4 pi, float32 [L, P, H, W].
+    """Returns P image planes for each of L lights of irradiance 4 pi, float32 [L, P, H, W], which the filter adds up.
 
-    Light of the light itself and of the opposite one, from all around, opacity, its square and optical depth: as they
-    are and blurred, and all of it times opacity.
+    The planes are the smoke lit by the light, by the opposite light and from all around, opacity, squared opacity and
+    optical depth; each also blurred at several scales, and all of these also multiplied by opacity.
 
     Args:
         volume: The smoke.
