@@ -1,4 +1,4 @@
-"""Speed against error: timing, the rows that every system reports, and their tables and plots."""
+"""Benchmarks of speed and error: timing of calls, one format of results for all systems, tables and plots."""
 
 from benchmarks.compare import Change, compare
 from benchmarks.figures import FIGURES

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`, from the checkout: the command line of the benchmarks."""
+"""The command line of the benchmarks: `python -m benchmarks` in a checkout of the repository."""
 
 from benchmarks.app import app
 from wlm.cli.app import run

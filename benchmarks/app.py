@@ -1,6 +1,7 @@
-"""The command line `python -m benchmarks`: measurements, reports, plots and comparisons of results.
+"""The command line `python -m benchmarks`: measures the systems, and reports, plots and compares the results.
 
-Each measuring command calls `run` of the module of its name, with the options of `_COMMANDS` as keyword arguments.
+Each command that measures calls the function `run` of the module that has its name. The options that `_COMMANDS` lists
+for the command are the keyword arguments.
 """
 
 import importlib
@@ -33,14 +34,14 @@ app = typer.Typer(
 
 
 def _option(kind: Any, flag: str, text: str, **more: Any) -> Any:
-    """Makes the annotation of an option."""
+    """Returns the type annotation from which typer makes a command line option: its type, flag and help text."""
     return Annotated[kind, typer.Option(flag, help=text, **more)]
 
 
-_PROFILE = "The profile or YAML file to vary."
+_PROFILE = "The profile, by name or YAML file, that is varied."
 # The annotation and the default of each option, by the name of its argument.
 _OPTIONS: dict[str, tuple[Any, Any]] = {
-    "quick": (_option(bool, "--quick", "Measure fewer and smaller cases, in minutes on a CPU."), False),
+    "quick": (_option(bool, "--quick", "Measure fewer, smaller cases: minutes on a CPU."), False),
     "device": (Device, "cpu"),
     "set_path": (_option(Path | None, "--set", "A lightmap set. Default: the demo's.", metavar="SET"), None),
     "profiles": (_option(list[str] | None, "--profile", "A profile or YAML file. Repeatable.", metavar="NAME"), None),
@@ -53,10 +54,10 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         None,
     ),
     "probes_path": (_option(Path | None, "--probes", "Light probes. Default: the demo's.", metavar="FILE"), None),
-    "keys": (_option(list[str] | None, "--key", "An array of the file. Repeatable."), None),
-    "volume_only": (_option(bool, "--volume-only", "Measure only the volume."), False),
+    "keys": (_option(list[str] | None, "--key", "Array of --probes to measure. Repeatable."), None),
+    "volume_only": (_option(bool, "--volume-only", "Measure only the cascaded probe volume."), False),
     "meshes_path": (
-        _option(Path | None, "--meshes", "Folders, each with a .glb, .exr lightmaps, maybe mask.png.", metavar="DIR"),
+        _option(Path | None, "--meshes", "Folder of a mesh, or of such folders: .glb, .exr, mask.png.", metavar="DIR"),
         None,
     ),
     "mesh_path": (_option(Path | None, "--mesh", "One mesh in place of --meshes.", metavar="FILE"), None),
@@ -67,11 +68,14 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "mask_path": (_option(Path | None, "--mask", "The mask of --lightmap.", metavar="FILE.png"), None),
     "scene_path": (_option(Path, "--set", "A lightmap set that names its mesh.", metavar="SET"), ...),
     "hours": (_option(list[float] | None, "--hour", "An hour to measure. Repeatable; default: all."), None),
-    "side": (_option(int | None, "--side", "Texels of the longer side, a divisor of it.", min=1), None),
-    "budget": (_option(float | None, "--budget", "A budget in place of the profile's."), None),
+    "side": (_option(int | None, "--side", "Texels of the set's longer side after downsampling.", min=1), None),
+    "budget": (_option(float | None, "--budget", "Share of the uncompressed bits. Default: the profile's."), None),
     "parts": (_option(bool, "--parts/--no-parts", "Measure each object and state alone at equal bits, too."), True),
     "steps": (_option(int | None, "--steps", "Steps of each fit. Default: the profile's.", min=1), None),
-    "only": (_option(list[str] | None, "--only", "A row to measure. Repeatable; default: all.", metavar="ROW"), None),
+    "only": (
+        _option(list[str] | None, "--only", "A variant to measure. Repeatable; default: all.", metavar="ROW"),
+        None,
+    ),
     "networks": (
         _option(list[Path] | None, "--network", "A trained network. Default: ours. Repeatable.", metavar="FILE"),
         None,
@@ -105,11 +109,11 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("scene_path", "hours", "side", "profiles", "budget", "parts", "quick", "device"),
     ),
     "atlas-ablation": (
-        "Measure lightmaps of meshes: the cascade without its parts, and with textures of other sizes.",
+        "Measure lightmaps of meshes: the texture cascade with steps left out, and with other texture sizes.",
         ("quick", "profile", "device", *_MESHES, "steps", "only"),
     ),
     "smoke": (
-        "Measure smoke: the solver beside a copy, advection, guiding maps, six-way lightmaps and whole frames.",
+        "Measure smoke: speed of the solver against a memory copy, advection, six-way lightmaps and whole frames.",
         ("quick", "device"),
     ),
     "smoke-orders": (
@@ -142,7 +146,7 @@ def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:
 
 
 def _measure(name: str, values: dict[str, Any]) -> None:
-    """Checks the output and the device before long work, measures, writes the result file and prints the rows."""
+    """Runs a measuring command: checks its arguments, measures, writes the result file and prints the results."""
     from benchmarks import describe_environment, read_runs, tables, write_json
     from wlm.interop import check_device
 
@@ -169,7 +173,7 @@ def _measure(name: str, values: dict[str, Any]) -> None:
 
 
 def _words(values: Mapping[str, Any]) -> list[str]:
-    """Returns the options that differ from their defaults, and every option with a value, as words of a command."""
+    """Returns command line words, such as "--device cuda:0": flags that are not at their default, all set values."""
     words = []
     for option, value in values.items():
         # typer keeps the first argument of `typer.Option`, which is the flag in an `Annotated`, as `default`.
@@ -198,7 +202,7 @@ def report(
         Path | None, output_option("INDEX.md", "The index; the pages go to a folder beside it. Default: print them.")
     ] = None,
 ) -> None:
-    """Write result files as Markdown: an index and one page for each system."""
+    """Write result files as Markdown pages: an index, and one page for each system."""
     from benchmarks import pages
 
     if output is None:
@@ -233,10 +237,10 @@ def plot(
 
 @app.command()
 def compare(
-    new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Results of the code to check.")],
-    old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Results of the code before.")],
+    new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Results of the changed code.")],
+    old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Results of the code before the change.")],
 ) -> None:
-    """Fail where a figure of NEW is worse: by over 0.05 dB, or by over 5% of a time of the same machine."""
+    """Compare two result files; fail if NEW has lost over 0.05 dB, or takes over 5% longer on the same machine."""
     from benchmarks import FIGURES, read_runs
     from benchmarks import compare as changes_between
 

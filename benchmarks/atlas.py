@@ -1,22 +1,22 @@
 """The atlas system against smaller lightmaps and block codecs: size, speed and error.
 
-For each lightmap of each mesh these kinds of rows:
+For each lightmap of each mesh the results table has these kinds of rows:
 
-- method "ours", one row for each profile: the file, the compression with the writing, the error as the mesh is seen
-  from around, and the time to read a million random points of its surface. In a full run also the first profile at the
-  bits of the first cascade, and at CRs of 92.5% and 95%.
+- method "ours", one row for each profile: the size of the file, the time to compress and write it, the error in views
+  from all around the mesh, and the time to read a million random points of its surface. A full run also measures the
+  first profile at the size of the first cascade, and at compression ratios (CR) of 92.5% and 95%.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
-- the rivals of `benchmarks.rivals.atlas` at the bits of the first profile; in a full run also at the bits of the
-  others. Bits are those of eq. 9 of lightmap-uv-clustering-cascade, which leave out UVs and headers. A rival has no
-  file, so its bytes are these bits.
-- method "fit", of the first lightmap alone: the cascade tuned in views, as the paper does it, and at points of the
-  surface; the time is that of the tuning alone.
+- the rivals of `benchmarks.rivals.atlas` in as many bits as the first profile takes; in a full run also in as many as
+  each other profile takes. Bits are counted by eq. 9 of lightmap-uv-clustering-cascade, which leaves out UVs and
+  headers. A rival has no file, so its size in bytes is that number of bits.
+- method "fit", of the first lightmap alone: the cascade tuned in rendered views, as the paper does it, and tuned at
+  points of the surface; the time is that of the tuning alone.
 
-Where there are several lightmaps the last rows are the means over them, with the least and the most of some figures;
-their largest error is the largest of all.
+If there are several lightmaps, the last rows are means over all of them, with the minimum and maximum of some figures;
+the largest error of such a row is the maximum over the lightmaps.
 
-A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
-graph, so that gaps between launches do not count. The peaks of PSNR are those of `wlm.atlas.evaluation`.
+The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
+replay of a CUDA graph, so that gaps between launches do not count. `wlm.atlas.evaluation` states the peaks of PSNR.
 """
 
 import math
@@ -85,7 +85,7 @@ class Lightmap:
     """A lightmap of a mesh.
 
     Attributes:
-        scene: The scene of its rows.
+        scene: Name of the scene, as the results table prints it.
         lit: The mesh and the lightmap.
     """
 
@@ -109,14 +109,14 @@ def run(
         quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
             two CPU cores with the demo's mesh. The cascade's fit is not finished, so its error is large.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
-        profiles: Profiles; none: `PROFILES`.
+        profiles: Names or YAML files of profiles; None: `PROFILES`.
         rivals: Whether to measure block codecs, which take minutes on the CPU. Downsampling is always measured.
-        rivals_at: Measure only the rivals, on the CPU, at the bits of our tiles in this result file.
+        rivals_at: Measure only the rivals, on the CPU, in as many bits as our models took in this result file.
         progress: Called with a line before each part of the work.
         paths: The arguments of `read_lightmaps`.
 
     Returns:
-        The rows, lightmap by lightmap in the order of the module's list, and their means.
+        The rows of each lightmap, in the order in which the module's docstring lists them, then their means.
 
     Raises:
         WlmError: A file, a profile or the device does not exist, options contradict each other, the result file has no
@@ -149,17 +149,17 @@ def read_lightmaps(
     lightmap_paths: Sequence[str | os.PathLike[str]] | None = None,
     mask_path: str | os.PathLike[str] | None = None,
 ) -> list[Lightmap]:
-    """Reads the lightmaps of a run.
+    """Reads the lightmaps to measure, with their meshes.
 
     Args:
-        meshes_path: A folder of a mesh, or of such folders: each has one `.glb`, its lightmaps, `.exr`, and maybe
-            their `mask.png`.
-        mesh_path: Instead, one mesh.
-        lightmap_paths: Its lightmaps.
-        mask_path: Their mask; None derives it.
+        meshes_path: The folder of one mesh, or a folder of such folders. The folder of a mesh has one `.glb` file,
+            its lightmaps as `.exr` files, and optionally their mask, `mask.png`.
+        mesh_path: One mesh file, instead of `meshes_path`.
+        lightmap_paths: The lightmaps of the mesh file.
+        mask_path: The mask of these lightmaps; None derives it from the mesh.
 
     Returns:
-        The lightmaps. Without any path those of the checkout's `demos/data/atlas`.
+        The lightmaps; if no path is given, the lightmaps in `demos/data/atlas` of the checkout.
 
     Raises:
         WlmError: A file is missing or damaged, a folder has no mesh with a lightmap, or paths were given that don't go
@@ -173,7 +173,7 @@ def read_lightmaps(
         raise WlmError("--lightmap and --mask need --mesh FILE")
     folder = demo_data("atlas", "--meshes DIR") if meshes_path is None else Path(meshes_path)
     if not folder.is_dir():
-        raise WlmError(f"{folder}: no such folder; expected one of meshes with their lightmaps")
+        raise WlmError(f"{folder}: no such folder; expected a folder of meshes with their lightmaps")
     lightmaps = []
     for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
         meshes, images = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
@@ -197,15 +197,15 @@ def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[st
 def rival_rows(
     results: str | os.PathLike[str], lightmaps: Sequence[Lightmap], *, progress: Note | None = None
 ) -> list[Row]:
-    """Measures the rivals alone, at the bits that our tiles took in a former run.
+    """Measures the rivals alone, in as many bits as our models took in a former run.
 
     Args:
-        results: What that run wrote.
-        lightmaps: At least one; those of that run.
+        results: The result file of the former run.
+        lightmaps: The lightmaps of the former run, at least one.
         progress: As for `run`.
 
     Returns:
-        The rows of the rivals, of the CPU, and their means.
+        The rows of the rivals, measured on the CPU, and their means.
 
     Raises:
         WlmError: `results` can't be read, or has no row of a lightmap.
@@ -238,16 +238,16 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles; the rest as for `run`.
+    """Measures the given profiles. Arguments that are not listed here are as for `run`.
 
     Args:
-        lightmaps: At least one.
-        profiles: At least one; the rivals have the bits of the first.
-        views, resolution: Cameras of the scores, and their pixels along a side.
-        whole: With the first profile at the bits of a cascade and at the CRs of `_SMALLER`, and rivals at the bits of
-            all profiles.
-        methods: The rivals.
-        points: Read by a timed decode.
+        lightmaps: At least one lightmap.
+        profiles: At least one profile; the rivals get as many bits as the first one takes.
+        views, resolution: Number of cameras for the error, and pixels along a side of their pictures.
+        whole: Whether to measure the first profile also at the size of a cascade and at the compression ratios of
+            `_SMALLER`, and the rivals at the sizes of all profiles.
+        methods: Names of the rivals.
+        points: Number of surface points that a timed decode reads.
         repeats: As for `Bench`.
     """
     if not lightmaps or not profiles:
@@ -280,19 +280,19 @@ def _smaller_name(profile: Profile, cr: float) -> str:
 
 
 def _share(row: Row) -> float:
-    """Returns the bits of eq. 9 over the bits of the lightmap."""
+    """Returns the compressed size as a fraction of the lightmap's bits, both as eq. 9 counts them."""
     return row["bpp"] / SOURCE_BITS
 
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """A row of a lightmap that is being measured.
+    """A row of the results table while it is being measured.
 
     Attributes:
-        row: The row, still without score, and before the timing without a decode time.
-        sample: The decoder to score; None: none.
-        decode: The decoder to time; None: none.
-        model: Our model; None for rivals.
+        row: The row so far: its errors are added later, and its decode time after the timing.
+        sample: Decoder whose errors are measured; None if no error is measured.
+        decode: Decoder whose time is measured; None if no time is measured.
+        model: The compressed model if the method is ours; None for rivals.
     """
 
     row: Row
@@ -302,7 +302,7 @@ class _Entry:
 
 
 class _AtlasBench(Bench):
-    """A lightmap, and points of its surface."""
+    """The benchmark of one lightmap, with random points of its mesh's surface at which decoders are timed."""
 
     def __init__(
         self, lightmap: Lightmap, device: str, progress: Note | None, points: int, repeats: int | None = None
@@ -312,7 +312,7 @@ class _AtlasBench(Bench):
         self.triangle, self.weight = _surface_points(self.lit.sheets[0], points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
-        """Measures our profiles, and the first of them at smaller sizes and at the bits of the first cascade."""
+        """Compresses by each profile; if `whole`, by the first also at smaller sizes and at the size of a cascade."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
         if not whole or profiles[0].method != "tiles":
             return entries
@@ -328,7 +328,7 @@ class _AtlasBench(Bench):
         return entries
 
     def entry(self, profile: Profile, option: str) -> _Entry:
-        """Compresses and writes, and reads the file back."""
+        """Compresses by a profile, writes the file and reads it back. Returns an entry with sizes and times."""
         self.note(f"{option}: compressing")
         fit = self.fit(option, lambda: compress(self.lit, profile, device=self.device))
         model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
@@ -353,7 +353,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Measures the first cascade tuned in views and in UV space."""
+        """Tunes the first cascade in rendered views and in UV space. Returns an entry for each of the two."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []
@@ -376,7 +376,7 @@ class _AtlasBench(Bench):
         return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
-        """Measures the lightmap itself, as if it were a model."""
+        """Makes the entry of the uncompressed lightmap, read at the same points as a model."""
         model = replace(
             model,
             method="plain",
@@ -392,20 +392,20 @@ class _AtlasBench(Bench):
         return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), decode=decode)
 
     def timed(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Times the decoders of those that have one, in turns."""
+        """Times the decoders of all entries that have one, in turns. Returns the entries with their times."""
         peers = [entry for entry in entries if entry.decode is not None]
         rows = self.time_rows([(entry.row, entry.decode) for entry in peers])
         timed = {id(entry): row for entry, row in zip(peers, rows, strict=True)}
         return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
 
     def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
-        """Measures the rivals at the bits of our profiles, and those that have their own size.
+        """Compresses by the rivals in as many bits as each of our profiles takes; some rivals have one fixed size.
 
-        A rival that holds the whole lightmap in fewer bits isn't measured twice.
+        A rival that needs fewer bits for the whole lightmap at full resolution is not measured twice.
 
         Args:
-            shares: By profile, its bits over the lightmap's.
-            methods: The rivals.
+            shares: Compressed size of each profile as a fraction of the lightmap's bits, by the profile's name.
+            methods: Names of the rivals.
         """
         entries, measured, enough = [], [], {}
         for profile, share in shares.items():
@@ -445,8 +445,8 @@ class _AtlasBench(Bench):
         return _Entry(row, rival.decoded)
 
     def scored(self, entries: Sequence[_Entry], views: int, resolution: int) -> list[Row]:
-        """Scores all in one go: each view is drawn once."""
-        self.note(f"scoring, {views} views of {resolution}²")
+        """Computes the errors of all entries together, so that each view is drawn once. Returns the finished rows."""
+        self.note(f"measuring errors in {views} views of {resolution} x {resolution} pixels")
         decoders = {str(i): entry.sample for i, entry in enumerate(entries) if entry.sample is not None}
         reports = compare(self.lit, decoders, views=views, resolution=resolution, device=self.device)
         rows = [entry.row for entry in entries]
@@ -455,7 +455,7 @@ class _AtlasBench(Bench):
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
-        """Makes the decode to time, and computes its errors against float64."""
+        """Returns a call that decodes the surface points, and its errors against a float64 decode."""
         decoder = Decoder(model, self.device)
         sheet = self.lit.sheets[0]
         corner = model.uv if len(model.uv) else sheet.uv[sheet.triangle]
@@ -469,12 +469,12 @@ class _AtlasBench(Bench):
 
 
 def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
-    """Makes a row for each method and option that was measured on more than one lightmap.
+    """Averages the rows of each method and option that was measured on more than one lightmap.
 
     Args:
-        rows: Those of each lightmap.
-        lightmaps: How many there are.
-        of: What their scene says besides.
+        rows: The rows of all lightmaps.
+        lightmaps: The number of lightmaps.
+        of: Text that is added to the scene name of the averaged rows.
     """
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
@@ -497,7 +497,7 @@ def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
 
 
 def warm_up(profile: Profile, device: str) -> None:
-    """Compiles what a compression by a profile and a decode need on a device, with a square of 32 texels a side."""
+    """Compiles all kernels of compression and decoding by compressing and decoding a square of 32 x 32 texels."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
@@ -509,7 +509,7 @@ def warm_up(profile: Profile, device: str) -> None:
 
 
 def _surface_points(sheet: Sheet, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws random points of the active triangles, uniform over the surface: triangles [N] and weights [N, 3]."""
+    """Draws N points uniformly over the lit surface. Returns triangle indices [N] and barycentric weights [N, 3]."""
     corner = sheet.position[sheet.triangle]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) * sheet.active
     ends = np.cumsum(area)

@@ -1,18 +1,19 @@
-"""Ablation of the paper's cascade and sweeps of its sizes (lightmap-uv-clustering-cascade, section 4.5 and table 2).
+"""Ablation of the paper's cascade, and its texture sizes (lightmap-uv-clustering-cascade, section 4.5 and table 2).
 
-One profile is fitted again and again, each time with one thing changed, without a plain lightmap in its place where
-that is better. The rows of method "ablation":
+One profile is fitted several times, each time with one setting changed. A fit is never replaced by a plain smaller
+lightmap, even if that has less error. The rows of method "ablation":
 
-- "whole": the profile.
+- "whole": the profile without a change.
 - "no repacking": the mesh keeps its UVs, and the cascade begins as the lightmap itself (table 3).
-- "no cascade": the repacked lightmap as it is, without a table and without tuning (table 3).
-- "not tuned": the cascade as tuning begins, whose seams are those before tuning.
-- "ASTC": T_p in blocks of 4 x 4 texels (table 2).
+- "no cascade": the repacked lightmap as it is, without a lookup table and without tuning (table 3).
+- "not tuned": the cascade before it is tuned.
+- "ASTC": the texture T_p in blocks of 4 x 4 texels (table 2).
 
-Those of method "sweep" (figure 7) have another epsilon, "scale", epsilon_p, "colour_scale", or epsilon_c, "lut_scale".
+Rows of method "sweep" (figure 7) change one size factor: epsilon ("scale"), epsilon_p ("colour_scale") or epsilon_c
+("lut_scale").
 
-Triangles are grouped once a lightmap, which takes no part in the times. Seams are the borders of the charts under the
-row's own UVs. Bits are as everywhere those of a GPU, 64 a texel of half floats, where the paper has 48.
+Triangles are grouped once per lightmap, and the time of this is not counted. The error at seams is measured at chart
+borders, in the UVs of the variant. A texel of half floats counts as 64 bits, as on a GPU; the paper counts 48.
 """
 
 import time
@@ -77,19 +78,20 @@ def run(
 
     Args:
         profile: A profile of method "cascade": its name or a YAML file.
-        only: Names of rows; none: all.
+        only: Names of the variants to measure; None: all.
         quick: Short fits in small views, which show on a CPU that everything works: the fits are not finished.
         device: "cpu" or "cuda:0".
-        steps: Steps of each fit; None: the profile's.
+        steps: Steps of each fit; None: as the profile states.
         progress: Called with a line before each part of the work.
         done: Called after each lightmap with all rows so far.
         paths: The arguments of `benchmarks.atlas.read_lightmaps`.
 
     Returns:
-        The rows, lightmap by lightmap, and where there are several their means.
+        The rows of each lightmap, and their means if there are several lightmaps.
 
     Raises:
-        WlmError: A file, the profile or the device does not exist, the profile is of tiles, or no row has a name.
+        WlmError: A file, the profile or the device does not exist, the profile is not a cascade, or a name in `only`
+            is unknown.
     """
     settings = Profile.load(profile).override(_QUICK if quick else {})
     if steps is not None:
@@ -112,7 +114,7 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Fits the variants of a profile and scores them in a number of square views; the rest as for `run`."""
+    """Fits the variants of a profile; errors are measured in `views` square pictures. Other arguments: see `run`."""
     chosen = choose(profile, only)
     of = f", ablation of {profile.name}"
     first = Bench("atlas", device, progress)
@@ -128,10 +130,10 @@ def run_rows(
 
 
 def variants(base: Profile) -> list[tuple[str, str, Profile]]:
-    """Returns methods, options and settings of all rows; a sweep leaves out the value of the profile.
+    """Returns method, option and profile settings of all variants; a sweep leaves out the profile's own value.
 
     Args:
-        base: What each is with one change.
+        base: The profile of which each variant changes one setting.
     """
     rows = [("ablation", name, base.override(changes)) for name, changes in ABLATION.items()]
     for setting, values in SWEEPS.items():
@@ -142,17 +144,17 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
 
 
 def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
-    """Returns the requested `variants`.
+    """Returns the requested variants of a profile, as `variants` does for all.
 
     Args:
-        base: What each is with one change.
-        only: Names of rows; none: all.
+        base: The profile of which each variant changes one setting.
+        only: Names of the variants; empty: all.
 
     Raises:
-        WlmError: The profile is of tiles, or no row has such a name.
+        WlmError: The profile is not a cascade, or no variant has such a name.
     """
     if base.method != "cascade":
-        raise WlmError(f"--profile: expected one of method cascade, found {base.name}, of {base.method}")
+        raise WlmError(f"--profile: expected one of method cascade, found {base.name}, which has method {base.method}")
     rows = variants(base)
     check_only(only, [option for _, option, _ in rows])
     return [row for row in rows if not only or row[1] in only]
@@ -182,7 +184,7 @@ def _rows(
             continue
         rows.append(_row(bench, method, option, variant, model, stages, time.perf_counter() - start))
         models[str(i)] = model
-    bench.note(f"scoring, {views} views of {resolution}²")
+    bench.note(f"measuring errors in {views} views of {resolution} x {resolution} pixels")
     decoders = {i: Decoder(model, device) for i, model in models.items()}
     labels = {i: chart_labels(model, scene, device) for i, model in models.items()}
     scores = compare(scene, decoders, labels=labels, views=views, resolution=resolution, device=device)

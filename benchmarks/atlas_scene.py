@@ -1,16 +1,16 @@
-"""A scene of many objects and states against its parts, each object and state alone, in as many bits.
+"""One model of a scene with many objects and lighting states, against one model for each object in each state.
 
 The scene is a lightmap set with its mesh, cut into objects that have their own lightmaps. An object is a connected set
 of triangles: triangles are connected where their corners share a position. Pieces with few texels, such as knobs and
 screws, are added to the nearest object that has more. The charts of an object are cut out of the lightmaps, downsampled
 each without its neighbours, and laid out again at whole texels, so that a chart that keeps its size is not resampled.
 
-Rows of method "scene", one for each profile: the file, the compression with its stages, and the error in views of the
-whole scene. After each a row of method "parts", `benchmarks.rivals.scene_parts` in the same bits or few more, by
-`standard` of one lightmap with the same textures.
+The results table has a row of method "scene" for each profile: file size, times of compression and of its stages, and
+error in views of the whole scene. A row of method "parts" follows it: every object in every state is compressed alone
+by the profile `standard` (`benchmarks.rivals.scene_parts`), in the same total number of bits or a few more.
 
-"gain" is the difference of the mean PSNR over views and states between the scene and the parts; "least gain" is that
-of the state with the smallest difference.
+"gain" is the mean PSNR of the scene over views and states, minus that of the parts; "least gain" is this difference in
+the state where it is smallest.
 """
 
 import math
@@ -65,19 +65,19 @@ def run(
     device: str = "cpu",
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures a scene against its parts.
+    """Measures a model of a whole scene against models of each object in each lighting state.
 
     Args:
-        scene_path, hours, side: As for `read_scene`.
-        profiles: Profiles; none: `PROFILES`.
-        budget: The budget in place of the profiles'.
-        parts: Whether to measure the parts, which take most of the time.
+        scene_path, hours, side: As `path`, `hours` and `side` of `read_scene`.
+        profiles: Names or YAML files of profiles; None: `PROFILES`.
+        budget: The share of the uncompressed bits that replaces the budget of the profiles; None: their own.
+        parts: Whether to measure the models of single objects too, which take most of the time.
         quick: Few small views, for a CPU.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, profile by profile.
+        The rows of each profile, in the order of the profiles.
 
     Raises:
         WlmError: A file, a profile or the device does not exist, or the budget is less than the smallest model takes.
@@ -99,7 +99,7 @@ def run_rows(
     progress: Note | None = None,
 ) -> list[Row]:
     """Measures a scene against its parts in a number of cameras around the scene and as many from inside, whose
-    pictures have `resolution` pixels along a side; the rest as for `run`."""
+    pictures have `resolution` pixels along a side. Other arguments are as for `run`."""
     profiles = [Profile.load(name) for name in names]
     if budget is not None:
         profiles = [profile.override({"budget": budget}) for profile in profiles]
@@ -112,7 +112,7 @@ def run_rows(
 
 
 class _SceneBench(Bench):
-    """A scene, and the views in which it is scored."""
+    """The benchmark of one scene, with the views in which errors are measured."""
 
     def __init__(
         self, title: str, scene: LightmappedScene, device: str, views: tuple[int, int], progress: Note | None
@@ -122,7 +122,7 @@ class _SceneBench(Bench):
         self._varies = variation(scene, peaks_of(scene), device)
 
     def rows(self, profile: Profile, parts: bool) -> list[Row]:
-        """Measures the scene and its parts."""
+        """Returns the row of the scene and, if `parts`, the row of its objects compressed one by one."""
         scene, device = self._scene, self.device
         self.note(f"{profile.name}: compiling")
         compress(_small(len(scene.states)), profile.override({"budget": 1.0, "views": 1}), device=device)
@@ -170,12 +170,12 @@ class _SceneBench(Bench):
         return rows
 
     def _bpp(self, bits: float) -> float:
-        """Returns the bits per texel and state."""
+        """Returns the bits per texel and lighting state, for a total number of bits."""
         return bits / self._scene.texels
 
 
 def _small(states: int) -> LightmappedScene:
-    """Makes a square with a number of states, to compile with."""
+    """Makes a square with this number of lighting states; compressing it compiles all kernels before the timing."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
@@ -189,14 +189,14 @@ def read_scene(
     """Reads a lightmap set and cuts it into objects.
 
     Args:
-        path: The set, as `wlm.lightmap.load` takes it, that names its mesh.
-        hours: Of its times those that become states; none: all.
-        side: Texels that the set's longer side is made smaller to, which has a multiple of as many; None: as it is.
-        trust: As of `wlm.lightmap.load`.
+        path: The set, in a form that `wlm.lightmap.load` reads; it must name its mesh.
+        hours: Times of the set that become lighting states; empty: all.
+        side: Texels of the longer side after downsampling, a divisor of the set's longer side; None: not downsampled.
+        trust: As for `wlm.lightmap.load`.
 
     Returns:
-        A scene of a sheet for each object, the largest first, which is called by the set's name and its side; a state
-        is called by its hour.
+        A scene with one lightmap sheet for each object, the largest first. Its name is made of the set's name and
+        side; each state is named after its hour.
 
     Raises:
         WlmError: The set or its mesh can't be read, or has no such hour or side.
@@ -228,14 +228,14 @@ def read_scene(
 def cut(
     lightmaps: SheetFrames, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, factor: int = 1
 ) -> LightmappedScene:
-    """Cuts lightmaps into those of the objects of their mesh.
+    """Cuts lightmaps of a mesh into one lightmap sheet for each connected object. Returns the scene of these sheets.
 
     Args:
-        lightmaps: Their times become states.
-        position: float64 [V, 3], in metres.
-        triangle: int [F, 3].
-        uv: float64 [V, 2], in [0, 1].
-        factor: Texels along a side that become one.
+        lightmaps: Lightmaps of the whole mesh; each time becomes a lighting state.
+        position: Positions of the V vertices in metres, float64 [V, 3].
+        triangle: Vertex indices of the F triangles, int [F, 3].
+        uv: Lightmap UVs of the vertices, float64 [V, 2] in [0, 1].
+        factor: Downsampling factor: each square of factor x factor texels becomes one texel.
     """
     height, width = lightmaps.mask.shape
     chart = charts(welded(position, uv, triangle))
@@ -261,7 +261,7 @@ def cut(
 def _piece(
     frames: np.ndarray, inside: np.ndarray, corner: np.ndarray, number: int, factor: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Returns a chart's light [M, h, w, 3] at the lower resolution, its mask [h, w], and its first texel, x and y."""
+    """Downsamples a chart in M states. Returns light [M, h, w, 3], mask [h, w], and x and y of its first texel."""
     height, width = inside.shape
     low = np.floor(corner.min(0)).clip(0, (width - 1, height - 1)).astype(int) // factor * factor
     high = np.maximum(np.ceil(corner.max(0)).astype(int), low + 1)
@@ -279,7 +279,7 @@ def _piece(
 
 
 def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Returns the object of each chart; objects with more texels have lower numbers."""
+    """Returns the object number of each chart, int [charts]; objects with more texels have lower numbers."""
     size = max(float(np.ptp(position, axis=0).max()), 1e-30)
     grid = np.round(position / (_SAME_PLACE * size)).astype(np.int64)
     corner = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)[triangle]
@@ -303,7 +303,7 @@ def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, coun
 
 
 def _object(position, triangle, texel, chart, own, pieces, factor, name):
-    """Makes the scene of one object, with its charts laid out anew."""
+    """Returns the scene of one object, whose charts are packed into a new lightmap."""
     sizes = np.array([pieces[number][1].shape[::-1] for number in own]) + _GAP
     first, tall = place(sizes, max(int(sizes[:, 0].max()), math.ceil(math.sqrt(sizes.prod(1).sum()))))
     wide = int((first[:, 0] + sizes[:, 0]).max())

@@ -13,14 +13,14 @@ _SPREAD = "_spread"
 
 @dataclass(frozen=True)
 class Change:
-    """One figure that two rows of the same method, option and scene both have.
+    """The change of one measured figure between an old and a new row of the same method, option and scene.
 
     Attributes:
         row: The new row.
         name: Name of the figure in `benchmarks.figures`.
-        old, new: Its values.
-        worse: Whether the figure lost more than 0.05 dB,
-            or takes over 5% longer and longer than the spread of the samples.
+        old, new: Values of the figure before and after.
+        worse: Whether a figure in dB fell by more than 0.05 dB, or a time grew by more than 5% and by more than the
+            samples of the timing scatter.
     """
 
     row: Row
@@ -38,7 +38,7 @@ def compare(new: Run, runs: Sequence[Run]) -> list[Change]:
         runs: The runs of the older file.
 
     Returns:
-        All figures in decibels and all times that two rows both have, in the order of the new rows.
+        The changes of all figures in decibels and all times that both files have, in the order of the new rows.
     """
     older = {_key(row): (row, run.environment.get("device_name")) for run in runs for row in run.rows}
     changes = []

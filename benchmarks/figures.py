@@ -1,6 +1,6 @@
-"""The figures of all benchmarks: the heading, unit and number format of each, by its name in a `Row`.
+"""Heading, unit and number format of every figure that the benchmarks measure, by the figure's name in a `Row`.
 
-`TABLES` is in the order of columns, and groups the figures for where one table would be too wide.
+`TABLES` states the order of columns. Its groups become separate tables where one table would be too wide.
 """
 
 from dataclasses import dataclass, replace
@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Figure:
-    """The presentation of one figure.
+    """How tables and plots show one measured quantity.
 
     Attributes:
         title: The quantity, in a word or two.
-        unit: Its unit; `"%"` for a ratio, which rows store as a number around 1. Empty for a pure number.
-        form: Format specification; empty: three digits, or no decimals from 100 on.
+        unit: The unit of the quantity, `""` if it has none. `"%"`: a ratio, stored as 1.0 and shown as 100%.
+        form: Python format specification; empty: three significant digits, or no decimals from 100 on.
     """
 
     title: str
@@ -22,16 +22,16 @@ class Figure:
 
     @property
     def heading(self) -> str:
-        """The heading of a column."""
+        """The heading of the figure's table column, such as "size, bytes"."""
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
     @property
     def label(self) -> str:
-        """The label of an axis."""
+        """The label of the figure's plot axis, such as "size (bytes)"."""
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
     def text(self, value: float, form: str = "") -> str:
-        """Returns the number without its unit, in the format of the figure or in another."""
+        """Returns a value as text without its unit, by the format specification `form` or by the figure's own."""
         if self.unit == "%":
             value *= 100.0
         form = form or self.form or (",.0f" if abs(value) >= 100.0 else ".3g")

@@ -1,26 +1,26 @@
-"""The lightmap system against itself and against block codecs: size, speed and error in one run.
+"""Size, speed and error of compressed lightmaps: each profile, each way to decode, and rival codecs, in one run.
 
-Five kinds of rows:
+The results table has these kinds of rows:
 
-- method "ours", one row for each profile: the file, the fit, the errors of the float decode against the input, the
-  decode time of the whole map to 8 bits on the fast path, and the time to unpack one tile of the file. The largest
-  error is in radiance, against the float64 path.
-- methods "exact" (one texel per thread) and "strip" (the fast path), one row for each form of the GELU, and on CUDA
-  "matrix" (the fast path on matrix units), of profile M:
-  the 8-bit output against the input, and its largest error against the float64 path as a share of 255. Half a level of
-  8 bits, 0.00196, is the rounding itself.
+- method "ours", one row for each profile: file size, time of the fit, errors of the float decode against the input,
+  time to decode the whole map to 8 bits by the fast kernel, and time to unpack one tile of the file. The largest error
+  is in units of radiance, against a float64 decode.
+- methods "exact" (kernel of one texel per thread) and "strip" (the fast kernel), one row for each form of the GELU, and
+  on CUDA "matrix" (the fast kernel on matrix units), all of profile M: the error of the 8-bit output against the input,
+  and its largest error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits alone errs by
+  0.00196, half a level.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
   (`wlm.lightmap.runtime_texture`), its errors and how long it takes from the stored bytes.
 - the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
-  and a video codec; between stored times their light is mixed.
+  and a video codec; between stored times their lightmaps are interpolated linearly.
 - method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
 
-Profiles and rivals have the scores of `wlm.lightmap.view_scores` too: those between stored times where both are scored,
-those of views in a full run.
+Profiles and rivals also have the errors of `wlm.lightmap.view_scores`: at times half-way between two scored times, and
+in a full run also in rendered views.
 
-A decode on CUDA is timed as the replay of a graph, so that gaps between launches do not count; rivals decode on the CPU
-alone, blocks in a texture unit on a GPU, so that they have a decode time on the CPU alone. `bytes` and `bpp` are in
-memory, `disk_bytes` and `disk_bpp` after lossless compression; methods without random access only have the latter.
+A decode on CUDA is timed as the replay of a CUDA graph, so that gaps between launches do not count. Rivals are decoded
+and timed on the CPU alone. `bytes` and `bpp` are sizes in memory, `disk_bytes` and `disk_bpp` sizes after lossless
+compression; methods without random access only have sizes on disk.
 """
 
 import functools
@@ -102,14 +102,14 @@ def run(
             set has them): five minutes on two CPU cores for 16 tiles. The fits are not finished, so errors are large.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
-        profiles: Profiles, by name or file; None: `QUICK_PROFILES` or `PROFILES`.
+        profiles: Names or YAML files of profiles; None: `QUICK_PROFILES` if `quick`, else `PROFILES`.
         rivals: Whether to measure the rivals too.
         rivals_only: Measure only the rivals. They need no GPU, except those that are fitted.
         rival_names: Measure only these keys of `benchmarks.rivals.lightmap.RIVALS`.
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, in the order of the module's list.
+        The rows, in the order in which the module's docstring lists them.
 
     Raises:
         WlmError: The set, the device or a rival does not exist, options contradict each other, or a fit diverged.
@@ -142,12 +142,12 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on a given set; the rest as for `run`.
+    """Measures the given profiles on a given set. Arguments that are not listed here are as for `run`.
 
     Args:
         lightmaps: The set.
-        profiles: At least one. The rows of decode options are of the one named "M", else of the first.
-        chosen: Indices of the times that are scored, int [K], at least one.
+        profiles: At least one profile. The ways to decode are measured with the profile "M", or else the first.
+        chosen: Indices of the times at which errors are measured, int [K], at least one.
         rivals: Keys of `benchmarks.rivals.lightmap.RIVALS`.
         repeats: As for `Bench`.
     """
@@ -170,7 +170,7 @@ def run_rows(
 
 
 def _quick_times(times: np.ndarray) -> np.ndarray:
-    """Returns the indices of the three hours, or of three times spread evenly."""
+    """Returns the indices of 9, 12 and 21 h if the set has these times, else of three evenly spaced times."""
     if np.isin(_QUICK_HOURS, times).all():
         return np.searchsorted(times, _QUICK_HOURS)
     return np.unique(np.linspace(0, len(times) - 1, 3).round().astype(int))
@@ -181,14 +181,14 @@ def _hours(times: Sequence[float]) -> str:
 
 
 def _repeated(model: SheetModel, count: int) -> SheetModel:
-    """Returns a model with the tiles of this one several times over."""
+    """Returns a larger model that holds `count` copies of each tile."""
     arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     width, height = TILE * len(model.kind), TILE * count
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
 
 
 def _load_ms(model: SheetModel) -> float | None:
-    """Returns the median time to unpack one tile of the file on the CPU, milliseconds; None without a packed tile."""
+    """Returns the median time in ms to unpack one tile of the file on the CPU; None if no tile has packed data."""
     numbers = np.flatnonzero(tile_sizes(model)).tolist()
     if not numbers:
         return None
@@ -212,7 +212,7 @@ def _fast(model: SheetModel, device: str, gelu: str | None) -> StripDecoder | Ma
 
 
 class _LightmapBench(Bench):
-    """A set, and the times of it that are scored."""
+    """The benchmark of one lightmap set, with the times at which errors are measured."""
 
     def __init__(
         self, lightmaps: LightmapSet, chosen: np.ndarray, device: str, progress: Note | None, repeats: int | None
@@ -229,7 +229,7 @@ class _LightmapBench(Bench):
         self.scored_at = "" if whole else f"scored at {_hours(self.times)}; "
 
     def fit_profile(self, profile: Profile) -> Fit:
-        """Fits and writes a profile; compiling its kernels is no part of either time."""
+        """Compresses the set by a profile, writes and reloads the file. Compiling of kernels is not timed."""
         if profile.frames == "always":  # no kernel is compiled
             self.note(f"{profile.name}: encoding {self.grid.count} tiles")
             return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
@@ -238,7 +238,7 @@ class _LightmapBench(Bench):
         return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of a profile, and its decode, which is timed later."""
+        """Returns the row of a compressed model, and a call that decodes it to 8 bits, which is timed later."""
         self.note(f"{fit.option}: scoring")
         model = fit.model.light
         decoder = SheetDecoder(model, self.device)
@@ -266,7 +266,7 @@ class _LightmapBench(Bench):
         return row, self._decode(self._decoders(model, "fast", None))
 
     def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of the texture that a renderer samples, with mips, and its decode."""
+        """Returns the row of the RGB9E5 texture with mips that a renderer samples, and a call that decodes it."""
         self.note(f"{fit.option}: texture")
         decoder = MapDecoder(fit.model.light, self.device)
 
@@ -285,7 +285,7 @@ class _LightmapBench(Bench):
         return row, self.replay(decoder.decode)
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of one way to decode a profile to 8 bits, and the decode."""
+        """Returns the row of one kernel and one form of the GELU, and a call that decodes the model to 8 bits so."""
         self.note(f"{fit.option}: {path} decode with {gelu} GELU")
         model = fit.model.light
         decoders = self._decoders(model, path, gelu)
@@ -335,7 +335,7 @@ class _LightmapBench(Bench):
         return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
 
     def fit_row(self, fit: Fit) -> Row:
-        """Returns the row of the speed of a fit."""
+        """Returns the row of the fit's speed alone."""
         profile = fit.model.profile
         return self.row(
             "fit",
@@ -349,7 +349,7 @@ class _LightmapBench(Bench):
         )
 
     def plain_rows(self, fit: Fit) -> list[Row]:
-        """Returns the row of some steps of the same fit in plain torch; no row if no tile is dynamic."""
+        """Times some steps of the same fit in plain torch. Returns one row, or none if no tile is dynamic."""
         # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
         plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
         profile = fit.model.profile.model_copy(update=plain)
@@ -383,7 +383,7 @@ class _LightmapBench(Bench):
         return image
 
     def _tiles(self, model: SheetModel) -> dict[str, int]:
-        """Counts tiles by kind; those without valid texels are left out."""
+        """Returns the number of tiles of each kind; tiles without valid texels are not counted."""
         kinds = count_kinds(model).items()
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
@@ -395,13 +395,13 @@ class _LightmapBench(Bench):
         decode: Callable[[float], np.ndarray] | None = None,
         views: int = VIEWS,
     ) -> dict[str, float]:
-        """Computes the figures of lightmaps at the chosen times, with a decoder also those of `view_scores`."""
+        """Returns the errors of lightmaps at the chosen times, and if `decode` is given also those of `view_scores`."""
         tally = None if decode is None else self._tally(name, decode, views)
         pairs = zip(self.chosen.tolist(), frames, strict=True)
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
 
     def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
-        """Makes the collector of the scores of `wlm.lightmap.view_scores`."""
+        """Makes the object that collects the errors of `wlm.lightmap.view_scores`."""
         whole = len(self.chosen) == len(self.lightmaps.times)
         seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
         for warning in warnings:
@@ -418,7 +418,7 @@ class _LightmapBench(Bench):
         return scores
 
     def _figures(self, frames: Sequence[FrameMetrics], tally: Tally | None) -> dict[str, float]:
-        """Returns PSNR, SSIM and FLIP, the number of times, and the figures of `view_scores`."""
+        """Returns PSNR, SSIM and FLIP, the number of scored times, and the errors of `view_scores`."""
         summary = summarise(frames)
         figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
         if tally is None:
@@ -429,7 +429,7 @@ class _LightmapBench(Bench):
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
     def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
-        """Makes decoders of the tiles with maps; a constant tile needs no launch."""
+        """Makes the decoders of all tiles that have feature maps or frames; constant tiles need none."""
         decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
@@ -453,7 +453,7 @@ class _LightmapBench(Bench):
     def _tiles_8bit(
         self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float, compare: bool
     ) -> tuple[np.ndarray, float]:
-        """Returns the radiance of all tiles through 8 bits, and the largest error of a byte / 255 if `compare`."""
+        """Decodes all tiles to 8 bits. Returns their radiance and, if `compare`, the largest error (1: 255 levels)."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))
         worst = 0.0
         for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():

@@ -1,18 +1,18 @@
 """Ablation of the feature maps and of the simulation of block compression (neural-dynamic-gi, section 11).
 
 One profile is fitted again and again in plain torch (`benchmarks.rivals.lightmap_torch`), from the same seed and for as
-many steps, each time with other feature maps, at about the same bytes. All are scored as decoded from the levels that a
-file would hold, the network fitted to these at the end (section 4). The rows:
+many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation, with
+the network fitted to the quantised maps at the end (section 4). The rows:
 
-- "hybrid": F_uv, F_uvt, F_ut and F_vt, the paper's and the profile's.
-- "2D alone", "3D alone": two maps F_uv; an F_uvt of 48 x 48 x 15 (table 6, figure 9).
+- "hybrid": the maps F_uv, F_uvt, F_ut and F_vt, as in the paper and in the profile.
+- "2D alone": two maps F_uv and no other map. "3D alone": one F_uvt of 48 x 48 x 15 texels (table 6, figure 9).
 - "tri-plane": F_uv, and F_ut and F_vt of six channels in place of F_uvt.
 - "8 channels of F_uv": two maps F_uv in place of F_ut and F_vt (table 8).
-- "no block simulation": the hybrid, whose texels are trained on 8-bit levels and meet a BC7 encoder at the end
-  (table 7, figure 10).
-- "kernels": the hybrid by `wlm.lightmap.compress`, to hold the plain fit to it.
+- "no block simulation": the hybrid trained as 8-bit texels, which a BC7 encoder compresses at the end (table 7,
+  figure 10).
+- "kernels": the hybrid fitted by `wlm.lightmap.compress`, as a check of the fit in plain torch.
 
-Only dynamic tiles are fitted, scored and weighed.
+Only dynamic tiles are fitted, and sizes and errors are of these tiles alone.
 """
 
 import os
@@ -69,11 +69,11 @@ def run(
     """Fits the variants of profile M to one set and compares them.
 
     Args:
-        only: Names of rows; none: all.
-        quick: Short fits, to see on a CPU that all of it works: so few steps show little.
+        only: Names of the variants to measure; None: all.
+        quick: Short fits that show on a CPU that everything works; their errors are not meaningful.
         device: "cpu" or "cuda:0".
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
-        steps: Of each fit; None: the profile's.
+        steps: Steps of each fit; None: as the profile states.
         progress: Called with a line before each part of the work.
         done: Called after each row with all rows so far.
 
@@ -101,7 +101,7 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Fits the variants of a profile, without the sizes of its maps, to a set; other arguments as for `run`."""
+    """Fits the variants to a set, with all settings of `profile` except the maps' sizes. Other arguments: see `run`."""
     check_only(only, ROWS)
     bench = _AblationBench(lightmaps, profile, device, progress)
     rows = []
@@ -115,14 +115,16 @@ def run_rows(
 
 
 class _AblationBench(Bench):
-    """A set, and the dynamic tiles of it that are fitted."""
+    """The ablation of one lightmap set, with the dynamic tiles that are fitted."""
 
     def __init__(self, lightmaps: LightmapSet, profile: Profile, device: str, progress: Note | None) -> None:
         super().__init__("lightmap", device, progress, scene=f"{lightmaps.name}, ablation")
         self._set, self._lightmaps, self._profile = lightmaps, lightmaps.light, profile
         targets = dynamic_targets(self._lightmaps, profile)
         if targets is None:
-            raise WlmError(f"{lightmaps.name}: expected a tile whose light changes in more than its strength")
+            raise WlmError(
+                f"{lightmaps.name}: expected a tile whose light changes over time by more than one common factor"
+            )
         self._targets = targets
         self._grid = TileGrid.of(*self._lightmaps.mask.shape)
         tiles = np.ones((len(targets.number), TILE, TILE, 1), bool)
@@ -134,7 +136,7 @@ class _AblationBench(Bench):
         return image
 
     def variant_row(self, name: str) -> Row:
-        """Returns the row of a variant of the feature maps."""
+        """Fits one variant of the feature maps in plain torch and returns its row."""
         axis = TimeAxis(self._lightmaps.times, self._lightmaps.period, self._profile.time_axis)
         try:
             fit = PlainFit(self._profile, axis, self._targets, VARIANTS[name], seed=_SEED, device=self.device)
@@ -150,7 +152,7 @@ class _AblationBench(Bench):
         return self._row(name, "in plain torch", fit.tile_bytes * len(tiles), frames, seconds)
 
     def kernels_row(self) -> Row:
-        """Returns the row of the profile as shipped."""
+        """Fits the unchanged profile with the fused kernels and returns its row."""
         profile, tiles = self._profile, sorted(self._targets.number.tolist())
         compress(self._set, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
         start = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Six-way lightmaps by Mitsuba's volumetric path tracer, of one bounce or more, and Open Image Denoise: extra `bake`.
+"""Six-way lightmaps by Mitsuba's volumetric path tracer, denoised by Open Image Denoise; both need the extra `bake`.
 
-An independent estimate of the same integral: with many samples it checks the march, with few it shows the quality that
-a path tracer has in the time of a frame. Mitsuba traces on the CPU here: `wlm.smoke.transport.tracing` is the path
-tracer that is measured on a GPU.
+Path tracing estimates the same integral as ray marching, independently: many samples check the ray march, few samples
+show the quality that a path tracer reaches in the time of a frame. Mitsuba traces on the CPU here; the path tracer
+that is measured on a GPU is `wlm.smoke.transport.tracing`.
 """
 
 import functools
@@ -50,7 +50,7 @@ class PathTracer:
     """Renders images of smoke under one of the six lights at a time.
 
     Attributes:
-        variant: Mitsuba's.
+        variant: Name of the Mitsuba variant, such as "llvm_ad_rgb".
     """
 
     def __init__(
@@ -67,14 +67,14 @@ class PathTracer:
 
         Args:
             volume: The smoke, on any device.
-            camera: Orthographic.
-            variant: As `choose_variant` gives it; None: the fastest on the CPU.
-            albedo: The share of light that a scattering leaves.
+            camera: An orthographic camera.
+            variant: Name of a Mitsuba variant; None: the fastest on the CPU.
+            albedo: Single-scattering albedo.
             g: Mean cosine of the Henyey-Greenstein phase function.
-            order: Scatterings after which a path ends.
+            order: Maximum number of scattering events of a path.
 
         Raises:
-            ValueError: The camera is in perspective.
+            ValueError: The camera is not orthographic.
             WlmError: Mitsuba isn't installed.
         """
         if camera.perspective:
@@ -91,18 +91,18 @@ class PathTracer:
         """Traces all six lightmaps.
 
         Args:
-            samples: Of each pixel of each lightmap.
-            seed: Of the paths.
+            samples: Paths for each pixel of each lightmap.
+            seed: Seed of the random paths.
 
         Returns:
-            Lightmaps float32 [6, H, W] as those of `SixWay`, and the transparency [H, W], which is noisy too.
+            Lightmaps float32 [6, H, W] in the order of `SixWay`, and the transparency [H, W], which is noisy too.
         """
         # Each is a copy on the CPU, which waits for the device.
         images = np.stack([self.trace(direction, samples, seed) for direction in VECTORS])
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
     def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
-        """Traces RGBA float32 [H, W, 4] under a light of irradiance 4 pi, with a direction [3] in the camera's axes."""
+        """Traces RGBA float32 [H, W, 4] under one light of irradiance 4 pi; `direction` [3] is in camera axes."""
         light = {
             "type": "directional",
             "direction": [float(-w) for w in self._camera.axes.T @ direction],
@@ -114,7 +114,7 @@ class PathTracer:
         return np.array(self._mitsuba.render(scene, spp=samples, seed=seed))
 
     def _load_smoke(self, volume: DensityVolume, albedo: float, g: float) -> Any:
-        """Loads the smoke in units of voxels; a border of empty voxels gives Mitsuba's clamped grid the end of ours."""
+        """Loads the smoke into Mitsuba in units of voxels, with a border of empty voxels as Mitsuba clamps its grid."""
         transform = self._mitsuba.ScalarTransform4f
         size = np.array(volume.shape, np.float64)
         grid = np.pad(volume.density.float().cpu().numpy(), 1).transpose(2, 1, 0)[..., None]
@@ -151,7 +151,7 @@ class PathTracer:
 
 
 def denoise(lightmaps: np.ndarray) -> np.ndarray:
-    """Denoises lightmaps [N, H, W], each alone.
+    """Denoises N lightmaps [N, H, W] one by one.
 
     Raises:
         WlmError: Open Image Denoise isn't installed.
@@ -166,7 +166,7 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def denoiser_device(device: str) -> str:
-    """Returns the device on which Open Image Denoise works for pictures on a device: the same, or "cpu"."""
+    """Returns the device on which Open Image Denoise runs for pictures on `device`: that device, or "cpu"."""
     import pyoidn
 
     try:

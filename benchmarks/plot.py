@@ -40,12 +40,12 @@ _FRONT_COLOUR = "#707070"
 
 @dataclass(frozen=True)
 class Panel:
-    """A panel of a plot: one figure of some methods against another.
+    """A panel of a plot, which shows one measured figure against another.
 
     Attributes:
-        x: The cost, a figure of which less is better, such as `"decode_ms"` or `"bpp"`.
-        y: `"psnr"`, or an error, of which less is better.
-        methods: Those that it shows; None for all.
+        x: Name of the figure on the x axis, a cost such as `"decode_ms"` or `"bpp"`; lower is better.
+        y: Name of the figure on the y axis: `"psnr"`, or an error, of which lower is better.
+        methods: Methods that the panel shows; None for all.
     """
 
     x: str
@@ -58,7 +58,7 @@ class Panel:
                 raise WlmError(f"plot: unknown figure {name!r}")
 
     def position(self, row: Row) -> tuple[float, float] | None:
-        """Returns the two figures of a row; None if the panel leaves out its method, or a figure is missing."""
+        """Returns a row's x and y value; None if the panel does not show its method, or a value is missing."""
         if self.methods is not None and row.method not in self.methods:
             return None
         return (row[self.x], row[self.y]) if {self.x, self.y} <= row.figures.keys() else None
@@ -84,18 +84,18 @@ def pareto_front(points: Iterable[tuple[float, float]]) -> list[int]:
 
 
 def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | Panel] = ("decode_ms", "bpp")) -> None:
-    """Draws quality against cost: one line of panels for each scene.
+    """Draws quality against cost: for each scene, panels side by side.
 
-    Rows of one method share a colour and a marker; each is labelled; the Pareto front is drawn as steps. Rows without
-    one of a panel's two figures are left out of it.
+    Rows of one method share a colour and a marker; each is labelled; the Pareto front is drawn as steps. A panel leaves
+    out rows that lack its x or its y value.
 
     Args:
         rows: The results.
         path: Picture to write, `.png`, `.svg` or `.pdf`.
-        x: One panel or several; a name stands for the PSNR of all methods against that figure.
+        x: One panel or several. A name of a figure stands for a panel of all methods' PSNR against that figure.
 
     Raises:
-        WlmError: The figure or the file's suffix is unknown, no row has what a panel needs, or the file can't be
+        WlmError: The figure or the file's suffix is unknown, no row has both values of a panel, or the file can't be
             written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -138,7 +138,7 @@ def _style(method: str, methods: Sequence[str]) -> tuple[str, str]:
 
 
 def _ink(colour: str) -> tuple[float, ...]:
-    """Returns a darker colour, for thin letters on white."""
+    """Returns a darker shade of a colour, so that thin letters are legible on white."""
     from matplotlib.colors import to_rgb
 
     return tuple(_INK * channel for channel in to_rgb(colour))
@@ -199,7 +199,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
 
 
 def _wide(values: Sequence[float]) -> bool:
-    """Returns whether the range of some numbers is too large for a linear axis."""
+    """Returns whether the values span so large a range that the axis should be logarithmic."""
     return min(values) > 0.0 and max(values) / min(values) > _LOG_RATIO
 
 

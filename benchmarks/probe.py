@@ -1,27 +1,27 @@
-"""The probe system against itself, plain torch, the PCA family and an engine's packing: size, speed and error.
+"""Size, speed and error of compressed light probes, beside a fit in plain torch, PCA methods and an engine's packing.
 
-Rows of each set, by method:
+The results table of each set of probes has these rows, by method:
 
 - "ours": one row for each profile, and for the first profile at each ratio of gaussian-probe-compression, tables 2 and
-  3. Size on disk and on a GPU, time of the fit with the writing, errors against the input, decode time of all live
-  probes. "pca" is the same for the profile of principal components.
-- "decode": the first profile, with ellipsoids as supports and with the spheres of the paper (eq. 6), which are another
-  fit.
-- "fit": the first profile on the first set: speed of the fit; "dense torch": as many steps in plain torch, all of them
-  on CUDA, otherwise a few.
-- The rivals of `benchmarks.rivals.probe` at shares of the probes' size as float32, and Unreal's packing, which has one
-  size. The list of dead probes counts for them too; nobody stores positions.
-- "held out": the first profile: light at every fifth probe from a fit to the others, and the light half-way between
-  probes; with that of the uncompressed others by two simple rules.
-- "volume", the first profile: a walk with the cascaded volume, filled from the original probes ("lossless") and from
-  each model. Figures are means and 95th percentiles over frames, each timed until the device has finished it. The PSNR
-  is that of readings at probes near the viewer against the input; beside it are the PSNR of the decoded probes at the
-  same samples, and that of readings farther away. The walk starts with an empty volume: the time of its first frame,
-  and the frames until no block waits. RMS and RMSE of the light refer to the probes that filled the volume.
-- "views", the first profile: pictures of balls at the probes, compared as displayed, see `wlm.probe.views`.
+  3. Size on disk and on a GPU, time to fit and write, errors against the input, time to decode all live probes. "pca"
+  has the same figures for the profile of principal components.
+- "decode": the first profile, with Gaussians that are cut off at ellipsoids, or at spheres as in the paper (eq. 6);
+  each is a fit of its own.
+- "fit": speed of the fit by the first profile on the first set. "dense torch": the same fit in plain torch, with as
+  many steps on CUDA and only a few on a CPU.
+- The rivals of `benchmarks.rivals.probe` at given percentages of the probes' size as float32, and Unreal's packing,
+  which has one size. The list of dead probes is counted for rivals too; positions are counted for no method.
+- "held out": every fifth probe is left out of a fit by the first profile. The model predicts the light at these probes
+  and half-way between probes; two simple interpolations of the uncompressed other probes do so for comparison.
+- "volume", the first profile: a viewer walks through the cascaded volume, which is filled from the original probes
+  ("lossless") or from a model. Times are means and 95th percentiles over frames. The PSNR compares light read from the
+  volume at probes near the viewer with the input; further columns have the PSNR of the decoded probes at the same
+  places, and of light read farther away. The walk starts with an empty volume: time of the first frame, and number of
+  frames until no block waits. RMS and RMSE of the light are against the probes that filled the volume.
+- "views", the first profile: pictures of balls at the probes, compared after tone mapping, see `wlm.probe.views`.
 
-A largest error is that against the float64 decode of the same model. A decode on CUDA is timed as the replay of a
-graph, so that gaps between launches do not count; the rivals decode on the CPU.
+The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
+replay of a CUDA graph, so that gaps between launches do not count; rivals are decoded on the CPU.
 """
 
 import os
@@ -95,18 +95,18 @@ def run(
     """Measures the probe system on one file.
 
     Args:
-        quick: Short fits, the profiles' ratios only, rivals of one size, a short walk, and of the demo noon only: less
+        quick: Short fits, no further ratios, rivals at one size, a short walk, and of the demo's probes only noon: less
             than two minutes on two CPU cores. The fits are not finished, so errors are large.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
-        probes_path: A file as `wlm.probe.load` reads it; None: the checkout's `demos/data/probes/street.npz`.
-        keys: The arrays of the file, one set of rows each; none: the only one, or noon and night of the demo's.
+        probes_path: A file that `wlm.probe.load` can read; None: the checkout's `demos/data/probes/street.npz`.
+        keys: Names of arrays in the file, each one a set of probes; None: the only array, or the demo's noon and night.
         rivals: Whether to measure the PCA family and Unreal's packing, which take minutes on the CPU and no GPU.
-        rivals_at: Measure only the rivals. The command states this result file, whose sizes are the same shares.
+        rivals_at: A result file. If given, only the rivals are measured, at the same percentages as in that file.
         volume_only: Measure only the volume, filled from the original probes and from principal components.
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, set by set in the order of the module's list.
+        The rows of each set, in the order in which the module's docstring lists them.
 
     Raises:
         WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
@@ -149,14 +149,14 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given sets; the rest as for `run`.
+    """Measures the given profiles on given sets. Arguments that are not listed here are as for `run`.
 
     Args:
-        sets: At least one.
-        profiles: At least one; all but the rows "ours" are about the first.
-        ratios: Further ratios of the first profile; the profile's ratio is left out.
-        shares: Sizes of the rivals, in per cent of float32.
-        frames: Frames of the walk, at least one; None: as many as a tenth of a block each takes.
+        sets: At least one set of probes.
+        profiles: At least one profile; all rows except "ours" are measured with the first one.
+        ratios: Further compression ratios for the first profile; its own ratio is not measured twice.
+        shares: Sizes of the rivals, in per cent of the probes' size as float32.
+        frames: Frames of the walk, at least one; None: the viewer moves by a tenth of a block in each frame.
         rivals: Whether to measure the rivals.
         repeats: As for `Bench`.
     """
@@ -183,7 +183,7 @@ def run_rows(
 
 
 class ProbeBench(Bench):
-    """A set of probes."""
+    """The benchmark of one set of probes."""
 
     def __init__(self, probes: ProbeSet, device: str, progress: Note | None, repeats: int | None = None) -> None:
         key = probes.key.removeprefix("sh").removeprefix("_")
@@ -192,18 +192,18 @@ class ProbeBench(Bench):
         self.position, self.values = probes.position[probes.live], probes.values[probes.live]
 
     def volume(self, frames: int | None = None) -> list[Row]:
-        """Measures the volume filled from the original probes and from principal components."""
+        """Returns the rows of walks with volumes filled from the original probes and from principal components."""
         return volume_rows(self, self.probes, {"pca": compress(self.probes, "pca")}, frames)
 
     def fit_profile(self, profile: Profile, option: str) -> Fit:
-        """Fits and writes a profile; compiling its kernels is no part of either time."""
+        """Compresses the probes by a profile, writes and reloads the file. Compiling of kernels is not timed."""
         self.note(f"{option}: fitting {len(self.position):,} probes, {profile.steps:,} steps")
         profile = profile.model_copy(update={"method": "gaussians"})
         compress(self.probes, profile.model_copy(update={"steps": 10}), device=self.device)
         return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of a fit, and its decode, which is timed later."""
+        """Returns the row of a compressed model, and a call that decodes its probes, which is timed later."""
         model, decoder = fit.model, GaussianDecoder(fit.model, self.device)
         points = decoder.points(self.position)
         report, errors = self._decode(decoder, points, decode64(model, self.position), fit.bytes)
@@ -223,7 +223,7 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.run(points))
 
     def component_row(self) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of principal components, and their decode, which is timed later."""
+        """Returns the row of principal components, and a call that decodes the probes, which is timed later."""
         self.note("principal components")
         fit = self.fit("pca", lambda: compress(self.probes, "pca"))
         decoder = fit.model.decoder(self.device)
@@ -243,7 +243,7 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.read(numbers, values))
 
     def held_out_row(self, fit: Fit) -> Row:
-        """Returns the row of the light at probes that were left out of the compression."""
+        """Returns the row with the error of predicted light at probes that were left out of the fit."""
         self.note(f"{fit.option}: fitting four fifths of the probes")
         live = np.flatnonzero(self.probes.live)
         out = np.arange(len(live)) % _EVERY == min(_EVERY, len(live)) - 1
@@ -269,7 +269,7 @@ class ProbeBench(Bench):
         )
 
     def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
-        """Returns a row and a decode for each way to decode a model."""
+        """Returns, for ellipsoids and for spheres, the row and a call that decodes the probes."""
         model = fit.model
         spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
         exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
@@ -297,7 +297,7 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.run(points))
 
     def fit_rows(self, fit: Fit) -> list[Row]:
-        """Returns the rows of the speed of the fit, and of the same fit in plain torch."""
+        """Returns one row with the speed of the fit, and one with the speed of the same fit in plain torch."""
         p, model = fit.model.profile, fit.model
         step_ms = 1e3 * fit.fit_seconds / p.steps
         option = f"{fit.option} {p.steps:,} steps"
@@ -342,7 +342,7 @@ class ProbeBench(Bench):
         return [ours, dense]
 
     def rival_rows(self, shares: Sequence[int]) -> list[Row]:
-        """Measures the rivals at shares of float32, in per cent, and Unreal's packing at its own size."""
+        """Returns rows of rivals at sizes in per cent of float32 probes, and of Unreal's packing at its fixed size."""
         rows = []
         for share in shares:
             option, size = f"{share}%", share * self.probes.float_bytes // 100
@@ -370,35 +370,35 @@ class ProbeBench(Bench):
     def _decode(
         self, decoder: GaussianDecoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
-        """Returns the score of a decode, and its errors against float64."""
+        """Decodes the probes. Returns PSNR and other scores, and the errors against a float64 decode."""
         decoder.run(points)
         values = points.values()
         return score(self._all(values), self.probes, size), exact_errors(values, exact)
 
     def _all(self, live: np.ndarray) -> np.ndarray:
-        """Returns the values of all probes; dead probes are zero."""
+        """Returns values [N, D] of all probes from those of the live ones; dead probes get zeros."""
         values = np.zeros_like(self.probes.values)
         values[self.probes.live] = live
         return values
 
     def _dead_bytes(self) -> int:
-        """Returns the bytes of the packed list of dead probes, as in our file."""
+        """Returns the size in bytes of the compressed list of dead probes in our file."""
         return 0 if self.probes.live.all() else len(zstd.compress(np.packbits(~self.probes.live).tobytes()))
 
 
 def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:
-    """Returns the sizes on a GPU and on a disk, and the error; the GPU size of a rival is that of its payload."""
+    """Returns the size on a GPU, the size on disk and the PSNR as figures of a row."""
     sizes = {"bytes": gpu_bytes, "bpp": 8 * gpu_bytes / report.probes, "disk_bytes": report.bytes}
     return sizes | {"share_of_float32": gpu_bytes / (4 * report.probes * report.outputs), "psnr": report.psnr}
 
 
 def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
-    """Measures walks with the original probes and with each model, each from an empty volume.
+    """Measures a viewer's walk through a volume filled from the original probes, and one for each model.
 
     Args:
         bench: Benchmark of the set, on the device of the volume.
         probes: The original probes.
-        models: Models by the names of their rows.
+        models: Compressed models, by the names that the results table prints.
         frames: Frames of the walk, at least one; None: each frame moves the viewer by a tenth of a block.
     """
     rows = []
@@ -430,12 +430,12 @@ def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel]
 
 
 def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> list[Row]:
-    """Scores pictures of balls under each kind of light.
+    """Compares pictures of balls lit by a model with pictures lit by the original probes, for each kind of light.
 
     Args:
         bench: Benchmark of the set, on the device of the decode.
         probes: The original probes.
-        model: A model of them.
+        model: The compressed probes.
         views: Number of pictures, at least one.
     """
     bench.note(f"{views} views of balls")
@@ -458,6 +458,6 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
 
 
 def _light(figures: dict[str, Any]) -> dict[str, float | None]:
-    """Returns figures of the light at a walk's samples; None where no probe is near the viewer."""
+    """Returns coverage, RMSE and RMS of the light read during a walk; None if no probe was near the viewer."""
     names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
     return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}

@@ -1,4 +1,4 @@
-"""Rows as Markdown: tables, and pages made of result files."""
+"""Writes results as Markdown: tables of rows, and pages of whole result files."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,11 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
 
     Args:
         paths: Files that `write_json` wrote.
-        index: The index; the pages are in a folder beside it that has its name without the suffix.
+        index: Path of the index. The pages are in a folder beside it, named like the index without its suffix.
 
     Returns:
-        The pages by their paths from the index's folder. Each has the plots `images/bench-SYSTEM*.png` beside the
-        index and of each run where and with what it was measured, the command that measures it again, and its rows.
+        The text of the index and of each page, by paths relative to the index's folder. A page shows the plots
+        `images/bench-SYSTEM*.png` and, for each run, its date, machine, versions, command and tables.
 
     Raises:
         WlmError: A file is missing or is no result file.
@@ -49,13 +49,13 @@ def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str]
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Writes rows as Markdown tables: of the smoke systems by method and scene, of the others by scene.
+    """Writes rows as Markdown tables: one for each scene, and for smoke one for each method and scene.
 
     Args:
         rows: The results, in the order to print.
 
     Returns:
-        Lines with a final newline; empty for no rows.
+        The Markdown text, with a final newline; empty if there are no rows.
     """
     groups: dict[str, list[Row]] = {}
     for row in rows:
@@ -66,7 +66,7 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def _group(rows: list[Row]) -> str:
-    """Writes one table if it fits the width; otherwise several with fewer columns, and notes below them."""
+    """Returns one Markdown table, or if that is too wide several with fewer columns and numbered notes below."""
     labels = [[row.method, row.option] if len({row.method for row in rows}) > 1 else [row.option] for row in rows]
     figures = {name: figure for table in TABLES.values() for name, figure in table.items()}
     whole = _table(figures, "notes", rows, labels, [row.notes for row in rows])
@@ -86,7 +86,7 @@ def _group(rows: list[Row]) -> str:
 def _table(
     figures: Mapping[str, Figure], last: str, rows: Sequence[Row], labels: Sequence[list[str]], notes: Sequence[str]
 ) -> list[str]:
-    """Returns the lines of a table without empty columns."""
+    """Returns the lines of a Markdown table, without columns in which no row has a value."""
     figures = {name: figure for name, figure in figures.items() if any(name in row.figures for row in rows)}
     heads = [""] * len(labels[0])
     lines = [[*heads, *(figure.heading for figure in figures.values())]]
@@ -101,7 +101,7 @@ def _table(
 
 
 def _section(run: Run, path: str | os.PathLike[str]) -> str:
-    """Writes the section of a run: the command that repeats it, the environment, and its rows."""
+    """Returns the Markdown section of a run: the command that repeats it, versions and machine, and its tables."""
     environment = run.environment
     cuda = f", CUDA {environment['cuda']}" if environment.get("cuda") else ""
     return (
@@ -112,5 +112,5 @@ def _section(run: Run, path: str | os.PathLike[str]) -> str:
 
 
 def _order(run: Run) -> tuple[str, list[str]]:
-    """Returns a sort key of system and scenes, so that a section keeps its position when it is measured again."""
+    """Returns a sort key made of system and scenes, so that a run measured again keeps its position on the page."""
     return run.rows[0].system, sorted({row.scene for row in run.rows})

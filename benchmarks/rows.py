@@ -1,7 +1,7 @@
-"""The rows that every benchmark reports, and the files that keep them.
+"""The rows of results that every benchmark reports, and the JSON files that store them.
 
-A row is one method with one option on one scene, with its figures by name. A result file is of one machine, and its
-runs are of different systems or scenes. It is JSON: ``{"format": "wlm-bench", "version": 3, "runs": [{"environment":
+A row has the figures of one method with one option on one scene. A result file has the runs of one machine, each of
+another system or other scenes. Its JSON: ``{"format": "wlm-bench", "version": 3, "runs": [{"environment":
 {...}, "rows": [{"system": ..., "figures": {"psnr": 45.98, ...}, "notes": "..."}, ...]}, ...]}``.
 """
 
@@ -35,16 +35,16 @@ _PACKAGES = {"numpy": "numpy", "torch": "torch", "warp": "warp-lang"}
 
 @dataclass(frozen=True)
 class Row:
-    """One method with one option on one scene.
+    """A row of results: the measured figures of one method with one option on one scene.
 
     Attributes:
         system: `lightmap`, `atlas`, `probe`, `smoke` or `smoke-network`.
-        scene: Name of the data.
-        method: What was run, ours or a rival.
+        scene: Name of the measured data.
+        method: Name of what was measured, such as "ours" or a rival's name.
         option: Profile or setting that tells rows of one method apart; may be empty.
-        figures: What was measured, by the names of `benchmarks.figures`. Those that are None, NaN or infinite were
-            not measured or have no meaning, and are left out.
-        notes: What a reader must know besides; free text.
+        figures: Measured values, by the names of `benchmarks.figures`. Values that are None, NaN or infinite are left
+            out: they were not measured, or have no meaning.
+        notes: Free text with further information for a reader of the table.
     """
 
     system: str
@@ -55,7 +55,7 @@ class Row:
     notes: str = ""
 
     def __post_init__(self) -> None:
-        """Checks the figures' names.
+        """Checks the names of the figures, and leaves out figures without a finite value.
 
         Raises:
             ValueError: A name is unknown.
@@ -69,24 +69,24 @@ class Row:
         object.__setattr__(self, "figures", plain)
 
     def __getitem__(self, name: str) -> float:
-        """Returns a figure of the row."""
+        """Returns the value of a figure; a `KeyError` if the row has no such figure."""
         return self.figures[name]
 
     def get(self, name: str) -> float | None:
-        """Returns a figure, or None if the row has no such figure."""
+        """Returns the value of a figure, or None if the row has no such figure."""
         return self.figures.get(name)
 
     def with_figures(self, **figures: float | None) -> Row:
-        """Returns a copy with more figures."""
+        """Returns a copy of the row with further figures."""
         return replace(self, figures={**self.figures, **figures})
 
     def with_timing(self, timing: Timing, name: str = "decode_ms", calls: int = 1) -> Row:
-        """Returns a copy with a time, and with its spread if there is more than one sample.
+        """Returns a copy with a median time, and its 10th and 90th percentiles if there are several samples.
 
         Args:
-            timing: Time of a call.
-            name: Name of the figure.
-            calls: Number of repetitions, such as steps, inside a timed call.
+            timing: Times of a call.
+            name: Name of the figure of the median.
+            calls: Number of repetitions, such as steps, in one timed call; times are divided by it.
         """
         spread = (timing.p90_ms - timing.p10_ms) / calls if timing.n > 1 else None
         return self.with_figures(**{name: timing.median_ms / calls, f"{name}_spread": spread})
@@ -94,10 +94,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Run:
-    """Rows that were measured together.
+    """Rows of results that one command measured together.
 
     Attributes:
-        environment: As `describe_environment` gives it.
+        environment: Machine, versions and command, as `describe_environment` returns them.
         rows: The results.
     """
 
@@ -106,11 +106,11 @@ class Run:
 
 
 def describe_environment(device: str, command: str) -> dict[str, object]:
-    """Describes what a figure depends on besides the code.
+    """Describes the machine and the software on which measured figures depend.
 
     Args:
         device: "cpu" or "cuda:0".
-        command: The command that made the rows, as a reader would repeat it.
+        command: The command line that measures the same rows again.
 
     Returns:
         Values for JSON: `date` (UTC), `command`, `device`, `device_name`, versions of `python`, `numpy`,
@@ -145,16 +145,16 @@ def write_json(
 ) -> None:
     """Writes a run to a result file, atomically: a reader sees the old file or the whole new one.
 
-    What the file holds of other systems and scenes stays; what it holds of a system's scene is replaced.
+    The new rows replace all rows of the same system and scene in the file; its other rows stay.
 
     Args:
         path: File to write; its folder must exist.
         rows: The results.
-        environment: As `describe_environment` gives it.
-        partial: Replace only the rows of the same method and option.
+        environment: Machine, versions and command, as `describe_environment` returns them.
+        partial: Whether to replace only rows that also have the same method and option.
 
     Raises:
-        WlmError: The environment does not fit JSON, the file can't be written, or what is there is no result file.
+        WlmError: The environment does not fit JSON, the file can't be written, or exists and is no result file.
     """
     path = Path(path)
 
@@ -183,7 +183,7 @@ def read_runs(path: str | Path) -> list[Run]:
         path: File that `write_json` wrote.
 
     Returns:
-        Its runs, from the oldest; at least one.
+        The runs of the file, from the oldest to the newest; at least one.
 
     Raises:
         WlmError: The file can't be read, is no result file of this version, or a row has an unknown, missing or

@@ -1,4 +1,4 @@
-"""The base of all benchmarks: it reports progress, fits and stores models, times calls in turns, and makes rows."""
+"""The base class of all benchmarks: reports progress, fits and stores models, times calls and makes result rows."""
 
 import tempfile
 import time
@@ -22,14 +22,14 @@ Note = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A model that was fitted, written and read back.
+    """A model that was fitted, written to a file and loaded again.
 
     Attributes:
-        option: The option of its row.
+        option: Name of the profile or setting, as the results table prints it.
         model: The model as loaded from the file.
         fitted: The model before it was written.
-        bytes: Size of the file.
-        fit_seconds, write_seconds: Wall-clock times.
+        bytes: Size of the file in bytes.
+        fit_seconds, write_seconds: Wall-clock times of fitting and of writing.
     """
 
     option: str
@@ -41,7 +41,7 @@ class Fit:
 
     @property
     def seconds(self) -> float:
-        """Seconds of the fit and the writing."""
+        """The time of fitting and writing together, in seconds."""
         return self.fit_seconds + self.write_seconds
 
 
@@ -49,9 +49,9 @@ class Bench:
     """A benchmark of one system on one device and one scene.
 
     Attributes:
-        system, scene: System and scene of the rows.
+        system, scene: System and scene that the rows state.
         device: "cpu" or "cuda:0".
-        mode: How a replayed call runs on this device, for the notes of a row.
+        mode: Text for the notes of a row: how a call that `replay` returns runs on this device.
     """
 
     def __init__(
@@ -66,17 +66,17 @@ class Bench:
         repeats: int | None = None,
         few: int = 1,
     ) -> None:
-        """Checks the device.
+        """Checks that the device exists, and stores the settings of the benchmark.
 
         Args:
-            system: System of the rows.
+            system: System that the rows state.
             device: "cpu" or "cuda:0".
-            progress: None for no lines of progress.
-            scene: Scene of the rows; lines of progress begin with it.
-            clock: Name of the figure of a timing.
-            warmup: Calls before the first that is timed; None: 1 on the CPU, 5 on CUDA.
-            repeats: Samples of each time; None: 5 on the CPU, where a sample is long, 30 on CUDA.
-            few: Samples of long calls.
+            progress: Called with each line of progress; None: no progress is reported.
+            scene: Scene that the rows state; lines of progress begin with it.
+            clock: Name of the figure that holds a measured time.
+            warmup: Number of calls before the first timed call; None: 1 on the CPU, 5 on CUDA.
+            repeats: Number of samples of each time; None: 5 on the CPU, where a sample is long, 30 on CUDA.
+            few: Number of samples of calls that take long.
 
         Raises:
             WlmError: The device does not exist.
@@ -90,7 +90,7 @@ class Bench:
         self.mode = "one thread" if slow else "replayed as a graph"
 
     def note(self, line: str) -> None:
-        """Reports what is done next."""
+        """Reports a line of progress that says which work comes next."""
         if self._progress is not None:
             self._progress(f"{self.scene}: {line}" if self.scene else line)
 
@@ -105,27 +105,27 @@ class Bench:
         calls: int = 1,
         **figures: float | None,
     ) -> Row:
-        """Makes a row.
+        """Makes a row of results.
 
         Args:
             method, option, notes: As in `Row`.
-            scene: A scene in place of the scene of the benchmark.
+            scene: Name of the scene; None: the scene of the benchmark.
             timing, calls: As for `Row.with_timing`.
-            figures: Figures by name.
+            figures: Measured values, by the names of `benchmarks.figures`.
         """
         row = Row(self.system, self.scene if scene is None else scene, method, option, figures, notes)
         return row if timing is None else row.with_timing(timing, self._clock, calls)
 
     def missing_row(self, method: str, option: str, error: Exception) -> Row:
-        """Makes the row of a case that cannot be measured: a package is not installed, or nothing fits the size."""
+        """Makes a row without figures for a case that cannot be measured; the error becomes its note."""
         return self.row(method, option, f"not measured: {error}")
 
     def fit(self, option: str, compress: Callable[[], Model]) -> Fit:
         """Fits a model, saves it and loads it again.
 
         Args:
-            option: The option of its row.
-            compress: Fits the model; its kernels must be compiled already.
+            option: Name of the profile or setting, as the results table prints it.
+            compress: Function that fits the model; its kernels must be compiled already.
         """
         start = time.perf_counter()
         model = compress()
@@ -138,11 +138,11 @@ class Bench:
             return Fit(option, load(path, model.SYSTEM), model, size, fitted - start, written - writing)
 
     def replay(self, call: Callable[[], object]) -> StepGraph:
-        """Captures a call in a graph on CUDA, so that gaps between launches do not count."""
+        """Returns a call that does the same: on CUDA by replaying a CUDA graph, on a CPU by simply calling it."""
         return StepGraph(call, self.device, warmup=1)
 
     def time(self, calls: Mapping[Any, Callable[[], object]], *, few: bool = False) -> dict[Any, Timing]:
-        """Times calls in turns."""
+        """Times calls in turns; returns the `Timing` of each by its name. `few`: take fewer samples of each."""
         warmup, repeats = (1, self._few) if few else (self._warmup, self._repeats)
         return time_together(calls, self.device, warmup, repeats)
 
@@ -157,8 +157,8 @@ def expect_alone(option: str, others: Mapping[str, object]) -> None:
     """Raises a `WlmError` if an option was given together with others that have no meaning beside it.
 
     Args:
-        option: The option that was given.
-        others: Whether each of the others was given, by its name.
+        option: Name of the option that was given.
+        others: For each other option, by name, a value that is true if the option was given.
     """
     if any(others.values()):
         raise WlmError(f"{option}: expected without {' and '.join(others)}")
@@ -179,29 +179,29 @@ def check_only(only: Sequence[str], names: Sequence[str]) -> None:
 def exact_errors(decoded: np.ndarray, exact: np.ndarray) -> dict[str, float]:
     """Compares a decode with the float64 decode of the same model.
 
-    Rounding can move a point across the border of a tile or of the support of a Gaussian; the error of such a point is
-    far above all others.
+    Rounding can move a point across the border of a tile or out of the reach of a Gaussian; the error of such a point
+    is far above all others, so a percentile is returned too.
 
     Args:
-        decoded: [N, C].
-        exact: float64 [N, C].
+        decoded: Decoded values of N points, [N, C].
+        exact: Values of the same points decoded in float64, [N, C].
 
     Returns:
-        The figures `max_error` and `error_999`, the error that 99.9% of the points stay within.
+        The figures `max_error`, the largest error, and `error_999`, the 99.9th percentile of the points' errors.
     """
     error = np.abs(decoded - exact).max(1)
     return {"max_error": float(error.max()), "error_999": float(np.percentile(error, 99.9))}
 
 
 def demo_data(name: str, option: str) -> Path:
-    """Finds data of the demos.
+    """Returns the path of a file or folder of demo data.
 
     Args:
-        name: Its path in `demos/data`.
-        option: The command line option that names other data.
+        name: Path inside `demos/data`.
+        option: The command line option with which a user can choose other data, for the error message.
 
     Raises:
-        WlmError: The data are missing, because the package is not in a checkout.
+        WlmError: The data are missing, because wlm does not run from a checkout of the repository.
     """
     path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / name
     if not path.exists():

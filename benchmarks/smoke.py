@@ -1,24 +1,24 @@
-"""The smoke system against copies, exact solutions and finer marches: speed and error, in one run.
+"""Speed and error of the smoke system, against memory copies, exact solutions and finer ray marches, in one run.
 
-The methods, each a table of its own:
+Each method has a table of its own:
 
-- "lattice": a copy of an array, and steps of the lattice Boltzmann solver of each storage, operator and kind of
-  boundary; their share of the copy's bandwidth is that of the bytes which a step has to move. "moving sphere" also
-  marks the sphere's cells and finds its links anew at each step.
-- "lattice storage": velocities of 16 bits against 32 in a jet, over the inlet's speed, and the share by which the mass
-  drifts.
-- "advection": a step of smoke in eddies, dense, with and without a sphere; and the error of a smooth ball after a whole
-  turn: the RMS over the ball's own, the largest difference (its peak is 1), and the smoke that was gained.
-- "advection bricks": the same step where only a cube in a corner has smoke.
-- "guide": guiding maps against a march in steps of half a voxel with no jitter and no cutoff. PSNR is of the light, its
-  greatest value the peak.
-- "six ways": the fine march, with its own estimate of its error by halving its step.
-- "weights": six lightmaps weighted for twelve lights against a march to each.
-- "frame": the stages of a frame of the scene `jet-sphere`, except the network that turns the guide into lightmaps,
-  which `smoke_network` measures; the march that it replaces is beside it.
+- "lattice": a copy of an array, and steps of the lattice Boltzmann solver with each storage, collision operator and
+  kind of boundary. The bytes that a step must move, over its time, are stated as a share of the copy's bandwidth.
+  "moving sphere" also marks the sphere's cells and finds its boundary links again at each step.
+- "lattice storage": difference of velocities stored in 16 and in 32 bits, relative to the speed of a jet's inlet, and
+  the relative drift of the mass.
+- "advection": a step that moves dense smoke in eddies, with and without a solid sphere; and the error of a smooth ball
+  after a full rotation: RMS error over the RMS of the ball, largest error (the ball's peak is 1), and smoke gained.
+- "advection bricks": the same step with sparse storage, where only a cube in a corner contains smoke.
+- "guide": guiding maps (coarse lightmaps for the network) against a march in steps of half a voxel with no jitter and
+  no cutoff. PSNR is of the light; its peak is the largest value.
+- "six ways": the fine ray march of six-way lightmaps, with its own estimate of its error by halving its step.
+- "weights": six lightmaps weighted for twelve lights, against a ray march for each of these lights.
+- "frame": the stages of a frame of the scene `jet-sphere`, except the network that makes lightmaps of the guiding map,
+  which `smoke_network` measures; the ray march that the network replaces is measured too.
 
-A largest error has the unit of what is compared: cells a step, light, or density. Times are of the calls that a user
-makes; on CUDA the lattice replays graphs by itself where it does many steps, and steps of advection are replayed as
+A largest error has the unit of the compared quantity: cells per step, light, or density. Times are of the calls that a
+user makes. On CUDA the lattice itself replays graphs where it does many steps, and steps of advection are replayed as
 graphs, so that gaps between launches do not count.
 """
 
@@ -90,7 +90,7 @@ _FEW_PATHS = 4
 
 @dataclass(frozen=True)
 class Sizes:
-    """Grids, steps and repeats. The defaults are the grids of the paper, for a GPU."""
+    """Grid sizes, step sizes and numbers of repeats. The defaults are the grids of the paper, for a GPU."""
 
     lattice: int = 256  # cells along an edge of the large lattice
     small: int = 100  # cells along an edge of the small lattice
@@ -149,10 +149,10 @@ QUICK = Sizes(
 
 
 class SmokeBench(Bench):
-    """A device and sizes.
+    """The benchmark of the smoke system on one device, with its grid sizes.
 
     Attributes:
-        bandwidth: Bytes a second that a copy reads and writes; NaN until it is measured.
+        bandwidth: Bytes per second that a memory copy reads and writes; NaN until it is measured.
     """
 
     def __init__(self, device: str, sizes: Sizes, progress: Note | None = None) -> None:
@@ -161,12 +161,12 @@ class SmokeBench(Bench):
         self.sizes, self.bandwidth = sizes, math.nan
 
     def of_copy(self, bytes_moved: float, ms: float) -> float:
-        """Returns the bandwidth of a number of bytes in a time in milliseconds, over the bandwidth of a copy."""
+        """Returns the bandwidth of moving some bytes in `ms` milliseconds, as a fraction of a copy's bandwidth."""
         return bytes_moved / (1e-3 * ms) / self.bandwidth
 
 
 def lattice_rows(bench: SmokeBench) -> list[Row]:
-    """Measures a copy, and steps of lattices with each kind of boundary, storage and operator in the same run."""
+    """Times a memory copy, and steps of the fluid solver with each boundary, storage and collision operator."""
     bench.note("lattice")
     cells, small = bench.sizes.lattice, bench.sizes.small
     cases = {
@@ -208,7 +208,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
 
 
 def storage_rows(bench: SmokeBench) -> list[Row]:
-    """Measures the error of 16 bits against 32, and the drift of the mass of both."""
+    """Measures the error of the fluid solver with 16-bit storage against 32 bits, and the mass drift of both."""
     bench.note("lattice: 16 bits against 32")
     sizes = bench.sizes
     exact, half = (_jet(bench, sizes.small, storage=storage) for storage in ("float32", "float16"))
@@ -230,7 +230,7 @@ def storage_rows(bench: SmokeBench) -> list[Row]:
 
 
 def advection_rows(bench: SmokeBench) -> list[Row]:
-    """Measures schemes and storages: a step with and without solids, and the error after a whole turn of a ball."""
+    """Measures advection by scheme and storage: time with and without solids, error after a ball's full turn."""
     rows = []
     n = bench.sizes.coarse
     box, cells = _box(n), (_RATIO * n) ** 3
@@ -262,7 +262,7 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
 
 
 def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
-    """Measures a step in bricks by the share of the box that has smoke."""
+    """Times an advection step in sparse bricks, for several shares of the box that contain smoke."""
     bench.note("advection: bricks")
     n, rows = bench.sizes.coarse, []
     edge = _RATIO * n
@@ -289,7 +289,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
 
 
 def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattice:
-    """Makes a lattice with a round inlet, a sphere, an outlet and walls; or with air at rest."""
+    """Makes a fluid lattice with a round inlet, a sphere, an outlet and walls, or a lattice of air at rest."""
     lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
     if faces != "periodic":
         for face in ("-x", "+x", "-y", "+y", "-z", "+z"):
@@ -309,7 +309,7 @@ def _sphere(mask: wp.array, moved: float) -> wp.array:
 
 
 def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
-    """Returns a call with steps of a jet whose sphere moves to and fro, and their number."""
+    """Returns a call that does some solver steps while a sphere moves to and fro, and the number of these steps."""
     lattice, speed, steps = _jet(bench, size), 0.05, 10
     mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
     lattice.step(1)
@@ -325,7 +325,7 @@ def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
 
 
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
-    """Returns the bytes of one cell that a step must read and write: populations and the solid flag."""
+    """Returns how many bytes a step must read and write for each cell: its populations and its solid flag."""
     return 2 * len(velocity_set(lattice).c) * (2 if storage == "float16" else 4) + int(faces == "all")
 
 
@@ -355,7 +355,7 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
 
 
 def _swirl(n: int, device: str) -> wp.array:
-    """Makes the velocity of eddies of the size of the box, at the speed of air on a lattice."""
+    """Makes the velocity field of eddies as large as the box, at the speed of air in the fluid solver."""
     at = 2 * np.pi * (np.arange(n) + 0.5) / n
     x, y, _ = np.meshgrid(at, at, at, indexing="ij")
     u = _SPEED * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0.5 * np.sin(x + y)], -1)
@@ -363,7 +363,7 @@ def _swirl(n: int, device: str) -> wp.array:
 
 
 def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Callable[[], None]:
-    """Returns a step that writes to a second field, so that a replay repeats the same work."""
+    """Returns a call that does one advection step into a second field, so that each replay does the same work."""
 
     def step() -> None:
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
@@ -374,7 +374,7 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
 
 
 def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
-    """Makes fields with smoke in a cube in a corner, whose volume is a share of the box."""
+    """Makes smoke fields with a cube of smoke in a corner; `fill` is the cube's volume as a share of the box."""
     edge = _RATIO * bench.sizes.coarse
     density = torch.zeros((edge,) * 3, device=bench.device)
     full = round(fill ** (1 / 3) * edge)
@@ -383,7 +383,7 @@ def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
-    """Returns a step in bricks, with the update of their lists and the clearing of retired bricks; and the bricks."""
+    """Returns a call that does one advection step in sparse bricks and updates their lists, and the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
     bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
@@ -409,10 +409,10 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
 
 
 def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
-    """Turns a smooth ball once about the box's axis, after which it should be where it was.
+    """Moves a smooth ball by a full rotation about the box's axis, after which the exact solution is the start.
 
     Returns:
-        `rms`, over the ball's own RMS; `max_error`, where the ball's greatest density is 1; `smoke_gained`.
+        `rms`, RMS error over the RMS of the ball; `max_error`, where the ball's peak density is 1; `smoke_gained`.
     """
     n, device = bench.sizes.coarse, bench.device
     edge, box = _RATIO * n, _box(n)
@@ -445,15 +445,15 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
 
 
 def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
-    """Makes a billowing column of octaves of noise. The random numbers come from the CPU, so that all devices agree.
+    """Makes a billowing column of smoke from octaves of noise. Random numbers are drawn on the CPU for any device.
 
     Args:
         n: Voxels along an edge.
-        device: Where it is made.
-        seed: Of the noise.
+        device: Device of the result.
+        seed: Seed of the noise.
 
     Returns:
-        float32 [n, n, n], in [0, 1].
+        The density, float32 [n, n, n] in [0, 1].
     """
     random = np.random.default_rng(seed)
     noise = torch.zeros((1, 1, n, n, n), device=device)
@@ -468,7 +468,7 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
 
 
 def guide_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures guiding maps by their step, with shared or separate marches to the lights, against a fine march."""
+    """Measures guiding maps by step size, with marches to the lights shared by pixels or not, against a fine march."""
     bench.note("guide")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
@@ -511,7 +511,7 @@ def guide_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def six_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures the fine march of six-way lightmaps by its step, with its own estimate of its error."""
+    """Measures the fine ray march of six-way lightmaps by step size, with its own estimate of its error."""
     bench.note("six ways")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
@@ -538,7 +538,7 @@ def six_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def weight_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures the rules that weight six lightmaps against a march to each of some oblique lights, on a plume."""
+    """Measures the rules that weight six lightmaps for oblique lights against a ray march for each, on a plume."""
     bench.note("weights")
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
@@ -567,8 +567,8 @@ def weight_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def frame_rows(bench: SmokeBench) -> list[Row]:
-    """A frame of a scene by stages: the air alone, the whole simulation, the guiding map, shadows and shading; all that
-    `wlm smoke run` does after the simulation; light of a point in the smoke, of fire, and of paths."""
+    """Times the stages of a frame: air alone, whole simulation, guiding map, shadows and shading; everything that
+    `wlm smoke run` does after the simulation; a point light in the smoke, fire, and path tracing."""
     sizes, device = bench.sizes, bench.device
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     scene = scene.model_copy(
@@ -643,7 +643,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
 def _drawn(
     scene: Scene, volume: DensityVolume, camera: Camera, time: float, device: str
 ) -> dict[str, Callable[[], object]]:
-    """Returns calls that light a frame, by name: pictures with shadows and obstacles, and light by diffusion."""
+    """Returns calls that light a frame, by name: pictures with shadows and obstacles, and multiple scattering."""
     lights = [settings.light() for settings in scene.lights]
     parts = {"background": scene.background, "obstacles": scene.obstacles}
     drawing = Drawing(camera, lights, albedo=scene.smoke.albedo, **parts, device=device)
@@ -661,7 +661,7 @@ def _drawn(
 
 
 def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Callable[[], object]]:
-    """Returns calls that trace six planes, under lights along the axes of the camera."""
+    """Returns calls that path-trace six lightmaps, one for each of six lights along the camera's axes."""
     six = [Light(tuple(map(float, sign * axis)), (4 * math.pi,) * 3) for axis in camera.axes for sign in (1.0, -1.0)]
     settings = {"samples": paths, "orders": 0}
     return {
@@ -671,7 +671,7 @@ def _traced(volume: DensityVolume, camera: Camera, paths: int) -> dict[str, Call
 
 
 def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
-    """Makes the cloud in both storages, and a camera above and beside it."""
+    """Makes a cloud stored in float32 and in float16, and a camera that looks at it obliquely from above."""
     n, pixels = bench.sizes.cloud, bench.sizes.resolution
     density = make_cloud(n, bench.device)
     volumes = {
@@ -684,7 +684,7 @@ def _cloud(bench: SmokeBench) -> tuple[dict[str, DensityVolume], Camera]:
 
 
 def _directions(count: int) -> np.ndarray:
-    """Returns evenly distributed directions, the points of a Fibonacci spiral on a sphere, [count, 3]."""
+    """Returns evenly distributed unit vectors [count, 3]: points of a Fibonacci spiral on the sphere."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     across = np.sqrt(1.0 - height**2)
@@ -696,12 +696,12 @@ def _rms(values: torch.Tensor) -> float:
 
 
 def _relative(values: torch.Tensor, exact: torch.Tensor) -> float:
-    """Returns the RMS difference over the RMS of the exact values."""
+    """Returns the RMS error relative to the RMS of the exact values."""
     return _rms(values.double() - exact.double()) / _rms(exact)
 
 
 def _psnr(coarse: Guide, fine: Guide) -> float:
-    """Returns the PSNR of the light; the peak is its greatest value."""
+    """Returns the PSNR of the light of a guiding map against a finer one, whose largest value is the peak."""
     return psnr_from_mse(_rms(coarse.light - fine.light) ** 2, float(fine.light.max()))
 
 
@@ -722,14 +722,14 @@ def run(*, quick: bool = False, device: str, sizes: Sizes | None = None, progres
     """Measures the smoke system.
 
     Args:
-        quick: Whether to take `QUICK`, for a minute on a CPU, in place of the grids of the paper, which need a GPU
-            with 40 GB.
+        quick: Whether to use the sizes `QUICK`, for a minute on a CPU, instead of the grids of the paper, which need a
+            GPU with 40 GB.
         device: "cpu" or "cuda:0".
-        sizes: Other grids.
+        sizes: Sizes that replace both; None: as `quick` says.
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, method by method.
+        The rows of each method, in the order in which the module's docstring lists them.
 
     Raises:
         WlmError: The device does not exist, or has too little memory.

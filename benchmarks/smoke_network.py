@@ -1,21 +1,21 @@
-"""The neural six-way lightmaps against marches, flip books and path tracing: time and error, in one run.
+"""Time and error of neural six-way lightmaps of smoke, against ray marches, flip books and path tracing, in one run.
 
-All rows are of held-out frames of a jet, a plume, a flame and a burst, from one camera, and their error is against the
-six-way march in steps of half a voxel. PSNR is of the six lightmaps of an image, in sRGB with a peak of 1: mean, least
-and most over the images. The methods, each a table of its own:
+All rows are of held-out frames of a jet, a plume, a flame and a burst, from one camera. Errors are against the six-way
+ray march in steps of half a voxel. PSNR is over the six lightmaps of an image, in sRGB with a peak of 1: mean, minimum
+and maximum over the images. Each method has a table of its own:
 
-- "time against error": the fine march ("six ways") and the coarse one by their steps in voxels, the latter also with
-  nodes of its lattice that are nearer or farther apart than a step, and networks with their guiding maps and with their
-  planes decoded to light. The emission is that of frames that glow. Times are of a frame, the mean over all; on a GPU
-  as replayed graphs, and as the calls that a user makes beside it.
-- "frame": the stages of a frame, and the simulation beside it. "shade" weights six lightmaps for two lights.
-- "flip book": lightmaps baked from one side, on a billboard that turns with the camera; the coarse march and the first
-  network, of the turned view, are beside it.
+- "time against error": the fine ray march ("six ways") and the coarse one at several step sizes in voxels, the coarse
+  one also with lattice nodes that are nearer or farther apart than a step; and networks, timed from the guiding map to
+  the decoded lightmaps. The error of emission is over frames that glow. Times are means over all frames: on a GPU of
+  replayed graphs, and in another column of the calls that a user makes.
+- "frame": the stages of a frame, and the simulation. "shade" weights six lightmaps for two lights.
+- "flip book": lightmaps baked from one side, on a billboard that turns with the camera; for comparison the coarse march
+  and the first network, both computed for the turned camera.
 - "path tracing": all six lightmaps by Mitsuba at one bounce on the CPU, with and without a denoiser; only with the
   extra `bake`.
 - "profiles": the time of each profile's network, with random weights.
-- "density": the same frames and those a moment before them, with another density. The flicker is the mean change of
-  the lightmaps along the motion, in levels of 255, also over that of the reference, in which nothing flickers.
+- "density": the same frames, each with the frame a moment before, at other smoke densities. Flicker is the mean change
+  of the lightmaps between the two after motion compensation, in levels of 255, and its ratio to that of the reference.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -89,7 +89,7 @@ _DENOISED = "denoised"
 
 @dataclass(frozen=True)
 class NetworkSizes:
-    """Grids, steps and repeats."""
+    """Grid sizes, step sizes and numbers of repeats."""
 
     cells: int  # cells of the air along the edge of the box
     refine: int  # voxels along a cell's edge
@@ -149,12 +149,12 @@ QUICK = NetworkSizes(
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A pair of frames, a moment apart.
+    """Two successive frames of simulated smoke.
 
     Attributes:
-        earlier, later: The smoke.
-        motion: [2, H, W], as `Pool.motion`, from the bench's camera.
-        seed: Of the guiding map's jitter, one more for the later frame.
+        earlier, later: The smoke in the first and in the second frame.
+        motion: Motion between the frames in the camera's image, [2, H, W], as in `Pool.motion`.
+        seed: Seed of the jitter of the earlier frame's guiding map; the later frame has the next seed.
     """
 
     earlier: DensityVolume
@@ -164,24 +164,24 @@ class Frame:
 
     @property
     def smoke(self) -> tuple[DensityVolume, DensityVolume]:
-        """The earlier and the later frame."""
+        """The smoke of the earlier and of the later frame."""
         return self.earlier, self.later
 
     def scaled(self, factor: float) -> "Frame":
-        """Returns the pair with another density."""
+        """Returns the two frames with the smoke's extinction multiplied by a factor."""
         parts = (replace(part, extinction=part.extinction * factor) for part in self.smoke)
         return Frame(*parts, self.motion, self.seed)
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A network with the settings of its guiding maps.
+    """A network to measure, with the settings of its guiding maps.
 
     Attributes:
-        name: In tables.
-        model: On the CPU.
-        settings: Of the samples of its training.
-        trained: False where its weights are random and only its time is measured.
+        name: Name of the network, as the results table prints it.
+        model: The network, on the CPU.
+        settings: Settings with which its training samples were made.
+        trained: False if its weights are random; then only its time is measured.
     """
 
     name: str
@@ -191,7 +191,7 @@ class Subject:
 
 
 class NetworkBench(Bench):
-    """Sizes, networks, a camera, and held-out frames."""
+    """The benchmark of some networks, with one camera and held-out frames of smoke."""
 
     def __init__(
         self, device: str, sizes: NetworkSizes, subjects: Sequence[Subject], progress: Note | None = None
@@ -219,17 +219,17 @@ class NetworkBench(Bench):
         return make_camera(view, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
-        """Computes planes [8, H, W] by the finest march."""
+        """Computes the reference image planes [8, H, W] by the finest ray march; by default from the bench's camera."""
         return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:
-        """Times calls as graphs; on a CPU there is nothing to replay."""
+        """Times calls that are replayed as CUDA graphs. Returns nothing on a CPU."""
         if self.device == "cpu":
             return {}
         return self.time({key: self.replay(call) for key, call in calls.items()}, few=few)
 
     def _simulate(self) -> None:
-        """Takes frames of the first scene of each kind, drawn with the seed that is held out from model selection."""
+        """Simulates one random scene of each kind, from a seed not used in model selection; returns its frames."""
         kinds, frames, trouble = self.sizes.kinds, {}, None
         for index in range(_DRAWN):
             scene = draw_scene(self.settings, self.settings.test_seed, index, validation=True)
@@ -283,11 +283,11 @@ class NetworkBench(Bench):
 
 
 class Pipeline:
-    """All stages from smoke to lightmaps by a network: guiding map, network, and decoding of the planes.
+    """All stages from smoke to lightmaps by a network: guiding map, network, and decoding of its output planes.
 
     Attributes:
-        subject: The network.
-        decoder: The network as it is used.
+        subject: The network with its settings.
+        decoder: The network, ready to run on the device.
     """
 
     def __init__(self, bench: NetworkBench, subject: Subject, *, half: bool) -> None:
@@ -297,13 +297,13 @@ class Pipeline:
         self._bench = bench
 
     def planes(self, volume: DensityVolume, camera: Camera, seed: int) -> torch.Tensor:
-        """Predicts planes [8, H, W]; the result is a copy."""
+        """Predicts the image planes [8, H, W] of smoke seen by a camera; the result is a copy."""
         look = self.subject.settings.look(volume.shape, seed)
         with stream(self._bench.device):
             return self.decoder(render_guide(volume, camera, self.decoder.guide, look)).clone()
 
     def parts(self, frame: Frame) -> dict[str, Callable[[], object]]:
-        """Returns calls that make the guiding map, the planes and the lightmaps of a frame, one after the other."""
+        """Returns the three calls that make a frame's guiding map, its output planes and its lightmaps, by name."""
         look = self.subject.settings.look(frame.later.shape, frame.seed + 1)
         kind, hot = self.decoder.guide, frame.later.temperature is not None
         encoded = render_guide(frame.later, self.camera, kind, look)
@@ -324,7 +324,7 @@ class Pipeline:
 
 
 def score(predicted: Sequence[torch.Tensor], references: Sequence[torch.Tensor]) -> dict[str, float]:
-    """Scores planes [8, H, W]: the PSNR of images, each over its six lightmaps in sRGB, their mean, least and most."""
+    """Computes the PSNR of each image [8, H, W] over its six lightmaps in sRGB. Returns mean, minimum and maximum."""
     lightmaps = slice(len(DIRECTIONS))
     psnr = [
         psnr_from_mse(float((a[lightmaps].double() - b[lightmaps].double()).square().mean()), 1.0)
@@ -334,7 +334,7 @@ def score(predicted: Sequence[torch.Tensor], references: Sequence[torch.Tensor])
 
 
 def open_subjects(networks: Sequence[str | Path], profiles: Sequence[str]) -> list[Subject]:
-    """Reads networks, and makes untrained ones of profiles.
+    """Reads trained networks from files, and makes untrained networks from profiles.
 
     Raises:
         WlmError: A file or a profile can't be read, a file lacks the settings of its samples, or two have one name.
@@ -363,17 +363,17 @@ def run(
     device: str,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures networks and their rivals.
+    """Measures neural six-way lightmaps and their rivals.
 
     Args:
-        networks: Files of trained networks; none, and no profile either: the network of the package.
-        profiles: Names of profiles whose untrained networks are timed.
+        networks: Files of trained networks; if neither these nor profiles are given, the network that wlm ships.
+        profiles: Names of profiles; an untrained network of each is timed.
         quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
 
     Returns:
-        The rows, method by method.
+        The rows of each method, in the order in which the module's docstring lists them.
 
     Raises:
         WlmError: A file cannot be read, or the device does not exist or has not enough memory.
@@ -385,14 +385,14 @@ def run(
 def run_rows(
     sizes: NetworkSizes, subjects: Sequence[Subject], *, device: str, progress: Note | None = None
 ) -> list[Row]:
-    """Measures networks on grids of the given sizes; the rest as for `run`."""
+    """Measures networks on grids of the given sizes. Other arguments are as for `run`."""
     bench = NetworkBench(device, sizes, subjects, progress)
     parts = (error_rows, frame_rows, flipbook_rows, traced_rows, profile_rows, density_rows)
     return [row for part in parts for row in part(bench)]
 
 
 def error_rows(bench: NetworkBench) -> list[Row]:
-    """Measures time and error of marches by their steps, and of networks."""
+    """Measures time and error of ray marches at several step sizes, and of networks."""
     bench.note(_TABLE)
     marches = {f"six ways, step {step:g}": _six(step) for step in bench.sizes.six}
     steps_of = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
@@ -452,7 +452,7 @@ def plotted(rows: Sequence[Row]) -> list[Row]:
 
 
 def _plane_psnr(plane: int, predicted: Sequence[torch.Tensor], references: Sequence[torch.Tensor]) -> float:
-    """Returns the PSNR of one of the planes, over all frames."""
+    """Returns the PSNR of the image plane with index `plane`, over all frames."""
     squares = [float((a[plane] - b[plane]).square().mean()) for a, b in zip(predicted, references, strict=True)]
     return psnr_from_mse(sum(squares) / len(squares), 1.0)
 
@@ -493,7 +493,7 @@ def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
 
 
 def frame_rows(bench: NetworkBench) -> list[Row]:
-    """Measures the parts of a frame: guiding map, network and decoding of each network, shading, and the simulation."""
+    """Times the stages of a frame: simulation; guiding map, network and decoding for each network; and shading."""
     bench.note("frame")
     count, size = len(bench.frames), bench.sizes.resolution
     half = bench.device != "cpu"
@@ -532,7 +532,7 @@ def frame_rows(bench: NetworkBench) -> list[Row]:
 
 
 def profile_rows(bench: NetworkBench) -> list[Row]:
-    """Measures the time of the network of each profile."""
+    """Times the network of each profile, with random weights."""
     bench.note("profiles")
     size, cuda = bench.sizes.profile, bench.device != "cpu"
     settings = {name: Profile.load(name).network for name in profile_names(Profile.FILES)}
@@ -555,7 +555,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
 
 
 def density_rows(bench: NetworkBench) -> list[Row]:
-    """Scores the networks and the coarse march on thinner and denser smoke, with their flicker."""
+    """Measures error and flicker of the networks and of the coarse ray march on thinner and denser smoke."""
     bench.note("density")
     size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape).step
     rows = []
@@ -586,7 +586,7 @@ def density_rows(bench: NetworkBench) -> list[Row]:
 
 
 def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, settings: DatasetSettings) -> Pool:
-    """Makes samples of the frames, with guiding maps of some settings."""
+    """Makes evaluation samples: for each frame its guiding maps by the given settings, its motion and its target."""
     guides = []
     for frame in frames:
         shape = frame.later.shape
@@ -615,7 +615,7 @@ def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Call
 
 
 def flipbook_rows(bench: NetworkBench) -> list[Row]:
-    """Scores a flip book baked from the first camera, under cameras that turn away from it."""
+    """Measures the error of a flip book that was baked for one camera, seen by cameras turned away from it."""
     bench.note("flip book")
     frames = bench.frames[:: bench.sizes.frames]  # one of each scene
     baked = [bake(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
@@ -645,7 +645,7 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
 
 
 def traced_rows(bench: NetworkBench) -> list[Row]:
-    """Measures six lightmaps by Mitsuba on the CPU, with and without a denoiser; no rows without the extra `bake`."""
+    """Measures six-way lightmaps by Mitsuba on the CPU, raw and denoised; no rows without the extra `bake`."""
     if not has_tracer():
         bench.note("path tracing: left out, mitsuba is not installed: wlm[bake]")
         return []

@@ -1,23 +1,24 @@
-"""Light of all orders in smoke: each method and its rivals against path tracing, with the time of a whole picture.
+"""Multiple scattering ("all orders") in smoke: our method and its rivals against path tracing, with times per picture.
 
-The scenes, one at each albedo:
+The scenes, each with two albedos:
 
-- "plumes": unseen plumes and clouds from random sides, each under three directional lights of random colours.
-- "jet": a simulated jet past a sphere from some sides, two frames of each for the flicker.
+- "plumes": plumes and clouds that were not used in training, from random directions, each under three directional
+  lights of random colours.
+- "jet": a simulated jet past a sphere from several cameras, two frames from each to measure flicker.
 
 The options of method "all orders"; PSNR and FLIP of a picture are in sRGB, against path tracing with many samples:
 
-- "single scattering", and "single x gain", a factor on it;
+- "single scattering", and "single x gain", which multiplies it by one factor;
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
 - "fitted filter", a linear filter of planes blurred at four scales;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
 - "diffusion" on a grid of 32^3 and single scattering, which are the inputs of
-- "learned mix", the result of `wlm.smoke.transport.scatter`.
+- "learned mix", a weighted sum with learned weights, the result of `wlm.smoke.transport.scatter`.
 
 The gain and the weights of the fitted octaves and of the fitted filter are fitted to the references of the score
 itself: weights fitted to other smoke could not score higher. A reference is the mean of two pictures that are traced
-independently: "path tracing" is its noise, estimated from their difference. Flicker is the RMS change of a picture from
-one frame to the next where smoke is visible, after the earlier frame is warped by the motion of the smoke, and its
+independently; the row "path tracing" is its noise, estimated from their difference. Flicker is the RMS change from
+one frame to the next where smoke is visible, after the earlier picture is warped by the motion of the smoke, and its
 ratio to the change of the references, whose noise cancels in the product of the two.
 
 Method "gain by grid" has one row for each grid: plumes and clouds that the mix was not trained on, with extinctions
@@ -91,13 +92,13 @@ _BURNING, _GLOW = 20.0, 10.0  # extinction and emission of the fire
 
 @dataclass(frozen=True)
 class GridSizes:
-    """Grids, pictures and samples.
+    """Sizes of the grids and pictures of the method "gain by grid".
 
     Attributes:
-        grids: Voxels along an edge.
-        extinctions: Of density 1, over the box's edge.
-        pixels: H and W.
-        samples: Paths a pixel of a reference.
+        grids: Voxels along an edge of each grid.
+        extinctions: Optical depths of smoke of density 1 across the whole box.
+        pixels: Width and height of a picture in pixels.
+        samples: Paths for each pixel of a reference picture.
     """
 
     grids: tuple[int, ...]
@@ -108,18 +109,18 @@ class GridSizes:
 
 @dataclass(frozen=True)
 class OrdersSizes:
-    """Smoke, pictures and samples. The defaults are for a GPU.
+    """Sizes of the smoke and the pictures, and numbers of samples. The defaults are for a GPU.
 
     Attributes:
         plumes: Number of plumes.
         cells: Voxels along the edge of a plume as it is drawn; None: 40 to 64.
         voxels: Voxels along the edge to which a plume is resampled; None: it is not resampled.
-        pixels: H and W.
-        samples: Paths for each pixel of a reference.
-        scale: Cells of the scene `jet-sphere`, as a multiple of its own.
-        frames: Frames of the scene before the first that is scored.
-        sides: Number of cameras that see the scene.
-        repeats: Samples of a time.
+        pixels: Width and height of a picture in pixels.
+        samples: Paths for each pixel of a reference picture.
+        scale: Factor on the number of cells along an edge of the scene `jet-sphere`.
+        frames: Frames of the scene before the first measured frame.
+        sides: Number of cameras around the scene.
+        repeats: Number of samples of each measured time.
         single: Sizes of `grid_rows`.
         other: Arguments of `other_rows`, by name.
     """
@@ -156,14 +157,14 @@ QUICK = OrdersSizes(
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Smoke from one side under lights.
+    """Smoke seen by one camera under some lights.
 
     Attributes:
-        volume: Cold smoke.
-        camera: Orthographic.
-        lights: Directional, with their irradiance.
-        seed: Of paths.
-        motion: float32 tensor [2, H, W] that takes the shot before to this one; None: it is of other smoke.
+        volume: Smoke that does not glow.
+        camera: Orthographic camera.
+        lights: Directional lights with their irradiance.
+        seed: Seed of the random paths.
+        motion: Motion from the previous shot to this one, float32 tensor [2, H, W]; None if that shows other smoke.
     """
 
     volume: DensityVolume
@@ -176,11 +177,12 @@ class Shot:
 def run(
     *, quick: bool = False, device: str, sizes: OrdersSizes | None = None, progress: Note | None = None
 ) -> list[Row]:
-    """Measures light of all orders.
+    """Measures methods that compute multiple scattering in smoke. Returns the rows, in the order of the scenes.
 
     Args:
-        quick: Whether to take `QUICK`, for a minute or two on a CPU, in place of 400^3 voxels at 512^2, for a GPU.
-        device, sizes, progress, returns: As for `benchmarks.smoke.run`; the rows are in the order of the scenes.
+        quick: Whether to use the sizes `QUICK`, for a minute or two on a CPU, instead of 400^3 voxels at 512 x 512
+            pixels, for a GPU.
+        device, sizes, progress: As for `benchmarks.smoke.run`.
     """
     sizes = sizes or (QUICK if quick else OrdersSizes())
     bench = Bench("smoke", device, progress, clock="time_ms", repeats=sizes.repeats, few=2)
@@ -194,7 +196,7 @@ def run(
 
 
 def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
-    """Makes the rows of one scene at both albedos."""
+    """Measures all methods on the shots of one scene at both albedos; returns a row for each method and albedo."""
     found: dict[float, dict[str, list[torch.Tensor]]] = {albedo: {} for albedo in ALBEDOS}
     traced: list[tuple[dict[float, torch.Tensor], ...]] = []
     opacity = []
@@ -232,7 +234,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
 
 
 def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
-    """Returns functions that make a picture of a shot at an albedo, float32 [H, W, 3], without any fit."""
+    """Returns, by name, the methods without fitted weights: functions of shot and albedo to float32 [H, W, 3]."""
     ways = {
         "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
         "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
@@ -252,7 +254,7 @@ def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
 
 
 def _octaves_by_angle(shot: Shot) -> torch.Tensor:
-    """Multiplies the octaves of each light by powers of the cosine between light and camera, [O * 3, H, W, 3]."""
+    """Returns the pictures of all octaves, each times 3 powers of the light-camera cosine: [O * 3, H, W, 3]."""
     height, width = shot.camera.height, shot.camera.width
     parts = torch.zeros((_POWERS, len(FITTED), height, width, 3), device=shot.volume.device)
     for light in shot.lights:
@@ -264,7 +266,7 @@ def _octaves_by_angle(shot: Shot) -> torch.Tensor:
 
 
 def _filter_by_angle(shot: Shot) -> torch.Tensor:
-    """Multiplies the filter planes of each light by powers of the cosine to the camera, [P * 3, H, W, 3]."""
+    """Returns the P filter planes, each times 3 powers of the light-camera cosine, summed: [P * 3, H, W, 3]."""
     parts = 0.0
     for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
         cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
@@ -274,21 +276,23 @@ def _filter_by_angle(shot: Shot) -> torch.Tensor:
 
 
 def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
-    """Traces all light at each of `ALBEDOS`, [H, W, 3]."""
+    """Returns a path-traced picture [H, W, 3] for each albedo of `ALBEDOS`; `salt` varies the random seed."""
     seed = 2 * shot.seed + salt
     made = trace(shot.volume, shot.camera, shot.lights, samples=samples, orders=_KEPT, seed=seed)
     return {albedo: _at_albedo(made, albedo).sum((0, 1)) for albedo in ALBEDOS}
 
 
 def _at_albedo(made: Transport, albedo: float) -> torch.Tensor:
-    """Returns the planes at an albedo, below 1 without light that was scattered more than `_KEPT` times."""
+    """Returns the light of each order at an albedo. Below 1, light scattered over `_KEPT` times is left out."""
     powers = albedo ** torch.arange(_KEPT + 2, device=made.planes.device)
     powers[-1] *= albedo == 1.0
     return made.planes * powers[:, None, None, None]
 
 
 def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """Fits one mix of features [N, H, W, 3] to the truth by least squares as in sRGB; returns its pictures."""
+    """Fits N weights, the same for all pictures, of feature images [N, H, W, 3] to the true pictures [H, W, 3] by
+    least squares, with errors weighted about as in sRGB. Returns the weighted sum of each picture's features.
+    """
     left, right = 0.0, 0.0
     for parts, wanted in zip(features, truth, strict=True):
         weights = ((wanted.clamp(min=0.0) + FAINT) ** -_CURVE).flatten().double()
@@ -301,7 +305,7 @@ def _fitted(features: Sequence[torch.Tensor], truth: Sequence[torch.Tensor]) -> 
 
 
 def _times(bench: Bench, shot: Shot, sizes: OrdersSizes) -> dict[str, Timing]:
-    """Times one picture by each method; on CUDA as a graph, unless the method waits for the device."""
+    """Times one picture by each method, on CUDA as a replayed graph unless the method waits for the device."""
     ways, albedo = _ways(), ALBEDOS[0]
     calls = {way: lambda make=make: make(shot, albedo) for way, make in ways.items()}
     calls[_OCTAVES] = lambda: octaves(shot.volume, shot.camera, shot.lights)
@@ -333,7 +337,7 @@ def _flicker(
 ) -> dict[str, float]:
     """Computes the RMS change between consecutive shots in levels of 255, and its ratio to that of the references.
 
-    References that change by no more than their noise, whose product isn't above 0, have nothing to be compared with.
+    The ratio is left out if the references change by no more than their noise.
     """
     power, wanted, count = 0.0, 0.0, 0
     for n, shot in enumerate(shots):
@@ -357,7 +361,7 @@ def _flicker(
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
-    """Draws the colours of lights at random."""
+    """Returns lights from the given directions with random colours."""
     colours = random.dirichlet(np.ones(3), len(ways)) * 3.0 / len(ways) * _FOUR_PI
     return tuple(Light(tuple(way), tuple(map(float, colour))) for way, colour in zip(ways, colours, strict=True))
 
@@ -375,7 +379,7 @@ def _plume(sizes: OrdersSizes, number: int, device: str) -> Shot:
 
 
 def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
-    """Simulates a jet and returns two consecutive frames from each of some sides."""
+    """Simulates a jet and returns shots of two consecutive frames from each of several cameras."""
     bench.note("jet: simulates")
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     solver = make_solver(scene, device=bench.device)
@@ -400,12 +404,12 @@ def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
 
 
 def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) -> list[Row]:
-    """Makes the rows of "gain by grid".
+    """Returns the rows of the method "gain by grid", one for each grid.
 
     Args:
         bench: The benchmark.
-        sizes: Grids, pictures and samples.
-        model: The mix; None: the one that comes with wlm.
+        sizes: Sizes of the grids and pictures, and numbers of samples.
+        model: The model with the learned weights; None: the one that wlm ships.
     """
     model = (load_orders() if model is None else model).to(bench.device)
     rows = []
@@ -421,7 +425,7 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
 
 
 def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> Iterator[tuple[float, float]]:
-    """Yields the PSNR of diffusion and of the mix for each light at each albedo."""
+    """Yields, for each light at each albedo, the PSNR of diffusion and the PSNR of the learned mix."""
     for number, (density, extinction) in enumerate(_smoke(device, sizes, cells)):
         random = np.random.default_rng([cells, number])
         volume = DensityVolume(density, extinction, 1.0 / cells)
@@ -439,7 +443,7 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
 
 
 def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Tensor, float]]:
-    """Yields densities [X, Y, Z] and extinctions."""
+    """Yields pairs of a smoke density [X, Y, Z] and the extinction of density 1, for plumes and clouds."""
     for seed in _PLUMES:
         drawn = make_plume(min(cells, _DRAWN), seed=seed, hot=False).density.to(device)
         size = (cells,) * 3
@@ -451,13 +455,13 @@ def _smoke(device: str, sizes: GridSizes, cells: int) -> Iterator[tuple[torch.Te
 
 
 def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, cells: int = _CELLS) -> list[Row]:
-    """Makes the rows of "phase functions" and "light in smoke".
+    """Returns the rows of the methods "phase functions" and "light in smoke".
 
     Args:
         bench: The benchmark.
-        views: Views of each phase function.
-        samples: Paths a pixel of a reference.
-        cells: Voxels along an edge of smoke with light in it.
+        views: Number of pictures for each phase function.
+        samples: Paths for each pixel of a reference picture.
+        cells: Voxels along an edge of the smoke that contains a light.
     """
     rows = []
     settings = {"pixels": _PIXELS, "samples": samples}
@@ -478,7 +482,7 @@ def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, ce
 
 
 def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> tuple[float, float]:
-    """Returns the PSNR of a picture of a plume under three lights, and that of single scattering."""
+    """Returns the PSNR of the learned mix for a plume under three lights, and the PSNR of single scattering."""
     volume, camera, ways = draw_view(_SEED, number, pixels=_PIXELS, lights=3)
     volume = replace(volume, density=volume.density.to(device))
     lights = [Light(way.toward, (_FOUR_PI / 3,) * 3) for way in ways]
@@ -489,7 +493,7 @@ def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> t
 
 
 def _inside(device: str, samples: int, cells: int) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Yields the option of each case, and its pictures by tracing, by the mix and by single scattering, [H, W]."""
+    """Yields each case's name, and its pictures by path tracing, the learned mix and single scattering."""
     random = np.random.default_rng(_SEED)
     plume = make_plume(cells, seed=11, hot=False).density.to(device)
     for name, density in (("plume", plume), ("cloud", make_cloud(cells, device))):

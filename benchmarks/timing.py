@@ -1,8 +1,8 @@
 """Timing of calls on the CPU or on a CUDA device.
 
-A number here is the time of one call among many, back to back, after a warm-up that compiles kernels and fills
-caches. On CUDA that includes the launch wherever launching takes longer than the kernels; capture the
-call in a graph to leave it out.
+A measured time is that of one call among many calls back to back, after a warm-up that compiles kernels and fills
+caches. On CUDA it includes the time to launch kernels if launching takes longer than the kernels run; a call that is
+captured in a CUDA graph avoids that.
 """
 
 import contextlib
@@ -41,17 +41,17 @@ class Timing:
 def time_together(
     calls: Mapping[str, Callable[[], object]], device: str = "cpu", warmup: int = 5, repeats: int = 30
 ) -> dict[str, Timing]:
-    """Times peers in one run, in turns, so that a drifting clock or a busy neighbour slows all alike.
+    """Times several functions in turns, so that a drifting clock or other programs slow all of them alike.
 
-    Each round takes one sample of every peer, and each round starts with the next peer. On CUDA all of them
-    run on the stream of `wlm.interop.stream`, which the events are recorded on; a function that launches on another
-    stream must make the two streams wait for each other.
+    Each round takes one sample of every function, and each round starts with another function. On CUDA all functions
+    run on the stream of `wlm.interop.stream`, on which the timing events are recorded; a function that launches on
+    another stream must make the two streams wait for each other.
 
     Args:
         calls: Functions without arguments, by name; their results are dropped.
         device: "cpu" or "cuda:0".
-        warmup: Calls of each before the first that is timed, at least 1.
-        repeats: Samples of each, at least 1.
+        warmup: Number of calls of each function before its first timed call, at least 1.
+        repeats: Number of samples of each function, at least 1.
 
     Returns:
         The distribution of the time of one call, by name.
@@ -80,7 +80,7 @@ _Sampler = Callable[[Callable[[], object], int], float]
 
 @contextlib.contextmanager
 def _clock(device: str) -> Iterator[_Sampler]:
-    """Provides a function `(fn, calls) -> milliseconds per call` for the device."""
+    """Yields a function that takes a function and a number of calls, and returns the milliseconds per call."""
     # Imported here so that reading results needs neither torch nor Warp.
     from wlm import interop
 

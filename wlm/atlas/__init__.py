@@ -1,4 +1,5 @@
-"""Lightmaps of a scene as a small colour texture, read through a lookup texture (lightmap-uv-clustering-cascade)."""
+"""Compresses a scene's lightmaps to a small texture that is read through a lookup texture
+(lightmap-uv-clustering-cascade)."""
 
 from wlm._facade import facade
 

@@ -40,12 +40,12 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
     Args:
         model: The model.
-        device: "cpu" or "cuda:N", where the reference is decoded.
+        device: "cpu" or "cuda:N", where the lightmap for comparison is decoded.
 
     Returns:
-        A bundle with the textures `colour` and, where the model has them, `lut`, `blocks`, and with shared
-        tiles `sheets` and `factors`; the file `mesh.glb`; and the reference `lightmap`, float32 [H, W, 3], the first
-        sheet's in the first state.
+        A bundle with the texture `colour`; the textures `lut` and `blocks` where the model has them; the textures
+        `sheets` and `factors` for shared tiles; the file `mesh.glb`; and, to compare with, the decoded `lightmap` of
+        the first sheet in the first state, float32 [H, W, 3].
 
     Raises:
         WlmError: A texture has more texels along a side than GPUs take, there is no such device, or the stored
@@ -81,7 +81,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_texels(model: AtlasModel) -> np.ndarray:
-    """Makes the texture `sheets`, uint16 [rows, 2, 4]: texels and first entry, x before y; tiles, smaller level, 0."""
+    """Makes the texture `sheets`, uint16 [rows, 2, 4]. A row's first texel has the width and height and the x and y of
+    its first entry in the lookup texture; the second has the tiles in x and y, the next smaller level's row, and 0."""
     table = model.table()
     texels = np.zeros((len(table), 2, 4), "<u2")
     texels[:, 0] = table[:, [1, 0, 3, 2]]
@@ -90,7 +91,7 @@ def sheet_texels(model: AtlasModel) -> np.ndarray:
 
 
 def _colour(model: AtlasModel, layered: bool) -> Texture:
-    """Makes T_p; with "mixed" its texture of single texels."""
+    """Makes the colour texture T_p; for the colour "mixed" it is the texture whose tiles are not stored as blocks."""
     layers = len(model.texels) if layered else 0
     format = TEXELS if model.colour == "mixed" else model.colour
     if format == "half":
@@ -103,14 +104,14 @@ def _colour(model: AtlasModel, layered: bool) -> Texture:
 
 
 def _texture(data: np.ndarray, format: str, texels: np.ndarray, layers: int) -> Texture:
-    """Makes a colour texture, with the decoded texels of its blocks."""
+    """Makes a colour texture from its stored data; block formats also get their decoded texels as an image."""
     rows, columns = texels.shape[1:3]
     image = (texels if layers else texels[0]).astype(np.float32) if format in ("bc6h", "astc") else None
     return Texture(data, _FORMATS[format], columns, rows, layers, image=image)
 
 
 def _lookup(model: AtlasModel) -> Texture:
-    """Makes T_c: integers for tiles, else coordinates."""
+    """Makes the lookup texture T_c: of integers if the model has tiles, of coordinates for the method "cascade"."""
     numbers = model.lut.shape[2]
     format = "R16G16B16A16_UINT" if numbers == 4 else "R16G16_UNORM" if model.method == "cascade" else "R16G16_UINT"
     return Texture.from_texels(np.ascontiguousarray(model.lut, "<u2"), format)

@@ -59,7 +59,7 @@ class _Object(Header):
 
 
 class _Header(Header):
-    """The settings of a file. Sizes are rows and columns; `sizes` are those of the lightmaps."""
+    """The settings of a file. All sizes are (rows, columns); `sizes` has the sizes of the lightmaps in texels."""
 
     name: Name
     method: Literal["tiles", "cascade", "plain", "shared"]
@@ -80,10 +80,11 @@ class _Header(Header):
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns the settings, parts and source of a model's file. Times are left out, so that one seed gives one file.
+    """Returns the settings, the parts and the source hash of a model's file, without times, so that one seed gives one
+    file.
 
     Raises:
-        ValueError: The model stores no triangles, or its UVs are not `snapped`.
+        ValueError: The model stores no triangles, or its UVs are not rounded to 16 bits.
     """
     stored = model.stored
     if stored is None:
@@ -127,7 +128,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def sizes(model: AtlasModel) -> tuple[int, int]:
-    """Returns the bytes of a model's file, and the part of them that triangles and masks take."""
+    """Returns two numbers of bytes: a model's file, and the triangles and masks in it."""
     settings, parts, source = encode(model)
     whole = sum(memoryview(part).nbytes for part in encode_artifact(model.SYSTEM, settings, parts, source))
     return whole, sum(parts[name].nbytes for name in _GEOMETRY)
@@ -243,7 +244,7 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
 
 
 def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Unpacks the masks of all sheets."""
+    """Unpacks the masks of all sheets, each bool [H, W]."""
     whole = np.unpackbits(bits).astype(bool)
     ends = np.cumsum([0, *(math.prod(size) for size in header.sizes)])
     masks = tuple(whole[a:b].reshape(size) for a, b, size in zip(ends, ends[1:], header.sizes, strict=False))
@@ -253,7 +254,7 @@ def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
-    """Reads the places of all sheets and levels; the bounds of the lookup texture are not checked here."""
+    """Reads where each sheet and level lies in the lookup texture, without checking that it lies inside the texture."""
     if header.method != "shared":
         (size,), (name,) = header.sizes, header.sheets
         grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)
@@ -279,7 +280,7 @@ def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
 
 
 def _check_tiles(model: AtlasModel) -> None:
-    """Checks that tiles lie within the textures, and sheets within the lookup texture.
+    """Checks that tiles lie within the colour textures, and sheets within the lookup texture.
 
     Raises:
         ValueError: A tile or sheet lies outside.

@@ -1,9 +1,9 @@
-"""The colour texture as stored: half floats, RGB9E5, or blocks that GPUs decode, BC6H or ASTC HDR 4x4.
+"""Formats of the stored colour texture: half floats, RGB9E5, and the block formats of GPUs, BC6H and ASTC HDR 4x4.
 
-RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which support
-them with four channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
-lightmap-uv-clustering-cascade, section 4.4, counts 6 for ASTC 4x4, which the format doesn't have; we count 8. ASTC
-needs the extra `atlas`.
+RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which support them with four
+channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel. For ASTC 4x4
+lightmap-uv-clustering-cascade, section 4.4, counts 6 bits per texel; the format takes 8, and so does our count. ASTC
+needs the optional packages of the extra `atlas`.
 
 Half floats represent the decoded texels of every format exactly.
 """
@@ -39,8 +39,8 @@ def quantise(
     weight: np.ndarray | torch.Tensor | None = None,
     device: str = "cpu",
 ) -> dict[str, np.ndarray]:
-    """Encodes T_p, [H, W, 3] on any device, as it is stored: `texels` and, for a block format, `blocks` of
-    `AtlasModel`. BC6H uses the weights [H, W] of the texels' squared errors.
+    """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
+    `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
 
     Raises:
         WlmError: A package is missing; the line names the extra.
@@ -55,8 +55,8 @@ def quantise(
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
-    """Computes the samples that tiles decode to after they are stored, float32 [T, ny, nx, 3], not negative; for blocks
-    ny and nx are multiples of 4. Half floats round by too little to matter.
+    """Returns the samples of T tiles as they decode after they are stored, float32 [T, ny, nx, 3], at least 0; for
+    block formats ny and nx are multiples of 4. Rounding to half floats is too small to matter and left out.
 
     Raises:
         WlmError: A package is missing; the line names the extra.
@@ -75,7 +75,7 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
 
 
 def _rounded(samples: torch.Tensor) -> torch.Tensor:
-    """Rounds samples to RGB9E5, as `wlm.formats.shared_exponent` does, for tensors."""
+    """Rounds samples in a tensor to RGB9E5, as `wlm.formats.shared_exponent` does for arrays."""
     samples = samples.clamp(0.0, LARGEST)
     largest = samples.amax(-1, keepdim=True)
     # The exponent of a number from 1/2 to 1 times a power of two.
@@ -86,14 +86,14 @@ def _rounded(samples: torch.Tensor) -> torch.Tensor:
 
 
 def _by_block(texels: torch.Tensor) -> torch.Tensor:
-    """Cuts tiles [T, ny, nx, C] into blocks [N, 16, C], tile by tile and row by row."""
+    """Cuts tiles [T, ny, nx, C] into blocks of 4x4 texels [N, 16, C], tile by tile and row by row."""
     count, ny, nx, channels = texels.shape
     cells = texels.reshape(count, ny // BLOCK_SIDE, BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, channels)
     return cells.transpose(2, 3).reshape(-1, BLOCK_SIDE * BLOCK_SIDE, channels)
 
 
 def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tensor:
-    """Inverts `_by_block`: makes tiles [T, ny, nx, 3] from blocks [N, 16, 3]."""
+    """Joins blocks of 4x4 texels [N, 16, 3] to tiles [T, ny, nx, 3], the inverse of `_by_block`."""
     cells = texels.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
     return cells.transpose(2, 3).reshape(count, ny, nx, 3)
 
@@ -104,8 +104,8 @@ def encode(
     weight: np.ndarray | torch.Tensor | None = None,
     device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Encodes a texture, [H, W, 3] linear on any device, as "bc6h" or "astc"; clamped to [0, 65504], infinities too.
-    Where H or W is no multiple of 4 the last row or column is repeated.
+    """Encodes a linear texture, [H, W, 3] on any device, as "bc6h" or "astc". Values, also infinite ones, are clamped
+    to [0, 65504]. If H or W is no multiple of 4, the last row or column is repeated.
 
     Returns blocks, uint8 [B, 16], row by row; and their decoded texels, float32 [H, W, 3].
 
@@ -135,7 +135,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     """Decodes a texture of blocks, uint8 [B, 16], to float32 [height, width, 3], finite, in [0, 65504].
 
     Raises:
-        ValueError: There is another number of blocks than the size needs.
+        ValueError: The number of blocks does not fit height and width.
         WlmError: A block isn't one of the format; or a package is missing, and the line names the extra.
     """
     rows, columns = block_grid(height, width)
@@ -156,7 +156,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
-    """Makes a tensor on the device; an array, which may have negative strides or be read-only, is copied."""
+    """Copies an array or tensor to a tensor on the device; an array may have negative strides or be read-only."""
     return (
         values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
     )

@@ -1,7 +1,7 @@
-"""Texels of a lightmap that a mesh's UV triangles touch or cover, exactly and in bounded memory.
+"""Finds the texels of a lightmap that a mesh's UV triangles touch or cover, exactly and in bounded memory.
 
-Texel (row, column) is the square [column, column + 1] x [row, row + 1] of UVs times (W, H), its centre in the
-middle. Each triangle is cut into the rows of texels that it meets; a row of it is a span of texels.
+Texel (row, column) is the square [column, column + 1] x [row, row + 1] of UVs times (W, H), its centre in the middle.
+Each triangle is cut into the rows of texels that it meets, with one span of texels per row.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Finds the texels whose square intersects some triangle's inside, bool [height, width]. UVs are float64 [V, 2] in
-    [0, 1]; each triangle has an area. One that ends exactly at a texel's side doesn't touch the texel."""
+    [0, 1]; each triangle has an area. A triangle that ends exactly at a texel's side doesn't touch that texel."""
     change = np.zeros((height, width + 1), np.int32)
     for corner, row in _rows(uv, triangle, height, width, centres=False):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -37,12 +37,12 @@ def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Counts for every texel the triangles that contain its centre, int32 [height, width]. A centre on an edge that two
-    triangles share is in exactly one of them."""
+    triangles share counts for exactly one of them."""
     return covered_on(uv, triangle, height, width, "cpu").numpy()
 
 
 def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str) -> torch.Tensor:
-    """Computes `covered_texels` on a device: the host finds the ends of spans, and the device fills them."""
+    """Computes the same as `covered_texels` on a device: the CPU finds the ends of spans, and the device fills them."""
     change = torch.zeros((height, width + 1), dtype=torch.int32, device=device)
     flat = change.view(-1)
     for row, first, stop in _centre_spans(uv, triangle, height, width):
@@ -55,7 +55,8 @@ def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, de
 def _centre_spans(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields rows and their spans of texels, first <= column < stop, with centres in a triangle; int64 [N] each."""
+    """Yields rows and their spans, int64 [N] each: the texels first <= column < stop have their centre in a
+    triangle."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -73,7 +74,7 @@ def _centre_spans(
 def _rows(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int, centres: bool
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields triangles' corners [N, 3, 2] in texels and rows [N] that they may meet, a bounded number at a time."""
+    """Yields, in pieces of bounded size, triangles' corners [N, 3, 2] in texels and the rows [N] that they may meet."""
     texel = uv * (width, height)
     v = texel[:, 1][triangle]  # [F, 3]
     if centres:
@@ -93,20 +94,20 @@ def _rows(
 
 
 def _directed(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Puts each edge's upper end (or left end, if horizontal) first, so that both its triangles compute alike."""
+    """Orders each edge's ends, upper end (or left end) first, so that both triangles of an edge get equal results."""
     swap = (a[:, 1] > b[:, 1]) | ((a[:, 1] == b[:, 1]) & (a[:, 0] > b[:, 0]))
     return np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Computes the edges' x at height y: the start's x for a horizontal edge, and never beyond the ends."""
+    """Returns the x at which edges cross height y, never beyond their ends; the start's x for a horizontal edge."""
     drop = end[:, 1] - start[:, 1]
     share = np.divide(y - start[:, 1], drop, out=np.zeros_like(drop), where=drop > 0).clip(0.0, 1.0)
     return start[:, 0] + share * (end[:, 0] - start[:, 0])
 
 
 def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
-    """Adds 1 to the texels first <= column < stop of each row, as differences along the row."""
+    """Adds spans first <= column < stop to `change`, the differences of counts along a row: +1 at first, -1 at stop."""
     flat, stride = change.reshape(-1), change.shape[1]
     np.add.at(flat, row * stride + first, 1)
     np.subtract.at(flat, row * stride + stop, 1)

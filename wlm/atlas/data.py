@@ -1,13 +1,12 @@
-"""Input: triangles with lightmap UVs and their lightmaps, read from files or arrays, checked and repaired.
+"""Reads triangles with lightmap UVs and their lightmaps from files or arrays, and checks and repairs them.
 
 A scene has sheets. A sheet is one layout of charts with a lightmap for each state (an hour, a directional layer, a
-shadow mask); the triangles of one object or of many read it. One mesh with one lightmap is a scene of one sheet and one
-state.
+shadow mask); it lights one or more objects. One mesh with one lightmap is a scene of one sheet and one state.
 
 Input that contradicts itself is refused with one line; a flaw that can be repaired is repaired, with one line of
 `warnings` for each kind and its count. Both are listed in docs/atlas.md, "Hard cases". Texels outside of charts are
-replaced by the nearest texel in a chart. Without a mask it is derived: texels whose centre is in a triangle, and those
-that a triangle touches at all unless they are 0 in every state, as texels that were never baked are.
+replaced by the nearest texel in a chart. If no mask is given, it has the texels whose centre is in a triangle and the
+texels that a triangle touches, except those that are 0 in every state, since they were probably never baked.
 
 The method's inputs: lightmap-uv-clustering-cascade, section 3 (mesh, UVs and an HDR lightmap).
 """
@@ -40,7 +39,7 @@ _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warn
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The number of one primitive's first vertex and first triangle in a sheet."""
+    """The numbers of the first vertex and the first triangle of a glTF primitive in a sheet."""
 
     primitive: GltfPrimitive
     vertex: int
@@ -49,13 +48,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Placed:
-    """A node that reads a sheet.
+    """A node that is lit by a sheet.
 
     Attributes:
-        node: Its number in the document.
-        label: Its name.
+        node: The node's number in the document.
+        label: The node's name.
         sheet: Number of the sheet.
-        scale_offset: Its rectangle in the sheet, v down: UV times the first two numbers, plus the last two.
+        scale_offset: The node's rectangle in the sheet, v down: UV times the first two numbers, plus the last two.
     """
 
     node: int
@@ -66,7 +65,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A layout of charts, the triangles that read it, and its lightmaps.
+    """A layout of charts, the triangles that are lit by it, and its lightmaps.
 
     Attributes:
         name: Its name, for messages.
@@ -104,8 +103,9 @@ class Triangles:
     Attributes:
         position: float64 [V, 3].
         triangle: int32 [F, 3].
-        uv: float64 [V, 2]; 0 without a lightmap.
-        sheet: int32 [F], the sheet that each triangle reads; -1 for those that only hide what is behind them.
+        uv: float64 [V, 2]; 0 for triangles without a lightmap.
+        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide
+            others.
     """
 
     position: np.ndarray
@@ -122,11 +122,11 @@ class LightmappedScene:
         name: Its name, for messages.
         states: Names of the M states.
         sheets: At least one.
-        objects: The nodes that read the sheets.
+        objects: The nodes that are lit by the sheets.
         blocker: float64 [B, 3, 3], triangles without a lightmap that hide what is behind them.
-        uv_set: n of the `TEXCOORD_n` that was read; 0 where the input is no glTF.
-        metres: Whether the unit is known to be the metre, as it is in glTF.
-        source: 16 hexadecimal digits of BLAKE2b over all sheets.
+        uv_set: n of the glTF attribute `TEXCOORD_n` that was read; 0 if the input is no glTF.
+        metres: Whether positions are known to be in metres, as in glTF.
+        source: Hash of all sheets, 16 hexadecimal digits of BLAKE2b.
         document: The file that the scene came from, or one made for it.
     """
 
@@ -142,17 +142,17 @@ class LightmappedScene:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings of all sheets, each once."""
+        """The warnings of all sheets, without repeats."""
         return tuple(dict.fromkeys(line for sheet in self.sheets for line in sheet.warnings))
 
     @property
     def texels(self) -> int:
-        """Number of texels of all lightmaps, over all sheets and states."""
+        """The number of texels of all lightmaps, over all sheets and states."""
         return max(len(self.states), 1) * sum(sheet.mask.size for sheet in self.sheets)
 
     @cached_property
     def triangles(self) -> Triangles:
-        """Joins all triangles of the scene."""
+        """Returns all triangles of the scene in one mesh."""
         first = np.cumsum([0, *(len(sheet.position) for sheet in self.sheets)])
         owner = [np.where(sheet.active, number, -1) for number, sheet in enumerate(self.sheets)]
         corners = self.blocker.reshape(-1, 3)
@@ -167,7 +167,7 @@ class LightmappedScene:
 
     @cached_property
     def indoors(self) -> Indoors:
-        """Finds the places where cameras inside the scene can be, see `wlm.ops.indoors`."""
+        """Finds the places inside the scene where a camera can stand, see `wlm.ops.indoors`."""
         return indoors(self.triangles.position, self.triangles.triangle, metres=self.metres)
 
 
@@ -193,12 +193,10 @@ def load(
             0. None derives it from the triangles.
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes that of the list, else 1, where engines and viewers
             look for them, if any primitive has it, else 0. Formats other than glTF have only 0.
-        node: With one lightmap, the node that it belongs to, by its name, its mesh's name or its number.
-        encoding: With one lightmap, the meaning of a PNG's bytes, one of `wlm.formats.channels.ENCODINGS`; None: the
-            file is no PNG.
-        flip: With one lightmap, whether its top row is v = 1 of glTF.
-        trust: Whether files may name files outside their folder, and draw more than their bytes account for
-            (`wlm.formats.limits`).
+        node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
+        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None: no PNG.
+        flip: If there is one lightmap, whether its top row is at v = 1 of glTF.
+        trust: Whether files may name files outside their folder, and expand to huge data (`wlm.formats.limits`).
 
     Raises:
         WlmError: One line that names the file and the field: the input contradicts itself, or a file is missing or
@@ -212,7 +210,7 @@ def load(
     else:
         for name, value in {"mask": mask_path, "node": node, "encoding": encoding, "flip": flip or None}.items():
             if value is not None:
-                raise WlmError(f"{name}: expected with one lightmap alone; a list of lightmaps states it")
+                raise WlmError(f"{name}: only allowed with a single lightmap; a list of lightmaps states it")
         listing = _listed(path, document, lights_path)
     if node is not None:
         primitives = named(str(path), primitives, node)
@@ -253,7 +251,7 @@ def from_arrays(
     *,
     metres: bool = False,
 ) -> LightmappedScene:
-    """Makes a scene of one sheet of arrays, under the same rules as `load`.
+    """Makes a scene of one sheet from arrays, with the same checks and repairs as `load`.
 
     Args:
         position: [V, 3] of numbers, in any unit; rounded to float32, as in files.
@@ -293,8 +291,7 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
     """Joins several scenes into one that has all their sheets.
 
     Args:
-        scenes: At least one, in the same space and with equally many states; the states' names are taken from the
-            first.
+        scenes: At least one, in the same space and with equally many states. The first names the states.
         name: The name of the new scene.
 
     Raises:
@@ -322,8 +319,8 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
 def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
-    """Makes the sheets of a model, without lightmaps, from the triangles in its file; also returns the triangles of all
-    other nodes, float64 [B, 3, 3].
+    """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the triangles of all
+    nodes that read no sheet, float64 [B, 3, 3].
 
     Raises:
         WlmError: A sheet has no triangle, or the triangles can't be read.
@@ -350,7 +347,7 @@ def place_objects(
 
 
 def _read_triangles(path: Path, trust: bool) -> tuple[GltfDocument, list[GltfPrimitive], bool]:
-    """Reads a mesh file: its document, its primitives, and whether its unit is the metre."""
+    """Reads a mesh file. Returns its document, its primitives, and whether its unit is the metre."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         document, primitives = read_gltf(path, trust)
@@ -370,7 +367,7 @@ def _read_triangles(path: Path, trust: bool) -> tuple[GltfDocument, list[GltfPri
 
 
 def _compact(where: str, name: str, position: np.ndarray, triangle: np.ndarray, uv: np.ndarray) -> Arrays:
-    """Checks arrays' shapes and ranges, and leaves out vertices that no triangle uses."""
+    """Checks the shapes and ranges of arrays, and returns them without the vertices that no triangle uses."""
     for field, array, kinds in (("position", position, "iuf"), ("triangle", triangle, "iu"), ("uv", uv, "iuf")):
         width = 2 if field == "uv" else 3
         if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
@@ -401,7 +398,7 @@ def _listed(path: Path, document: GltfDocument, lights_path: str | os.PathLike[s
 def _select(
     where: str, primitives: list[GltfPrimitive], uv_set: int | None
 ) -> tuple[list[GltfPrimitive], int, list[str]]:
-    """Selects the UV set and the primitives that have it; returns a warning if some lack it."""
+    """Selects the UV set and the primitives that have it. Also returns a warning if some primitives lack it."""
     sets = sorted({number for each in primitives for number in each.uv})
     if not sets:
         raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
@@ -422,7 +419,7 @@ def _select(
 
 
 def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[tuple[GltfPrimitive, Placed]]:
-    """Finds the primitives that the objects of a list name, and their places."""
+    """Finds the primitives that the objects of a list name, and their rectangles in the sheets."""
     pairs = []
     for each in listing.objects or ():
         for primitive in named(where, readers, each.node):
@@ -435,7 +432,7 @@ def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[
 
 
 def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitive:
-    """Transforms the UVs of a primitive to those of the sheet."""
+    """Transforms the UVs of a primitive into its rectangle in the sheet."""
     sx, sy, x, y = place.scale_offset
     if (sx, sy, x, y) == (1.0, 1.0, 0.0, 0.0):
         return primitive
@@ -446,7 +443,7 @@ def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitiv
 def _read_lightmaps(
     listing: Listing, files: SheetFiles, trust: bool
 ) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask if any; also returns the names of these files."""
+    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files."""
     lightmaps: list[np.ndarray] = []
     names = [str(listing.file(name, trust)) for name in files.files]
     for path in names:
@@ -475,8 +472,8 @@ def _checked(
     names: Sequence[str],
     warnings: Sequence[str] = (),
 ) -> Sheet:
-    """Checks and repairs the triangles and lightmaps [M, H, W, 3] of a sheet. With M = 0 the mask is required, and no
-    light is checked. `names` are the files of the lightmaps and of the mask, for messages."""
+    """Checks and repairs the triangles and lightmaps [M, H, W, 3] of a sheet. If there are no lightmaps (M = 0), the
+    mask is required. `names` are the files of the lightmaps and the mask, for messages."""
     warnings, parts, vertices, triangles = list(warnings), [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)
@@ -517,7 +514,7 @@ def _checked_light(
     mask: np.ndarray | None,
     names: Sequence[str],
 ) -> tuple[np.ndarray, list[str]]:
-    """Derives or checks the mask and repairs the lightmaps in place; returns the mask and the warnings."""
+    """Makes or checks the mask and repairs the lightmaps in place. Returns the mask and the warnings."""
     warnings = []
     height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):
@@ -570,7 +567,7 @@ def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:
 
 
 def _has_area(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Tests whether each triangle of points [V, 2 or 3] has an area, whatever its size: bool [F]."""
+    """Tests which triangles of points [V, 2 or 3] have an area above 0, however small: bool [F]."""
     a, b, c = (point[triangle[:, k]] for k in range(3))
     ab, ac = b - a, c - a
     longest = np.sqrt(np.maximum.reduce([(edge * edge).sum(axis=1) for edge in (ab, ac, c - b)]))
@@ -589,7 +586,7 @@ def _count(number: int, singular: str, plural: str | None = None) -> str:
 
 
 def _hash(sheets: Sequence[Sheet]) -> str:
-    """Hashes the input to 16 hexadecimal digits, the same on every machine."""
+    """Hashes the sheets to 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     for sheet in sheets:
         for array in (sheet.position, sheet.triangle, sheet.uv, sheet.lightmaps, sheet.mask):

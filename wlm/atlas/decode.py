@@ -16,7 +16,7 @@ _TEXELS_AT_ONCE = 1 << 24
 
 
 class Decoder:
-    """A model on a device. It is a `wlm.atlas.evaluation.Sampler`.
+    """A model on a device that returns light at points. It is a `wlm.atlas.evaluation.Sampler`.
 
     Attributes:
         model: The model.
@@ -51,7 +51,7 @@ class Decoder:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """Computes the factors of a state for shared tiles, float32 [C, 3], interpolated between two states (0.5).
+        """Returns the factors of shared tiles in a state, float32 [C, 3]; a state such as 0.5 is interpolated.
 
         Raises:
             ValueError: The state is below 0 or above the last.
@@ -70,17 +70,16 @@ class Decoder:
         state: float = 0.0,
         lod: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Reads light at coordinates, as a shader does.
+        """Returns light at UVs, as a shader reads it.
 
         Args:
-            uv: float32 [N, 2] on the decoder's device: the model's new UVs where it has any, else the sheets'.
-            sheet: int [N], or one number for all points, 0 to S - 1.
-            state: 0 to M - 1, or between two states.
-            lod: float32 [N], base-2 logarithm of lightmap texels per pixel, for a model with mips; None: full
-                resolution.
+            uv: float32 [N, 2] on the decoder's device: the model's new UVs if it has any, else the UVs of the sheets.
+            sheet: The sheet's number from 0, int [N], or one for all points.
+            state: 0 to the number of states - 1; fractions lie between two states.
+            lod: float32 [N], base-2 logarithm of texels per pixel, for a model with mips; None: full resolution.
 
         Returns:
-            float32 [N, 3].
+            float32 [N, 3], light.
 
         Raises:
             ValueError: No such state, or the model has no mips.
@@ -98,8 +97,8 @@ class Decoder:
         return out
 
     def run(self, uv: wp.array, out: torch.Tensor) -> None:
-        """Reads light of a model with one lightmap at vec2 [N], N at least 1, into float32 [N, 3]; on CUDA the work is
-        queued, not awaited."""
+        """Writes light at N UVs, vec2 [N], to `out`, float32 [N, 3], for a model with one lightmap; N is at least 1. On
+        CUDA the work is queued, not awaited."""
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
@@ -109,7 +108,7 @@ class Decoder:
             cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
-        """Reads light at points of the scene, float32 [N, 3]."""
+        """Returns light at points of the scene, float32 [N, 3]."""
         uv = points.uv
         if len(self._corner):
             uv = (self._corner[points.triangle] * points.weight[:, :, None]).sum(1)
@@ -118,7 +117,8 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Reads light of shared or separate tiles."""
+        """Returns light, float32 [N, 3], from tiles that all lightmaps share or from separate tiles for each
+        lightmap."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -134,7 +134,7 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Reads light of rows of the table of sheets, with a state's factors."""
+        """Returns light, float32 [N, 3], for rows of the table of sheets, given the factors of a state."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()
@@ -148,7 +148,7 @@ class Decoder:
         return out
 
     def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
-        """Interpolates light between two levels of each row; level 0 is the row itself."""
+        """Returns light interpolated between two mip levels of each row of the table; level 0 is full resolution."""
         smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
         near, far = row, torch.where(smaller[row] > 0, smaller[row], row)
         for number in range(1, 1 + len(self.model.levels)):
@@ -162,11 +162,10 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the texels of a sheet's mask, with the values of `lightmap`: float32 [K, 3], row by row, on the
-        decoder's device.
+        """Decodes the K texels of a sheet's mask as `lightmap` does: float32 [K, 3] on the device, row by row.
 
         Raises:
-            WlmError: The sheet has another size than the model's.
+            WlmError: The sheet's size differs from that in the model.
         """
         height, width = sheet.mask.shape
         if (height, width) != self.model.sheets[number].size:
@@ -185,12 +184,12 @@ class Decoder:
         """Decodes a lightmap in its original layout.
 
         Args:
-            sheet: 0 to S - 1.
+            sheet: The sheet's number, from 0.
             state: As for `read`.
 
         Returns:
-            float32 [H, W, 3], zero outside of the mask. Where the mesh has new UVs, a texel of the mask whose centre is
-            in no triangle has the value of the nearest texel whose centre is.
+            float32 [H, W, 3], zero outside of the mask. If the mesh has new UVs, a texel of the mask whose centre is in
+            no triangle has the value of the nearest texel whose centre is in one.
         """
         own = self.model.scene.sheets[sheet]
         result = np.zeros((*own.mask.shape, 3), np.float32)

@@ -1,20 +1,19 @@
-"""Error of decoded lightmaps in views of the scene (lightmap-uv-clustering-cascade, section 4.1.4).
+"""Measures the error of decoded lightmaps in views of the scene (lightmap-uv-clustering-cascade, section 4.1.4).
 
 The scene is rendered from cameras around it (`wlm.ops.views`) and, where viewers can stand in it, from as many cameras
 inside it (`wlm.ops.indoors`). A pixel is the lightmap's linear RGB at its surface point, without any shading. The
 reference is the original lightmap read bilinearly, clamped, its gaps filled from the nearest texel of a chart. Only
-covered pixels count; a view without any is left out. A view is scored in every state, and figures are means over states
-and views.
+covered pixels count; a view without any is left out. Results are means over all states and views.
 
-The peak of every PSNR and the range of SSIM are one number for each state: maximum less minimum of the reference's
-covered pixels of all views. (The paper doesn't name its peak; one per view would change with the cameras.) A maximum
-above twice the 99.9th percentile counts as that: one bright texel must not make every error small.
+The peak of every PSNR and the range of SSIM are one number for each state: the maximum minus the minimum of the
+reference over the covered pixels of all views. (The paper doesn't name its peak; one per view would change with the
+cameras.) The maximum is limited to twice the 99.9th percentile, since one bright texel must not make every error small.
 
-Errors are also measured as displayed on a screen: light is exposed so that nearly all of the original's charts are
-below white, `wlm.texels.exposure`, and coded as sRGB, clipped to [0, 1]. The peak of that PSNR is 1.
+Errors are also measured as displayed on a screen: light is exposed so that nearly all texels of the original's charts
+are below white (`wlm.texels.exposure`), clipped to [0, 1] and encoded as sRGB. The peak of this PSNR is 1.
 
-A figure without a meaning is NaN, null in JSON: PSNR and SSIM where the reference is one grey, to within a millionth,
-or nothing is covered, and seams where no border is in any view. An exact decoder has a PSNR of 120 dB (`PSNR_CAP_DB`).
+A result without a meaning is NaN, null in JSON: PSNR and SSIM if the reference has a single value, to within a
+millionth, or nothing is covered; and seams if no view shows a border. An exact decoder has 120 dB (`PSNR_CAP_DB`).
 """
 
 import math
@@ -76,32 +75,31 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Score(system.Report):
-    """The error of a decoder.
+    """The error of a decoder, measured in views of the scene.
 
     Attributes:
         name: The scene's name.
         views: Number of views that show a sheet.
-        pixels: Covered pixels in all of them.
-        peak: Range of the reference there, used for PSNR and SSIM (see the module); mean over the states.
-        peaks: The same, by state.
-        brightest: Maximum of the reference there, in any state.
+        pixels: Number of covered pixels in all views.
+        peak: Range of the reference in the covered pixels, for PSNR and SSIM; mean over the states.
+        peaks: The range for each state.
+        brightest: Maximum of the reference in the covered pixels, in any state.
         psnr: dB, the mean over states and views.
         psnr_by_state: dB, means over the views.
-        around_psnr, inside_psnr: The same as `psnr` for the views from around the scene and for those from inside.
+        around_psnr, inside_psnr: The same as `psnr`, for cameras around the scene and for cameras inside.
         inside_views: Number of views from inside that show a sheet.
-        eye_height: Height of the cameras inside the scene above the ground, in the scene's unit; NaN where there are
-            none.
+        eye_height: Height of the cameras inside the scene above the ground, in the scene's unit; NaN if there are none.
         psnr_worst: dB, of the worst view and state.
-        worst_view: Its number among the cameras; -1: no view, or no peak.
-        one_minus_ssim: 1 less the mean SSIM of each view's covered pixels, averaged over views and states: a Gaussian
-            window of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. Uncovered pixels of
-            both pictures have the reference's nearest covered value.
+        worst_view: Number of the camera of that worst view; -1 if there is no view or no peak.
+        one_minus_ssim: 1 minus the mean SSIM of each view's covered pixels, averaged over views and states. The window
+            is a Gaussian of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. In both
+            pictures, uncovered pixels take the reference's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
         rest_error: Mean absolute error of all other pixels.
         seam_ratio: `seam_error` over `rest_error`: 1 where seams are no worse than other pixels.
         texel_psnr: dB, over the texels that are in a mask and have their centre in a triangle; mean over the states.
         tone_psnr: dB, the mean over views and states of the PSNR as displayed on a screen.
-        flip: Mean FLIP of some of the views as displayed on a screen, 0 to 1.
+        flip: Mean FLIP error, 0 to 1, of a subset of the views as displayed on a screen.
     """
 
     name: str
@@ -134,9 +132,9 @@ class Report(Score):
     Attributes:
         method: The model's method.
         profile: Name of its settings.
-        bytes: Size of its file.
-        geometry_bytes: Size of the triangles and masks in the file.
-        gpu_bytes: Size of its textures and tables on a GPU.
+        bytes: Size of the model's file in bytes.
+        geometry_bytes: Bytes of the triangles and masks in the file.
+        gpu_bytes: Bytes of the model's textures and tables on a GPU.
         cr: Compression ratio of the textures (eq. 9).
     """
 
@@ -157,9 +155,9 @@ def evaluate(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Report:
-    """Compares a model with the original lightmaps of the scene, with options as for `compare`.
+    """Compares a model with the original lightmaps of the scene; options are those of `compare`.
 
-    Seams are the borders of the new UVs' charts, or of the lightmaps' where the mesh keeps its UVs.
+    Errors at seams are taken along the borders of charts: of the new UVs, or of the old UVs if the mesh keeps them.
 
     Raises:
         WlmError: There is no such device, or the model was made from another scene.
@@ -198,14 +196,15 @@ def compare(
 
     Args:
         scene: The scene with its original lightmaps.
-        decoders: By name; see `Sampler`.
-        views: Number of cameras, spread evenly on the sphere, and of views from inside; or the cameras. None: `VIEWS`,
-            or `SHARED_VIEWS` for several lightmaps.
+        decoders: The decoders, by names that the result uses; see `Sampler`.
+        views: Number of cameras spread evenly around the scene, and of as many inside; or the cameras themselves. None:
+            `VIEWS`, or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For some decoders, numbers of their charts or tiles: their seams are where these change. Seams of the
-            others are the borders of the lightmaps' charts. An outline in front of another surface is no border.
-        progress: Called with the views done.
+        labels: Functions that number charts or tiles, by names of decoders: seams lie where the number changes. For
+            other decoders, seams are the borders of the lightmaps' charts. Outlines in front of other surfaces are no
+            seams.
+        progress: Called with the number of views done.
 
     Returns:
         The scores by name.
@@ -259,7 +258,8 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes the labels for `compare` from the charts of a model's own UVs; the points will be on the device."""
+    """Makes a function for `labels` of `compare` that numbers the charts of a model's own UVs, for points on the
+    device."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -279,12 +279,12 @@ def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
 
 
 def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
-    """Makes a decoder of the lightmaps themselves, read bilinearly."""
+    """Makes a decoder that reads the original lightmaps bilinearly."""
     return _Reference(scene, check_device(device)).light
 
 
 class _Reference:
-    """The original lightmaps, on the device unless they are too large."""
+    """The original lightmaps, in the device's memory unless they are too large for it."""
 
     def __init__(self, scene: LightmappedScene, device: str) -> None:
         self._device = device
@@ -294,7 +294,7 @@ class _Reference:
         self._charts = [sheet.lightmaps[:, sheet.mask] for sheet in scene.sheets]
 
     def light(self, points: Points, state: int = 0) -> torch.Tensor:
-        """Reads the lightmaps bilinearly at points, float32 [N, 3]."""
+        """Returns the lightmaps' light at points, read bilinearly, float32 [N, 3]."""
         if len(self._images) == 1:
             return raster.texture(self._image(0, state), points.uv)
         light = torch.empty((len(points), 3), dtype=torch.float32, device=self._device)
@@ -318,10 +318,8 @@ def _peaks(
     resolution: int,
     device: str,
 ) -> tuple[list[float], float]:
-    """Computes the range of the reference in all views (see the module) for each state, and its maximum.
-
-    Rendering each view twice is cheaper than storing all views.
-    """
+    """Returns the range of the reference over all views for each state (see the module), and the reference's maximum.
+    Rendering each view twice is cheaper than storing all views."""
     states = range(len(scene.states))
     low, high = [math.inf] * len(states), [-math.inf] * len(states)
     count = torch.zeros((len(states), _BINS), dtype=torch.float64)
@@ -345,7 +343,7 @@ def _peaks(
 
 
 def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
-    """Calls the decoder and checks the colours, float64 [N, 3]."""
+    """Calls the decoder and returns its checked colours, float64 [N, 3]."""
     colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
         raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
@@ -356,7 +354,7 @@ def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedSce
 
 
 def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
-    """Computes and checks the labels, int64 [N]."""
+    """Calls the labels' function and returns its checked numbers, int64 [N]."""
     label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
         raise ValueError(f"{name}: expected labels, integers [{count}], got {label.dtype} {tuple(label.shape)}")
@@ -365,7 +363,7 @@ def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
 
 @dataclass
 class _Tally:
-    """The errors of a decoder: sums, and rows of view, state, MSE, SSIM, MSE on a screen and FLIP."""
+    """Collects the errors of a decoder by view and state: MSE, SSIM, and as displayed on a screen the MSE and FLIP."""
 
     states: int
     rows: list[tuple[float, ...]] = field(default_factory=list)
@@ -417,7 +415,7 @@ def _ratio(a: float, b: float) -> float:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Averages the numbers that aren't NaN; NaN if there are none."""
+    """Returns the mean of the numbers that aren't NaN; NaN if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return fmean(known) if known else math.nan
 
@@ -425,7 +423,7 @@ def _mean(values: Sequence[float]) -> float:
 def _texel_errors(
     scene: LightmappedScene, reference: _Reference, decoders: Mapping[str, Sampler], device: str
 ) -> dict[str, list[float]]:
-    """Computes mean squared errors over mask texels whose centre is in an active triangle, by decoder and state."""
+    """Returns mean squared errors, by decoder and state, over mask texels whose centre is in an active triangle."""
     sums, total, first = {name: [0.0] * len(scene.states) for name in decoders}, 0, 0
     for number, sheet in enumerate(scene.sheets):
         height, width = sheet.mask.shape
@@ -446,8 +444,9 @@ def _texel_errors(
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Finds the pixels within 2 pixels of a border, bool [h, w]: of triangles, -1 for none, whose labels differ and
-    that share a place in space, int [F, 3]."""
+    """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each
+    pixel. A border lies between triangles with different labels that share a corner in space: a number of `place`,
+    int [F, 3]."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1
@@ -464,10 +463,11 @@ def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor
 
 
 class _View:
-    """The pictures of a view of the original, compared with those of decoders."""
+    """One view's pictures of the original lightmaps, to be compared with those of decoders."""
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
-        """Makes the pictures of light [N, 3] at the covered pixels [h, w]; FLIP is computed only if asked for."""
+        """Makes pictures of the original's light [N, 3] at the covered pixels [h, w]; `flip`: whether to compute
+        FLIP."""
         whole = hit.cpu().numpy()
         # SSIM reads half a window around a covered pixel.
         rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
@@ -478,13 +478,14 @@ class _View:
         self._light, self._screen = self._pictures(target)
 
     def errors(self, light: torch.Tensor) -> tuple[float, float, float]:
-        """Computes SSIM, NaN without a peak, and as displayed the mean squared error and FLIP or NaN."""
+        """Returns a decoder's SSIM, NaN without a peak; the MSE as displayed on a screen; and FLIP, or NaN."""
         picture, screen = self._pictures(light)
         similarity = ssim(self._light, picture, self._hit, self._peak) if self._peak > 0.0 else math.nan
         return similarity, *picture_error(self._screen, screen, self._hit, self._flip)
 
     def _pictures(self, light: torch.Tensor) -> np.ndarray:
-        """Returns light [N, 3] as a picture, and the picture as displayed, float64 [2, h, w, 3]; black elsewhere."""
+        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; uncovered pixels are
+        black."""
         values = light.cpu().numpy().astype(np.float64)
         pictures = np.zeros((2, *self._hit.shape, 3))
         pictures[:, self._hit] = values, to_srgb(values * self._exposure)

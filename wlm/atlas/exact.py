@@ -1,4 +1,4 @@
-"""The decoder in float64, from a model's stored numbers to light: the reference of the runtime kernels."""
+"""Decodes light in float64 from a model's stored numbers: the reference for the runtime kernels."""
 
 import numpy as np
 
@@ -6,14 +6,15 @@ from wlm.atlas.model import BLOCK_SIDE, LUT_STEPS, AtlasModel, coarse_place, unp
 
 
 def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, state: int = 0) -> np.ndarray:
-    """Reads light at points (lightmap-uv-clustering-cascade, eq. 7; `wlm.atlas.model` for shared tiles).
+    """Returns light at points (lightmap-uv-clustering-cascade, eq. 7; for shared tiles see `wlm.atlas.model`).
 
-    Light has a step where tiles meet; a point that float32 rounds into the neighbouring tile differs by that step.
+    Light may jump where tiles meet, so a point that float32 rounds into the neighbouring tile differs by that jump.
 
     Args:
         model: The model.
-        uv: [N, 2], finite: the model's new UVs where it has any, else the sheets'; clamped to [0, 1].
-        sheet: int [N], sheets, or levels: rows of `AtlasModel.table` in the first state; or one for all points.
+        uv: [N, 2], finite: the model's new UVs if it has any, else the UVs of the sheets; clamped to [0, 1].
+        sheet: int [N], or one number for all points: a sheet or mip level, a row of `AtlasModel.table` for the first
+            state.
         state: The number of the state.
 
     Returns:
@@ -28,7 +29,8 @@ def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, sta
 
 
 def _tiles(model: AtlasModel, uv: np.ndarray, row: np.ndarray, state: int) -> np.ndarray:
-    """Reads tiles: a sum of their components, clipped at 0. A tile of one lightmap has one component with factor 1."""
+    """Returns light from tiles, [N, 3]: components times factors, at least 0. One lightmap has one component, factor
+    1."""
     factor = model.factor[state] if len(model.factor) else np.array([[0.0] * 3, [1.0] * 3])
     table = model.table()[row].astype(np.int64)
     size, origin, tiles = table[:, 1::-1], table[:, 3:1:-1], table[:, 5:3:-1]
@@ -56,7 +58,7 @@ def _tiles(model: AtlasModel, uv: np.ndarray, row: np.ndarray, state: int) -> np
 
 
 def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Reads [H, W, C] between texel centres, clamped."""
+    """Reads a texture [H, W, C] bilinearly at UVs [N, 2], clamped at its edges."""
     size = np.array(texels.shape[1::-1])
     place, page = (uv * size - 0.5).clip(0, size - 1), np.zeros(len(uv), np.int64)
     return _between(texels[None], page, np.zeros(2, np.int64), size - 1, place)
@@ -65,7 +67,8 @@ def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def _between(
     texels: np.ndarray, page: np.ndarray, first: np.ndarray, last: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Reads [pages, H, W, C] bilinearly at places [N, 2] in texels from texel 0's centre, clamped to first..last."""
+    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to
+    first..last."""
     low = np.clip(np.floor(place).astype(np.int64), first, last)
     high = np.minimum(low + 1, last)
     share = (place - low)[:, :, None]

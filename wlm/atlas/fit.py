@@ -1,8 +1,7 @@
-"""Compression of a scene with lightmaps to an atlas model.
+"""Compresses the lightmaps of a scene to an atlas model.
 
 One lightmap is compressed by the method of the profile, `tiles` or `cascade`; a plain smaller lightmap of as many bits
-replaces the model where that has no larger error. Several lightmaps, of several sheets or states, share tiles
-(`shared`).
+replaces the model if its error is no larger. Several lightmaps, of several sheets or states, share tiles (`shared`).
 """
 
 import os
@@ -64,7 +63,7 @@ def compress(
     Args:
         scene: The scene.
         profile: The settings: a profile's name, a YAML file or a `Profile`.
-        seed: Seed of the random views and mixtures.
+        seed: Seed of random choices, such as views.
         device: "cpu" or "cuda:N".
         progress: Called as each stage begins, and about twice a second in stages of many steps.
         checkpoint: From `open_checkpoint` for the same settings, or None: keeps a running compression, so that an
@@ -72,9 +71,8 @@ def compress(
         settings: Settings that replace the profile's, by name: `budget=0.1`.
 
     Returns:
-        The model. With one lightmap it is "plain", a smaller lightmap of as many bits, where that has no larger error
-        than the method. Its report has lines under "lost light" where texels lost more than half of their light and
-        PSNR doesn't show it.
+        The model. For one lightmap it is "plain", a smaller lightmap of as many bits, if that has no larger error. Its
+        report has lines under "lost light" if texels lost more than half of their light and PSNR doesn't show it.
 
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
@@ -142,7 +140,7 @@ def open_checkpoint(
 
 
 def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
-    """Compresses one lightmap by tiles or by the cascade, and compares it with a plain one."""
+    """Compresses one lightmap by `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)
     if method == "tiles":
@@ -161,7 +159,7 @@ def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, 
 
 
 def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list[str]:
-    """Makes lines about texels that lost more than half of their light where PSNR doesn't show it."""
+    """Makes lines of text about texels that lost more than half of their light where PSNR doesn't show it."""
     lost, decoder = LostLight(), Decoder(model, device)
     for number, sheet in enumerate(scene.sheets):
         inside = torch.from_numpy(sheet.mask).to(device)
@@ -174,11 +172,9 @@ def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list
 def with_fallback(
     scene: LightmappedScene, grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
 ) -> AtlasModel:
-    """Returns the model, or a smaller lightmap with at most as many bits and no larger weighted error.
-
-    The weights of cells are float64 [2 H, 2 W]. Without a model the smaller lightmap has the budget's bits, and a
-    texel, or a block, at least.
-    """
+    """Returns the model, or a plain smaller lightmap if one of at most as many bits has no larger weighted error.
+    `weight`, float64 [2 H, 2 W], has the weights of cells, quarters of texels. Without a model the smaller lightmap has
+    as many bits as the budget allows, but at least one texel or block."""
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
     bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits
@@ -209,10 +205,8 @@ def with_fallback(
 
 
 def _cell_centres(grid: FineGrid, weight: torch.Tensor) -> Iterator[tuple[Points, torch.Tensor]]:
-    """Yields the centres of cells that are in a triangle, and their weights, some rows at a time.
-
-    Where no triangle contains a centre, because all are too small, the cells with a weight represent their triangles.
-    """
+    """Yields, some rows at a time, the centres of those quarters of texels (cells) that are in a triangle, and their
+    weights. If all triangles are so small that none contains a centre, the cells with a weight are used instead."""
     any_held = bool((grid.triangle[0] >= 0).any())
     rows = max(1, _CELLS_AT_ONCE // grid.width)
     pieces = (values.split(rows) for values in (*grid.triangle, weight))

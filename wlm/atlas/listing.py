@@ -1,10 +1,10 @@
-"""Lists of a scene's lightmaps: the files of each sheet, and the node that reads each part of a sheet.
+"""Lists of a scene's lightmaps: the files of each sheet, and the objects that each sheet lights.
 
-docs/atlas.md shows the JSON file. A sheet is one layout of charts and has a file for each state; its other fields mean
-the same as in `wlm.atlas.load`. An object is a node by its name, its mesh's name or its number; it reads the sheet at
-UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits (`matching`).
-`convention` states how the rectangles are written: v runs down in glTF and Godot, and up in Unity, whose glTF
-exporters write 1 - v.
+docs/atlas.md shows the JSON file. A sheet is one layout of charts and has a file for each state; its other fields are
+arguments of `wlm.atlas.load`. An object is a node, named by its name, its mesh's name or its number; it reads the sheet
+at UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits (`matching`).
+`convention` states how the rectangles are written: v runs down in glTF and Godot, up in Unity, whose glTF exporters
+write 1 - v.
 
 Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stack of slices or of directional layers has
 to be cut first); a `set.json` of `wlm lightmap`, which is one sheet with a state for each time; and a folder, which
@@ -36,7 +36,7 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet, with fields as in the module docstring."""
+    """The files of a sheet; the module's docstring explains the fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -49,7 +49,7 @@ class SheetFiles(BaseModel):
 
 
 class ObjectPlace(BaseModel):
-    """The rectangle of a sheet that a node reads, v down: UV times the first two numbers, plus the last two."""
+    """A node and its rectangle in a sheet, v down: UV times the first two numbers, plus the last two."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -70,15 +70,15 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """A list of lightmaps, from any of the module's sources.
+    """A list of lightmaps from any source that the module's docstring names.
 
     Attributes:
         path: The file that names the lightmaps.
-        states: Names of the states; each sheet has a file for each.
-        sheets: The files.
+        states: Names of the states; each sheet has one file for each state.
+        sheets: The files of each sheet.
         objects: Nodes and their rectangles; None: every sheet is assigned to the mesh that it fits.
-        uv_set: n of `TEXCOORD_n`; None: 1 where there is one, else 0.
-        direct: Whether the names of files are paths that the caller gave, and not names in a file.
+        uv_set: n of the glTF attribute `TEXCOORD_n`; None: 1 if the mesh has TEXCOORD_1, else 0.
+        direct: Whether the caller gave the paths of files; false if they come from a file.
     """
 
     path: str
@@ -89,10 +89,10 @@ class Listing:
     direct: bool = False
 
     def file(self, name: str, trust: bool) -> Path:
-        """Resolves the path of a file of the list.
+        """Returns the path of a file that the list names.
 
         Raises:
-            WlmError: It lies outside the list's folder, and the list isn't trusted.
+            WlmError: The path lies outside the list's folder, and the list isn't trusted.
         """
         if self.direct:
             return Path(name)
@@ -100,7 +100,8 @@ class Listing:
 
 
 def is_listing(path: str | os.PathLike[str] | None) -> bool:
-    """Tests whether a path is a list of lightmaps rather than one lightmap; None means those of the materials."""
+    """Tests whether a path is a list of lightmaps and not one lightmap. None, for the materials' lightmaps, is a
+    list."""
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 
@@ -118,10 +119,10 @@ def lone_lightmap(
 
 
 def read_listing(path: str | os.PathLike[str]) -> Listing:
-    """Reads the JSON file, or lists a folder.
+    """Reads a list of lightmaps from a JSON file, a `.lmbake` file or a folder.
 
     Raises:
-        WlmError: One line that names the file and the field; or no picture of light is in the folder.
+        WlmError: A field is wrong, which the message names with the file; or the folder has no lightmap.
     """
     if os.path.isdir(path):
         folder = Path(path).resolve()
@@ -152,7 +153,7 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
 
 
 def material_lightmaps(document: GltfDocument) -> Listing | None:
-    """Lists the lightmaps that the materials of a glTF file name; None: no material names one.
+    """Lists the lightmaps that the materials of a glTF file name; returns None if no material names one.
 
     Raises:
         WlmError: A texture is malformed, uses another UV set than the others, or is embedded in the file.
@@ -204,7 +205,8 @@ def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFile
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
-    """Turns an object in an engine's convention into one of ours; anything else stays, and is refused later."""
+    """Converts an object's rectangle from an engine's convention to ours; other input is kept and fails later
+    checks."""
     if not isinstance(entry, dict):
         return entry
     entry = dict(entry)
@@ -239,7 +241,7 @@ def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
 
 
 def _from_bake(path: str) -> Listing:
-    """Reads Godot's bake: one texture of one slice, and the rectangles of its users."""
+    """Reads a list from Godot's `.lmbake`: one texture of one slice, and the rectangles of the nodes that use it."""
     bake = read_users(path)
     slices = {user.slice for user in bake.users}
     if len(bake.textures) != 1 or bake.directional or slices != {0}:
@@ -259,7 +261,7 @@ def _godot_place(user: GodotUser) -> ObjectPlace:
 
 
 def _from_folder(where: str, folder: Path) -> Listing:
-    """Lists every picture of light in a folder."""
+    """Lists every lightmap file in a folder."""
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
     except OSError as error:
@@ -273,7 +275,7 @@ def _from_folder(where: str, folder: Path) -> Listing:
 
 
 def _from_set(path: str, content: dict[str, Any]) -> Listing:
-    """Reads a `set.json`, which is one sheet."""
+    """Reads a list from a `set.json`, which is one sheet with a state for each time."""
     entries = content["lightmaps"]
     fields = ("time_hours", "file")
     entries = entries if isinstance(entries, list) else [None]

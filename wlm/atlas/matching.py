@@ -1,8 +1,8 @@
-"""Matching of a lightmap to a mesh: its node, its vertical orientation, and its stray texels.
+"""Finds from a lightmap's own light which mesh it was baked for, whether it is upside down, and which texels are stray.
 
-Everything is derived from the light itself. Within a chart light is smooth except at the edges of shadows; it is not
-smooth across gaps, other charts and leftovers of a baker between them. So the mean step between neighbouring texels of
-one chart is least under the UVs that the lightmap was baked for.
+Within a chart light is smooth except at the edges of shadows; it is not smooth across gaps, other charts and values
+that a baker leaves between charts. So the mean difference between neighbouring texels of one chart is smallest with the
+UVs that the lightmap was baked for.
 """
 
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ _FRINGE, _REACH = 4.0, 5  # limit over the brightest chart texel nearby, and the
 def choose_mesh(
     where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
 ) -> tuple[list[GltfPrimitive], list[str]]:
-    """Chooses the primitives of a scene for which a lightmap was baked, and makes lines that say what was left out.
+    """Chooses the primitives for which a lightmap was baked. Also returns lines of text that say what was left out.
 
     Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts the lightmap is
     smoothest is chosen; a mesh that several nodes draw counts once.
 
     Raises:
-        WlmError: No mesh fits clearly better than the next.
+        WlmError: The lightmap fits no mesh clearly better than all others.
     """
     numbers = sorted({each.mesh for each in primitives})
     if len(numbers) == 1:
@@ -72,7 +72,7 @@ def choose_mesh(
 
 
 def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPrimitive]:
-    """Selects the primitives of one node, by its name, its mesh's name or its number.
+    """Selects the primitives of the node with the given name, mesh name or number.
 
     Raises:
         WlmError: There is no such node; the line lists the nodes that exist.
@@ -86,7 +86,7 @@ def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPr
 
 
 def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Computes the number of the chart at each texel's centre, int32 [height, width], -1 for none."""
+    """Returns the number of the chart at each texel's centre, int32 [height, width]; -1 outside of charts."""
     uv = np.asarray(uv, np.float64).clip(0.0, 1.0)
     number = charts(welded(position, uv, triangle))
     corners = torch.from_numpy(np.ascontiguousarray(triangle, np.int32))
@@ -95,9 +95,9 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 
 
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
-    """Computes the mean step, in octaves, between neighbouring texels of one chart (`chart_map`); infinite if there are
-    none. NaN and infinity are steps. A large lightmap is sampled in evenly spread bands of rows, `_LOOKED_AT` texels in
-    all."""
+    """Returns the mean difference, in octaves, between neighbouring texels of one chart (`chart_map`); infinity if
+    there are no such texels. NaN and infinity count as differences. A large lightmap is sampled in evenly spread bands
+    of rows with `_LOOKED_AT` texels in all."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
@@ -118,7 +118,7 @@ def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
 
 
 def _bands(height: int, width: int) -> list[slice]:
-    """Selects the rows of a lightmap that are examined: all, or evenly spread bands."""
+    """Returns the rows of a lightmap to examine: all, or evenly spread bands if it is large."""
     count = max(_LOOKED_AT // (_BAND * width), 4)
     if count * _BAND >= height:
         return [slice(0, height)]
@@ -135,12 +135,11 @@ def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
 
 
 def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:
-    """Replaces stray texels of float32 [H, W, 3] by the nearest valid texel, in place; returns the number of specks.
-
-    A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4 times as bright as the
-    brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values in gutters. Other
-    texels are stray in a speck: less than 3 texels wide, above 16 times the 99.5th percentile of all of them.
-    """
+    """Replaces stray texels of a lightmap, float32 [H, W, 3], by the nearest valid texel, in place. Returns the number
+    of texels in specks. A texel with its centre outside all triangles is stray if it is NaN, infinite or more than 4
+    times as bright as the brightest nearby texel with its centre in a triangle: bakers and denoisers leave such values
+    in gutters. All other texels are stray if they form a speck: less than 3 texels wide, and brighter than 16 times the
+    99.5th percentile of all such texels."""
     brightest = lightmap.max(axis=2)
     finite = np.isfinite(lightmap).all(axis=2)
     inside = mask & covered
@@ -161,7 +160,7 @@ def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) 
 
 
 def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joins positions, UVs and triangles of some primitives into one mesh."""
+    """Joins primitives to one mesh; returns its positions, UVs and triangles."""
     first = np.cumsum([0, *(len(each.position) for each in primitives)])
     triangle = [each.triangle + start for each, start in zip(primitives, first[:-1], strict=True)]
     uv = np.concatenate([each.uv[uv_set] for each in primitives]).astype(np.float64)
@@ -169,5 +168,5 @@ def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarra
 
 
 def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns all values except the last along an axis, and all except the first."""
+    """Returns two views of an array: without the last, and without the first, element along an axis."""
     return values.take(range(values.shape[axis] - 1), axis), values.take(range(1, values.shape[axis]), axis)

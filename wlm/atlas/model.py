@@ -1,7 +1,7 @@
-"""The model of a scene's lightmaps: its settings and arrays, as stored in a file and in GPU memory.
+"""The model of a scene's compressed lightmaps: its settings and arrays, as stored in a file and in GPU memory.
 
-A lightmap is read through a lookup texture (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), with T_c the
-lookup texture, T_p the colour texture, and F by the method:
+A lightmap is read through a lookup texture (lightmap-uv-clustering-cascade, eq. 7): C(u) = T_p(F(T_c(u))), where T_c is
+the lookup texture, T_p the colour texture, and F depends on the method:
 
     tiles    A point lies in a tile of the lightmap. The tile's entry of T_c, read without a filter, names a rectangle
              of T_p; relative position in the tile is relative position in the rectangle. Our method.
@@ -143,11 +143,11 @@ class Profile(Settings):
     """For the cascade: weight of the image gradients' L1 in the loss beside the colours' L1 (section 3.3.3)."""
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Replaces some settings, as `wlm.system.Settings.override`.
+        """Returns the profile with some settings replaced, as `wlm.system.Settings.override`.
 
         Raises:
-            WlmError: A setting is unknown or out of range, or the cascade is given a budget or two textures, which it
-                lacks.
+            WlmError: A setting is unknown or out of range, or the cascade, which has neither, is given a budget or
+                "mixed".
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
@@ -160,7 +160,7 @@ class Profile(Settings):
         return super().override(values, prefix)
 
     def checked(self, lightmaps: int) -> tuple[Self, str]:
-        """Fills in the budget and chooses the method.
+        """Returns the profile with its budget filled in, and the method to use.
 
         Args:
             lightmaps: Number of lightmaps, sheets times states.
@@ -184,14 +184,14 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class SheetPlace:
-    """The place of a sheet, or of a level of one, in the lookup texture.
+    """The place of a sheet, or of a mip level of a sheet, in the lookup texture T_c.
 
     Attributes:
         name: The sheet's name.
-        height, width: Texels of its lightmaps.
-        row, column: Its first entry in T_c.
-        rows, columns: Its tiles; 0 where the method has none.
-        smaller: Row in `AtlasModel.table` of the next smaller level; 0: there is none.
+        height, width: Size of the sheet's lightmaps in texels.
+        row, column: Place of the sheet's first entry in T_c.
+        rows, columns: Rows and columns of tiles; 0 if the method has no tiles.
+        smaller: Row in `AtlasModel.table` of the next smaller level; 0 if there is none.
     """
 
     name: str
@@ -205,7 +205,7 @@ class SheetPlace:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows and columns of texels."""
+        """The rows and columns of texels of the sheet's lightmaps."""
         return self.height, self.width
 
 
@@ -221,23 +221,21 @@ class AtlasModel(Model):
         name: The scene's name.
         source: `LightmappedScene.source`.
         profile: The settings of the compression.
-        method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also where the profile's method
-            is no better. All but "shared" have one sheet and one state.
+        method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also if the profile's method was no
+            better. All except "shared" have one sheet and one state.
         colour: Format of T_p, as in `Profile`; "plain" is never "mixed".
         states: Names of the states.
         sheets: The places of the sheets.
-        texels: half [pages, Hp, Wp, 3], T_p, finite, not negative; the stored texture decodes to exactly these. With
-            "mixed" the texture in RGB9E5.
+        texels: half [pages, Hp, Wp, 3], T_p as decoded, finite, not negative. For "mixed" the texture in RGB9E5.
         lut: uint16 [Hc, Wc, 2 or 4], T_c: `pack_entries` for "tiles", coordinates in units of 1 / `LUT_STEPS` for
             "cascade", `pack_tiles` or their first two numbers for "shared"; [0, 0, 2] for "plain".
-        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; with "mixed" those of its second texture; [0, 0, 16]
-            for none.
+        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; [0, 0, 16] for none.
         block_texels: half [pages, Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 0, 3] for none.
         factor: float32 [M, C, 3], finite, of any sign, for "shared": the constant of each mixture, then the factors of
             its components; else [0, 0, 3].
-        levels: For "shared" with mips, the smaller levels of all sheets, for each sheet a quarter, then halves.
+        levels: For "shared" with mips, the smaller levels of all sheets: a quarter of a sheet's sides, then halves.
         later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
-        uv: float32 [F, 3, 2] in [0, 1], `snapped`, the corners' new UVs; [0, 3, 2] where the mesh keeps its own.
+        uv: float32 [F, 3, 2] in [0, 1], `snapped`, the corners' new UVs; [0, 3, 2] if the mesh keeps its UVs.
         stored: The scene's triangles and masks; None for a model without a file.
         report: Facts about the compression for the user: "seconds" by stage (not saved, since they differ from run to
             run), groups, and the reason why the method is plain.
@@ -265,12 +263,13 @@ class AtlasModel(Model):
 
     @property
     def rows(self) -> tuple[SheetPlace, ...]:
-        """All sheets and levels, as in `table`."""
+        """All sheets and mip levels, in the order of `table`."""
         return (*self.sheets, *self.levels, *self.later)
 
     @property
     def stride(self) -> int:
-        """Rows from a sheet in one state to the same sheet in the next; 0: all states have one row."""
+        """The number of rows of `table` from a sheet in one state to the same sheet in the next; 0: all states use one
+        row."""
         return len(self.sheets) + len(self.levels) if self.later else 0
 
     @property
@@ -280,12 +279,12 @@ class AtlasModel(Model):
 
     @property
     def first_block_code(self) -> int:
-        """`first_block_code` of the entries of T_c."""
+        """The result of the function `first_block_code` for the entries of the lookup texture T_c."""
         return first_block_code(self.colour)
 
     @property
     def bits(self) -> int:
-        """Bits on a GPU: T_p, T_c and, for "shared", factors and the table of sheets."""
+        """The number of bits on a GPU: of T_p, T_c and, for "shared", the factors and the table of sheets."""
         side = BLOCK_SIDE if self.colour in ("bc6h", "astc") else 1
         pages, rows, columns = self.texels.shape[:3]
         first = COLOUR_BITS[TEXELS if self.colour == "mixed" else self.colour]
@@ -297,7 +296,7 @@ class AtlasModel(Model):
 
     @property
     def source_bits(self) -> int:
-        """Bits of all lightmaps at 48 per texel (eq. 9)."""
+        """The number of bits of all original lightmaps, at 48 bits per texel (eq. 9)."""
         return sum(math.prod(each.size) for each in self.sheets) * len(self.states) * SOURCE_BITS
 
     @property
@@ -307,7 +306,7 @@ class AtlasModel(Model):
 
     @cached_property
     def scene(self) -> Any:
-        """Reads the `LightmappedScene`, without lightmaps, from the stored triangles and masks.
+        """Returns the `LightmappedScene`, without lightmaps, from the stored triangles and masks.
 
         Raises:
             WlmError: The stored triangles are damaged.
@@ -318,27 +317,25 @@ class AtlasModel(Model):
 
     def table(self) -> np.ndarray:
         """Makes the table of sheets for kernels and shaders, int32 [rows, 7]: rows and columns of texels, the first row
-        and column in T_c, rows and columns of tiles, and the row number of the next smaller level.
-
-        Sheets come first, then levels; with separate tiles both are listed for each state in turn.
-        """
+        and column in T_c, rows and columns of tiles, and the row number of the next smaller level. Sheets come first,
+        then mip levels; with separate tiles the sheets and levels are repeated for each state."""
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
 
     def without_mips(self) -> "AtlasModel":
-        """Returns the model without its smaller levels; the texels of shared levels stay in the textures."""
+        """Returns the model without its smaller mip levels. The textures still contain the texels of these levels."""
         kept = [row for at, row in enumerate(self.later) if at % (self.stride or 1) < len(self.sheets)]
         sheets, later = (tuple(replace(row, smaller=0) for row in rows) for rows in (self.sheets, kept))
         return replace(self, sheets=sheets, levels=(), later=later)
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that the lightmap's size is plausible for its numbers of texels and entries: a file of a few bytes must
-    not claim gigabytes.
+    """Checks that the lightmap's size is plausible for the number of stored texels and entries, since a file of a few
+    bytes must not claim gigabytes.
 
     Raises:
-        WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels in all,
-            and more than 65,536 for each texel of T_p and T_c.
+        WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels and also
+            more than 65,536 for each texel of T_p and T_c.
     """
     check_size(*size)
     stored = texels + entries
@@ -350,38 +347,37 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
 
 
 def snapped(uv: np.ndarray) -> np.ndarray:
-    """Rounds UVs in [0, 1] to the nearest multiples of 1 / `LUT_STEPS`, which a file stores, float32."""
+    """Rounds UVs in [0, 1] to the nearest multiples of 1 / `LUT_STEPS`, which a file can store; returns float32."""
     return (np.rint(np.asarray(uv, np.float64) * LUT_STEPS) / LUT_STEPS).astype(np.float32)
 
 
 def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
-    """Rows and columns of the grid of tiles over a lightmap.
-
-    Tiles span texel centres; the last ones may reach beyond the lightmap.
-    """
+    """Returns the rows and columns of the grid of tiles over a lightmap. The borders of tiles lie on texel centres; the
+    last tiles may reach beyond the lightmap."""
     return max(1, -(-(height - 1) // tile)), max(1, -(-(width - 1) // tile))
 
 
 def first_block_code(colour: str) -> int:
-    """Returns the smallest size code with which an entry of T_c names blocks instead of texels, or `NO_BLOCKS`."""
+    """Returns the smallest size code with which an entry of the lookup texture names blocks; `NO_BLOCKS` if none
+    does."""
     return {"mixed": FIRST_BLOCK_CODE, "bc6h": 0, "astc": 0}.get(colour, NO_BLOCKS)
 
 
 def pack_entries(
     first: np.ndarray, size: np.ndarray, blocks: np.ndarray | bool = False, code: int = FIRST_BLOCK_CODE
 ) -> np.ndarray:
-    """Encodes entries of T_c for tiles.
+    """Encodes entries of the lookup texture T_c for the method "tiles".
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`; four times that for blocks.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, or 4 `MOST_SIZE` for blocks.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
-        blocks: bool [...], where an entry names blocks: its first texel and size are multiples of 4. The sizes of
+        blocks: bool [...], true for entries that name blocks, whose first texel and size are multiples of 4. Sizes of
             other entries are at most `code`.
         code: `first_block_code`.
 
     Returns:
-        uint16 [..., 2]: the first texel shifted left by 4, plus the size less 1. For blocks, both count blocks, and
-        `code` is added.
+        uint16 [..., 2]: the first texel shifted left by 4, plus the size minus 1. For blocks, place and size are in
+        blocks, and `code` is added.
 
     Raises:
         ValueError: A number is out of range.
@@ -398,8 +394,8 @@ def pack_entries(
 
 
 def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decodes `pack_entries`: first texels and sizes, int64 [..., 2] each, and whether they name blocks, bool [..., 2],
-    which is equal along both axes in a valid file."""
+    """Decodes the result of `pack_entries`. Returns first texels and sizes, int64 [..., 2] each, and whether entries
+    name blocks, bool [..., 2], equal along both axes in a valid file."""
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
@@ -415,14 +411,14 @@ def pack_tiles(
     blocks: np.ndarray | bool = False,
     coarse: np.ndarray | int = 0,
 ) -> np.ndarray:
-    """Encodes entries of T_c for shared tiles.
+    """Encodes entries of the lookup texture T_c for shared tiles.
 
     Args:
         first, size, blocks: As for `pack_entries`: the rectangle of the first component.
         component: int [...], number of the mixture's constant among the factors, below 65,536.
-        count: int [...], components, 0 to 255; 0: the tile is black.
-        page: int [...], below `MOST_PAGES`.
-        coarse: int [...], number of coarse components, 0 to `MOST_COARSE`; 0 except for tiles in blocks.
+        count: int [...], number of components, 0 to 255; 0: the tile is black.
+        page: int [...], number of the page of T_p, below `MOST_PAGES`.
+        coarse: int [...], number of coarse components, one block each, 0 to `MOST_COARSE`; 0 for tiles in texels.
 
     Returns:
         uint16 [..., 4].
@@ -433,8 +429,8 @@ def pack_tiles(
 
 
 def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
-    """Decodes `pack_tiles`, or entries of two numbers, which have one component, to the arguments of `pack_tiles` in
-    their order: int64, except `blocks`, which is bool [...]."""
+    """Decodes the result of `pack_tiles`, or of `pack_entries` as tiles with one component. Returns the arguments of
+    `pack_tiles` in their order: int64, except `blocks`, which is bool [...]."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
@@ -446,13 +442,14 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
-    """Computes the place of a coarse component of a tile, int [..., 2], relative to the tile's first texel; these are
-    stacked in columns beside the `whole` other components of a size."""
+    """Returns the place of a coarse component of a tile, int [..., 2], in texels from the tile's first texel. Coarse
+    components are stacked in columns to the right of the tile's `whole` other components, each of the given size."""
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
 
 
 def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
-    """Texels along x and y of all components of tiles, int [..., 2], with arguments as for `pack_tiles`."""
+    """Returns the texels along x and y that all components of a tile take, int [..., 2]; arguments as in
+    `pack_tiles`."""
     columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

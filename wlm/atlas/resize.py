@@ -1,4 +1,4 @@
-"""Lightmaps at a lower resolution, to be read bilinearly."""
+"""Resizes lightmaps to a lower resolution, at which they are read bilinearly."""
 
 import warnings
 
@@ -15,8 +15,8 @@ _PULL = 1e-4
 
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
-    """Finds the largest rows and columns of a given aspect ratio, at most height and width, whose whole blocks of a
-    number of bits per texel are within a budget of bits; None if not even one block fits."""
+    """Returns the largest rows and columns, with the aspect ratio of height and width and at most as large, whose whole
+    blocks fit a budget of bits at `bits` per texel; None if not even one block fits."""
     longest = max(height, width)
     for side in range(longest, 0, -1):
         rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
@@ -28,11 +28,9 @@ def fitting_size(height: int, width: int, budget: float, block: tuple[int, int],
 def resized(
     filled: np.ndarray, mask: np.ndarray, height: int, width: int, filter: str = "fit", device: str = "cpu"
 ) -> torch.Tensor:
-    """Makes a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504], from one without gaps.
-
-    The filter "box" averages the lightmap over the new texels' squares; "fit" has the least squared error when it is
-    read at the mask's texels. At the lightmap's own size the result is the lightmap.
-    """
+    """Returns a smaller lightmap, to be read bilinearly, float64 [height, width, 3] in [0, 65504]. `filled` is the
+    lightmap without gaps. The filter "box" averages the lightmap over the new texels' squares; "fit" minimises the
+    squared error at the texels of the mask. At its own size the lightmap is returned unchanged."""
     light = torch.from_numpy(filled).to(device).double()
     if (height, width) == mask.shape:
         return light
@@ -43,12 +41,12 @@ def resized(
 
 
 def box(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """Averages an image float64 [H, W, C] over the squares of fewer texels: [height, width, C]."""
+    """Reduces an image, float64 [H, W, C], to [height, width, C]: each new texel is the mean over its square."""
     return _along(_box(width, image.shape[1]), _along(_box(height, image.shape[0]), image))
 
 
 def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
-    """Multiplies a matrix [new, old] with an image [old, N, C] along its first axis; the result is [N, new, C]."""
+    """Multiplies a matrix [new, old] with an image [old, N, C] along the first axis; returns [new, N, C]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about sparse tensors, whose interface may change
         parts = (torch.from_numpy(values) for values in (matrix.indptr, matrix.indices, matrix.data))
@@ -58,7 +56,8 @@ def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
 
 
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """Minimises the squared error at the mask's texels by conjugate gradients, from an initial [h, w, 3]."""
+    """Minimises the squared error at the mask's texels by conjugate gradients from `start`; returns an image [h, w,
+    3]."""
     rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
     turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
 
@@ -84,7 +83,7 @@ def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch
 
 
 def _bilinear(new: int, old: int) -> sparse.csr_matrix:
-    """Makes the matrix [new, old] that reads `old` texels at the centres of `new` ones, clamped."""
+    """Makes the matrix [new, old] for a bilinear read of `old` texels at the centres of `new` texels, clamped."""
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place).astype(np.int64)
     column = np.clip(np.stack([first, first + 1]), 0, old - 1)
@@ -94,7 +93,7 @@ def _bilinear(new: int, old: int) -> sparse.csr_matrix:
 
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
-    """Makes the matrix [new, old] that averages `old` texels over the squares of `new` ones."""
+    """Makes the matrix [new, old] that averages `old` texels over the squares of `new` texels."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     weight = np.maximum(weight, 0.0)

@@ -1,4 +1,4 @@
-"""The GLSL that reads a model's textures (lightmap-uv-clustering-cascade, eq. 7)."""
+"""Generates the GLSL that reads a model's textures (lightmap-uv-clustering-cascade, eq. 7)."""
 
 from wlm.atlas.model import (
     BLOCK_SIDE,
@@ -114,7 +114,7 @@ _WHAT = {
 
 
 def _one_lightmap(model: AtlasModel) -> str:
-    """Generates the text for a model with one lightmap, with the sizes of lightmap and tiles as constants."""
+    """Returns the GLSL for a model with one lightmap, where the sizes of lightmap and tiles are constants."""
     height, width = model.sheets[0].size
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
     kinds = ["plain", *(["mixed"] if mixed else []), model.method]
@@ -290,7 +290,7 @@ _FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 
 
 
 def _shared(model: AtlasModel) -> str:
-    """Generates the text for shared tiles, with a function of the object's rectangle, sheet and state."""
+    """Returns the GLSL for shared tiles, with a function of an object's rectangle, sheet and state."""
     height, width = model.texels.shape[1:3]
     kinds = {"sheets": "usampler2D", "lut": "usampler2D", "factors": "sampler2D", "colour": "sampler2DArray"}
     mixed = model.colour == "mixed"
@@ -328,7 +328,7 @@ def _shared(model: AtlasModel) -> str:
 
 
 def glsl(model: AtlasModel) -> str:
-    """Generates the shader text for a model: only functions, to be included below `#version`.
+    """Returns the GLSL for a model: only functions, to be included below `#version`.
 
     Returns:
         GLSL 3.30, which is also valid Vulkan GLSL if the bindings are defined: `wlm_atlas(uv)` for one lightmap,

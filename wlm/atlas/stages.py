@@ -1,4 +1,4 @@
-"""The stages of a compression, which are reported when they begin and timed; long ones are saved in a checkpoint."""
+"""Stages of a compression: each is reported when it begins and timed, and long stages are saved in a checkpoint."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,13 +10,13 @@ from wlm.system import Meter, OnProgress
 
 
 class Stages:
-    """Reports and times stages.
+    """Reports and times the stages of a compression.
 
     A checkpoint keeps the long stages of a method as batches, numbered in their order.
 
     Attributes:
         device: "cpu" or "cuda:N".
-        progress: The callback, which a stage of many steps calls too; or None.
+        progress: The callback, also called within stages of many steps; or None.
         checkpoint: The checkpoint, or None.
         seconds: Seconds of the finished stages, by name.
     """
@@ -27,7 +27,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Runs a stage inside the block; on CUDA its time includes the kernels that it has queued."""
+        """Runs the code of a `with` block as a stage; on CUDA the time includes the kernels that it has queued."""
         meter = Meter(self.progress, name, 0)
         meter.report(0)
         yield
@@ -38,11 +38,8 @@ class Stages:
 
 @contextmanager
 def one_thread(device: str) -> Iterator[None]:
-    """Limits torch to one thread on the CPU.
-
-    Torch's calls are short here: a second thread makes an evaluation ten times slower on a busy machine and gains
-    little on an idle one.
-    """
+    """Limits torch to one thread on the CPU. Calls of torch are so short that a second thread makes an evaluation ten
+    times slower on a busy machine and gains little on an idle one."""
     threads = torch.get_num_threads()
     try:
         if device == "cpu":

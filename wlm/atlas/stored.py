@@ -1,7 +1,7 @@
 """The triangles and masks that a model's file stores beside its textures.
 
-The file contains the whole glTF document of the input, as a `.glb`, so that a copy of it with new UVs keeps materials
-and everything else. `extras.wlm` of a node names the sheet that it reads, its rectangle and the UV set.
+The file contains the whole glTF document of the input, as a `.glb`, so that a copy with new UVs keeps materials and
+everything else. `extras.wlm` of a node has the number of its sheet, its rectangle in the sheet and the UV set.
 """
 
 import copy
@@ -17,9 +17,9 @@ from wlm.formats.gltf_writer import Replacement, encode_glb
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """Triangles and masks of a scene: the bytes of a `.glb` file, the nodes that read the sheets, n of their
-    `TEXCOORD_n`, whether the unit is known to be the metre, whether the other nodes hide what is behind them, and for
-    each sheet bool [H, W], true where a texel belongs to a chart."""
+    """Triangles and masks of a scene: the bytes of a `.glb` file; the nodes that are lit by the sheets; n of their UV
+    set `TEXCOORD_n`; whether positions are known to be in metres; whether the other nodes hide what is behind them; and
+    for each sheet its mask, bool [H, W], true where a texel belongs to a chart."""
 
     glb: bytes
     objects: tuple[Placed, ...]
@@ -65,16 +65,16 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 
 def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
-    """Makes the mesh for an engine: the bytes of the stored document and, where the model has new UVs, an additional UV
-    set; and n of the `TEXCOORD_n` under which the model is read."""
+    """Makes the mesh for an engine. Returns the bytes of the stored `.glb`, with an additional UV set if the model has
+    new UVs, and n of the `TEXCOORD_n` at which the model is read."""
     if not len(model.uv):
         return model.stored.glb, model.stored.uv_set
     return with_uvs(model.scene, model.uv)
 
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
-    """Encodes a scene of one sheet with one more UV set, numbered after the last existing one, of the corners' new UVs
-    [F, 3, 2]; returns the bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
+    """Encodes a scene of one sheet with an additional UV set, the corners' new UVs [F, 3, 2], numbered after the last
+    existing set. Returns the bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
 
     Raises:
         ValueError: The shape is wrong, or a UV isn't finite.

@@ -1,7 +1,7 @@
-"""The surface point at each pixel of a view of a scene, and at each texel of a sheet.
+"""Finds the surface point at each pixel of a view of a scene, and at each texel of a sheet.
 
 Cameras come from `wlm.ops.views` (around the scene) and `wlm.ops.indoors` (at eye height inside the scene). Triangles
-that read no sheet, and those that aren't `active`, hide what is behind them, and their pixels count as uncovered.
+without a lightmap, or that aren't `active`, hide what is behind them; their pixels count as uncovered.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,13 +19,13 @@ from wlm.ops.views import View, Viewpoint, sphere_views, visible_points
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of a scene's surface, on one device.
+    """N points of a scene's surface, on one device.
 
     Attributes:
-        uv: float32 [N, 2], the UVs in the sheet.
-        sheet: int32 [N], the sheet.
+        uv: float32 [N, 2], each point's UV in its sheet.
+        sheet: int32 [N], number of the point's sheet.
         triangle: int64 [N], the triangle's number in the whole scene.
-        weight: float32 [N, 3], the weights of its corners.
+        weight: float32 [N, 3], barycentric weights of the triangle's corners.
     """
 
     uv: torch.Tensor
@@ -38,12 +38,12 @@ class Points:
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
-    """Makes views of a scene: cameras around it and, where viewers can stand in it, as many views from inside.
+    """Makes cameras around a scene and, where viewers can stand in it, as many cameras inside.
 
     Args:
         scene: The scene.
         count: Number of cameras around it, at least 0.
-        seed: None spreads them evenly; else they are random. Views from inside follow it too.
+        seed: None spreads the cameras evenly; a number places all cameras, also inside ones, at random.
     """
     return [*sphere_views(count, seed), *scene.indoors.views(count, 0 if seed is None else seed)]
 
@@ -51,7 +51,7 @@ def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) ->
 def visible_uv(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Renders a scene from each camera.
+    """Renders the visible triangle and its UVs from each camera.
 
     Args:
         scene: The scene.
@@ -60,9 +60,9 @@ def visible_uv(
         device: "cpu" or "cuda:N".
 
     Yields:
-        For each camera, on the device: int32 [h, w], the visible triangle of a sheet, -1 for none; float32 [h, w, 2],
-        the weights of its corners 0 and 1, corner 2 has the rest; float32 [h, w, 2], the UVs there. The latter two
-        are 0 in uncovered pixels.
+        For each camera, on the device: int32 [h, w], the visible triangle with a sheet, -1 for none; float32 [h, w, 2],
+        barycentric weights of the triangle's corners 0 and 1 (all three add up to 1); float32 [h, w, 2], UVs. Weights
+        and UVs are 0 in uncovered pixels.
 
     Raises:
         WlmError: There is no such device.
@@ -83,7 +83,7 @@ def visible_uv(
 def points_at(
     scene: LightmappedScene, visible: torch.Tensor, barycentric: torch.Tensor, uv: torch.Tensor
 ) -> tuple[torch.Tensor, Points]:
-    """Selects the covered pixels of a result of `visible_uv`, bool [h, w], and their points, row by row."""
+    """Returns the covered pixels of a view from `visible_uv`, bool [h, w], and the points at them, row by row."""
     hit = visible >= 0
     triangle = visible[hit].long()
     sheet = torch.from_numpy(scene.triangles.sheet).to(visible.device)[triangle]
@@ -91,25 +91,25 @@ def points_at(
 
 
 def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
-    """Computes the weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
+    """Returns the barycentric weights of all three corners, float32 [N, 3], from those of corners 0 and 1, [N, 2]."""
     return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
 def visibility(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
-    """Counts the pixels that show each part of the UV space of a scene's only sheet.
+    """Counts the pixels that show each cell of a grid over the UV space of a scene with one sheet.
 
     Args:
         scene: The scene.
         views: The cameras.
-        resolution: Pixels along a side of their pictures.
+        resolution: Pixels along a side of a camera's picture.
         height, width: Size of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 lies in the
-        last one.
+        float64 [height, width] on the device, the pixels of all views whose UVs lie in each cell; a UV of 1 is in the
+        last cell.
 
     Raises:
         WlmError: There is no such device.
@@ -138,8 +138,8 @@ def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple
         device: "cpu" or "cuda:N".
 
     Returns:
-        On the device: int64 [height, width], the triangle of the sheet, the first of several, -1 for none; float32
-        [height, width, 2], the weights of its corners 0 and 1.
+        On the device: int64 [height, width], the number of the triangle in the sheet, the first of several, -1 for
+        none; float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(
@@ -155,7 +155,7 @@ def sheet_charts(sheet: Sheet) -> np.ndarray:
     """Numbers the charts of a sheet.
 
     Returns:
-        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space are one chart; -1
-        where a triangle isn't active.
+        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space have the same
+        number; -1 for triangles that aren't active.
     """
     return charts(welded(sheet.position, sheet.uv, sheet.triangle), sheet.active)

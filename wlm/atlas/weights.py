@@ -1,4 +1,4 @@
-"""Weights of a lightmap's error in each part of it, by visibility and distance to a seam."""
+"""Computes the weight of a lightmap's error at each place, from visibility and distance to a seam."""
 
 from functools import cached_property
 
@@ -22,7 +22,7 @@ _SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
-    """A sheet's grid at twice its resolution: each cell is a quarter of a texel. Its maps are computed once."""
+    """A grid of cells over a sheet, each a quarter of a texel, and maps over the grid, computed when first used."""
 
     def __init__(self, sheet: Sheet, device: str) -> None:
         self.sheet, self.device = sheet, device
@@ -30,18 +30,18 @@ class FineGrid:
 
     @cached_property
     def triangle(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The triangle at each cell's centre, and the weights of its corners, as in `texel_triangles`."""
+        """The triangle at each cell's centre, and the barycentric weights of its corners, as in `texel_triangles`."""
         return texel_triangles(self.sheet, self.height, self.width, self.device)
 
     @cached_property
     def covered(self) -> torch.Tensor:
-        """bool [2 H, 2 W], whether a triangle contains the cell's centre, computed exactly."""
+        """Whether a triangle contains the cell's centre, computed exactly: bool [2 H, 2 W]."""
         sheet = self.sheet
         return covered_on(sheet.uv, sheet.triangle[sheet.active], self.height, self.width, self.device) > 0
 
     @cached_property
     def border(self) -> torch.Tensor:
-        """bool [2 H, 2 W], whether a chart's border is within a texel."""
+        """Whether a chart's border is within a texel of the cell: bool [2 H, 2 W]."""
         triangle = self.triangle[0]
         chart = torch.from_numpy(sheet_charts(self.sheet)).to(self.device)
         chart = torch.where(triangle < 0, -1, chart[triangle.clamp(min=0)])
@@ -50,15 +50,14 @@ class FineGrid:
 
     @cached_property
     def texels(self) -> torch.Tensor:
-        """bool [2 H, 2 W], the quarters of mask texels that have their centre in a triangle."""
+        """Whether a cell is part of a mask texel whose centre is in a triangle: bool [2 H, 2 W]."""
         sheet = self.sheet
         inside = covered_on(sheet.uv, sheet.triangle[sheet.active], *sheet.mask.shape, self.device) > 0
         return _quarters(inside & torch.from_numpy(sheet.mask).to(self.device))
 
     @cached_property
     def relative(self) -> torch.Tensor:
-        """float64 [2 H, 2 W], the factor from squared error of linear light to squared relative error, up to a
-        constant."""
+        """The factor from squared error to squared relative error of light, up to a constant: float64 [2 H, 2 W]."""
         sheet = self.sheet
         light = torch.from_numpy(sheet.lightmap).to(self.device).mean(2, dtype=torch.float64)
         bright = light[torch.from_numpy(sheet.mask).to(self.device)]
@@ -67,21 +66,21 @@ class FineGrid:
 
 
 def _quarters(texels: torch.Tensor) -> torch.Tensor:
-    """Repeats each texel as four cells."""
+    """Repeats each texel as 2 x 2 cells."""
     return texels.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
 
 def _largest(values: torch.Tensor) -> torch.Tensor:
-    """Computes the largest value within a texel of each cell."""
+    """Returns for each cell the largest value within a texel of it."""
     window = 2 * _BORDER + 1
     across = max_pool2d(values[None, None], (1, window), 1, (0, _BORDER))
     return max_pool2d(across, (window, 1), 1, (_BORDER, 0))[0, 0]
 
 
 def weights(scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
-    """Counts for each cell of a scene's only sheet the pixels that show it in random views, float64 [2 H, 2 W] on the
-    grid's device, see `spread`. Views from inside count as much as views from around; at least one weight is above 0.
-    """
+    """Returns the weight of each cell of a scene's only sheet, float64 [2 H, 2 W] on the grid's device: `spread` of the
+    number of pixels that show it in random views. Views from inside count as much as views from around the scene. At
+    least one weight is above 0."""
     count, shape = profile.views, (grid.height, grid.width, grid.device)
     views = scene_views(scene, count, seed)
     around, inside = (visibility(scene, each, RESOLUTION, *shape) for each in (views[:count], views[count:]))
@@ -98,9 +97,9 @@ def spread(
     relative: float = 0.0,
     mean: float | None = None,
 ) -> torch.Tensor:
-    """Turns pixel counts, float64 [2 H, 2 W], into weights: unseen cells get a small weight, and borders of charts a
-    larger one, as in `Profile`. `mean` is the mean count of a cell, which scales the weight of unseen cells; None: that
-    of this sheet."""
+    """Turns pixel counts of cells, float64 [2 H, 2 W], into weights: cells that no view shows get a small weight, and
+    cells at borders of charts a larger weight, as `Profile` says. `mean` is the mean count of a cell, which scales the
+    weight of cells that no view shows; None: the mean over this sheet."""
     # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it

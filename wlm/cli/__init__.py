@@ -1,4 +1,4 @@
-"""The command `wlm`: one file a command group, no logic of its own."""
+"""The command line `wlm`: one module for each group of commands; the work is done by the other packages."""
 
 from wlm.cli.app import app, main
 

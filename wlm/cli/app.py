@@ -1,8 +1,8 @@
-"""The root of the command line: its commands, its version, and its errors.
+"""Root of the command line: registers the commands, shows the version, and reports errors.
 
-Exit codes: 0 success; 1 the reader of the output closed the pipe; 2 wrong input or an output that cannot be written,
-with one line on stderr that starts with `error:`; 130 stopped by Ctrl-C; 143 stopped by SIGTERM. Any other exception
-is a bug and shows its traceback.
+Exit codes: 0 success; 1 the reader of a pipe closed it; 2 wrong input or an output that cannot be written, with one
+line on stderr that starts with `error:`; 130 stopped by Ctrl-C; 143 stopped by SIGTERM. Any other exception is a bug
+and shows its traceback.
 
 Modules that take long to import (torch, Warp) are imported by the commands that need them, so that `wlm --version`
 answers at once.

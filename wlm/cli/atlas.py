@@ -54,7 +54,7 @@ _Mask = Annotated[
     Path | None, typer.Option(metavar="PNG", help="Texels that belong to charts; default derived from the triangles.")
 ]
 _UvSet = Annotated[
-    int | None, typer.Option("--uv-set", min=0, help="n of TEXCOORD_n, the UVs of the lightmap; default 1, else 0.")
+    int | None, typer.Option("--uv-set", min=0, help="Number n of the lightmap UVs TEXCOORD_n; default 1, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
 _Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
@@ -148,7 +148,7 @@ def decode(
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state; a fraction mixes two states.")] = 0.0,
     view: Annotated[
         int | None,
-        typer.Option(min=0, help="Draw the scene from this camera of evaluate instead; those inside come last."),
+        typer.Option(min=0, help="Draw the scene from this camera of wlm evaluate; cameras inside come last."),
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,

@@ -13,7 +13,7 @@ app = typer.Typer(
 )
 
 _Scene = Annotated[
-    Path, typer.Argument(metavar="SCENE.yaml", help="Names a glTF file, its lights by hour, and the resolution.")
+    Path, typer.Argument(metavar="SCENE.yaml", help="Settings: a glTF file, its lights by hour, the resolution.")
 ]
 
 
@@ -92,7 +92,7 @@ def probes(
 @exclusive
 def sixway(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE.yaml", help="Names the smoke, the camera, and the number of samples.")
+        Path, typer.Argument(metavar="SCENE.yaml", help="Settings: the smoke, the camera, the number of samples.")
     ],
     output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
     device: Device = "cpu",

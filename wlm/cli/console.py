@@ -63,7 +63,7 @@ def show(content: Table) -> None:
 def show_figures(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]], text: Sequence[str] = ()
 ) -> None:
-    """Prints a table of words and numbers.
+    """Prints a table of texts and numbers to stdout.
 
     Args:
         title, columns, text: Arguments of `table`.
@@ -126,7 +126,7 @@ def note_warnings(warnings: Iterable[str]) -> None:
 
 
 def note_start(checkpoint: "Checkpoint", resume: bool, start: str) -> None:
-    """Notes that work which was to be resumed has no checkpoint and begins at `start`."""
+    """Prints a line if `--resume` was given but there is no checkpoint, so that the work begins at `start`."""
     if resume and not checkpoint.resumed:
         note(f"{checkpoint.path}: there is nothing to resume; starting {start}")
 
@@ -137,7 +137,7 @@ def show_text(text: str) -> None:
 
 
 def number(value: float | None, form: str) -> str:
-    """Formats a number; None and NaN become a dash."""
+    """Formats a number by the format spec `form`; None and NaN become a dash."""
     return "–" if value is None or value != value else format(value, form)
 
 
@@ -193,7 +193,7 @@ def exclusive(command: Callable[..., None]) -> Callable[..., None]:
 def quiet_warp() -> None:
     """Starts Warp without its banner, its notes on compilation, and its line about a missing GPU driver.
 
-    The missing driver does not matter on the CPU, and `--device cuda` has an error of its own. One line says that
+    A missing driver does not matter on the CPU, and `--device cuda` raises an error about it anyway. One line says that
     kernels will be compiled if Warp's cache is empty.
     """
     import warp as wp
@@ -209,7 +209,7 @@ def quiet_warp() -> None:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Shows progress on stderr: a bar on a terminal, else a plain line about every tenth of the work.
+    """Shows progress on stderr: a bar on a terminal, otherwise a plain line after about every tenth of the work.
 
     Work without a known number of steps gets one line at its beginning. Yields a function to call with the finished
     steps, the total, and a text to show with them.
@@ -254,14 +254,14 @@ def running(
 ) -> "Iterator[OnProgress]":
     """Shows the progress of long work and, if it has a checkpoint, lets a signal stop it between two steps.
 
-    The output of the work must be written inside the block, so that a signal cannot interrupt it. Each stage with
-    another name than `what` has a bar of its own, named `what: stage`.
+    The output of the work must be written inside the block, so that a signal cannot interrupt it. A stage whose name
+    differs from `what` gets its own bar, named `what: stage`.
 
     Args:
         what: Name of the work in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
         unit: Name of a step.
-        whole: Whether a signal waits for the end of a step; unnecessary for steps that write their own results.
+        whole: Whether a signal waits for the end of a step; False for steps that write their results by themselves.
 
     Yields:
         A callback for the work. If a signal stops the work after the first call, a line says how to continue.
@@ -297,7 +297,7 @@ def running(
 
 
 def _named_figure(name: str, value: float) -> str:
-    """Writes the figure `PSNR dB` of 41.2 as "PSNR 41.2 dB"."""
+    """Formats a figure whose name ends with a unit: `PSNR dB` and 41.2 become "PSNR 41.2 dB"."""
     label, _, unit = name.partition(" ")
     return " ".join(filter(None, (label, number(value, ".4g"), unit)))
 
@@ -309,7 +309,7 @@ class _Clock:
         self._first: tuple[int, float] | None = None
 
     def left(self, done: int, total: int) -> str:
-        """Writes the time left; an empty text at the first finished step, or if the total is unknown."""
+        """Returns the estimated time left as text; empty at the first finished step, or if the total is unknown."""
         if done <= 0 or not total:
             return ""
         now = time.perf_counter()

@@ -47,7 +47,7 @@ def doctor() -> None:
 
 
 def _size_of(folder: Path) -> int:
-    """Returns the bytes of all files under a folder, in which other processes may add and remove files."""
+    """Returns the total bytes of the files under a folder, even while other processes add and remove files."""
     total = 0
     for parent, _, files in os.walk(folder):
         for name in files:
@@ -57,7 +57,7 @@ def _size_of(folder: Path) -> int:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Returns the extras of the package, each with those of its packages that are not installed."""
+    """Returns the optional dependency groups (extras) of wlm, each with its packages that are not installed."""
     try:
         requirements = metadata.requires("wlm") or []
     except metadata.PackageNotFoundError:

@@ -53,8 +53,8 @@ _Set = Annotated[
 _Times = Annotated[
     str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, separated by commas.")
 ]
-_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default that of the set.')]
-_Period = Annotated[float | None, typer.Option(help="Length of the day; default that of the set.")]
+_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default the mask of the set.')]
+_Period = Annotated[float | None, typer.Option(help="Length of the day; default the length that the set states.")]
 _Layers = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
 ]
@@ -92,7 +92,7 @@ def compress(
         typer.Option(
             min=1,
             metavar="N",
-            help="Processes that fit tiles in parallel, with the same result; default one for two cores, one on a GPU.",
+            help="Processes that fit tiles in parallel, with the same result; default one per two cores, one on a GPU.",
         ),
     ] = None,
     cluster: Annotated[
@@ -139,8 +139,8 @@ def evaluate(
 ) -> None:
     """Compare compressed lightmaps with the originals: PSNR, SSIM and FLIP by tile and time, and bits per texel.
 
-    The error is also measured where light is shown: filtered, beside charts, between stored times, across tiles, over
-    time, and in views of the set's mesh.
+    The error is also measured as a renderer shows the light: filtered, beside charts, between stored times, across
+    tiles, over time, and in views of the set's mesh.
     """
     if json_path is not None:
         check_output(json_path, ".json")
@@ -167,10 +167,10 @@ def decode(
     output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
     texture: Annotated[
         Path | None,
-        typer.Option(metavar="MAP.dds", help="Also write the texture of the runtime: RGB9E5 texels with mips."),
+        typer.Option(metavar="MAP.dds", help="Also write a texture as renderers sample it: RGB9E5 texels with mips."),
     ] = None,
     layer: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first of radiance.")
+        str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first layer of radiance.")
     ] = None,
     atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas to decode; default the first.")] = None,
     device: Device = "cpu",
@@ -294,7 +294,7 @@ def _cells(report: "Report | SheetReport", columns: Any) -> list[str]:
 
 
 def _show_where_shown(report: "Report") -> None:
-    """Shows the scores of light where it is shown; columns without any score are left out."""
+    """Prints the table of `wlm.lightmap.view_scores.ShownScore`; columns without any score are left out."""
     columns = [
         column for column in _SHOWN if any(math.isfinite(getattr(own, column[1])) for own in report.sheets.values())
     ]
@@ -306,7 +306,7 @@ def _show_where_shown(report: "Report") -> None:
 
 
 def _note_worst(report: "SheetReport") -> None:
-    """Notes the worst tiles, times and views, and the tiles without a score."""
+    """Prints the tile, time and view with the lowest scores, and how many tiles have no score."""
     if report.worst_tile is not None:
         worst = report.worst_tile
         note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")

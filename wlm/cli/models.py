@@ -1,4 +1,4 @@
-"""Steps that the verbs of all systems have in common: fit and save, load an input, export, describe."""
+"""Steps that commands for lightmaps, atlases and probes share: fit and save, load an input, export, describe."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -32,7 +32,7 @@ def fit(
     every: float,
     **options: Any,
 ) -> tuple[Any, Any, dict[str, Any]]:
-    """Compresses an input into a file, with progress, a checkpoint and notes of all warnings.
+    """Compresses an input into a file; shows progress, keeps a checkpoint, and prints warnings.
 
     Args:
         system: Name of the system, whose package has `Profile`, `compress` and `open_checkpoint`.
@@ -40,7 +40,7 @@ def fit(
         output: The `.wlm` to write.
         profile: Name of the profile or path of a YAML file.
         settings: Settings that replace those of the profile, by name.
-        seed, device, resume, every: Values of the options.
+        seed, device, resume, every: Values of `--seed`, `--device`, `--resume` and `--checkpoint-every`.
         options: Further options of `compress`.
 
     Returns:
@@ -76,7 +76,7 @@ def export(
     device: str,
     **options: Any,
 ) -> None:
-    """Writes a model as a folder and shows the files. Options of a kit that are None are not given.
+    """Exports a model to a folder and lists the written files. Options that are None are not passed on.
 
     Raises:
         WlmError: An option has no meaning for the engine, or the folder cannot be written.

@@ -1,11 +1,11 @@
-"""Options that several commands have, each defined once."""
+"""Options that several commands share, each defined once."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-Device = Annotated[str, typer.Option(help='Device that computes: "cpu", "cuda" or "cuda:N".')]
+Device = Annotated[str, typer.Option(help='Device to compute on: "cpu", "cuda" or "cuda:N".')]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed; one seed gives one result on one device.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run with the same output.")]
 CheckpointEvery = Annotated[
@@ -44,9 +44,9 @@ ExactShader = Annotated[
     bool, typer.Option("--exact", help="Without --engine: the shader interpolates in floats, not by the texture unit.")
 ]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="Compressed file that wlm compress wrote.")]
-Key = Annotated[str | None, typer.Option(help="Array of a probe file that has several, such as an hour.")]
+Key = Annotated[str | None, typer.Option(help="Array to read from a probe file with several, such as an hour.")]
 
 
 def output_option(metavar: str, help_text: str) -> Any:
-    """Makes the option `--output` (`-o`) for an annotated path."""
+    """Returns the typer option `--output` (`-o`) for the annotation of a path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)

@@ -46,7 +46,7 @@ _Probes = Annotated[
 ]
 _CONVENTIONS = "threejs, godot, unreal or unity"
 _Convention = Annotated[
-    str | None, typer.Option(help=f"SH convention of the numbers: {_CONVENTIONS}; default as PROBES states.")
+    str | None, typer.Option(help=f"SH convention of PROBES: {_CONVENTIONS}; default as the file states.")
 ]
 _At = Annotated[
     Path | None,
@@ -150,8 +150,8 @@ def decode(
 ) -> None:
     """Decode the light at the stored positions or at others.
 
-    Positions of the same number and the same box as the file's probes are taken for these probes in their order: dead
-    probes then decode to zero. Other positions have no dead probes.
+    If the given positions have the number and the bounding box of the file's probes, they count as these probes, in
+    order, and dead probes decode to zero. At other positions no probe is dead.
     """
     check_output(output, ".npz", ".json")
     quiet_warp()
@@ -190,7 +190,7 @@ def export(
         typer.Option(help="Cells of the grid of three, godot or unreal along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
-        Literal["x", "y", "z"] | None, typer.Option(help="Axis that becomes left-handed for unity; default none.")
+        Literal["x", "y", "z"] | None, typer.Option(help="Axis to flip for the left-handed unity; default none.")
     ] = None,
     device: Device = "cpu",
 ) -> None:

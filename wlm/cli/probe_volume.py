@@ -1,4 +1,4 @@
-"""`wlm probe volume`: the cascaded lighting volume around a viewer; and scores of it for `wlm evaluate`."""
+"""`wlm probe volume`: writes the cascaded lighting volume around a viewer; also its scores for `wlm evaluate`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,15 +30,15 @@ def volume(
     probes_path: Annotated[
         Path | None,
         typer.Argument(
-            metavar="PROBES", help="File with the positions and normals of the probes; default stored ones."
+            metavar="PROBES", help="File with positions and normals of the probes; default those in FILE.wlm."
         ),
     ] = None,
     at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Position of the viewer; default the middle of the probes."),
+        typer.Option(metavar="X Y Z", help="Position of the viewer; default the centre of the probes."),
     ] = None,
     block: Annotated[
-        float | None, typer.Option(help="Side of the finest blocks; default from the distances of the probes.")
+        float | None, typer.Option(help="Side of the finest blocks; default from the spacing of the probes.")
     ] = None,
     key: Key = None,
     device: Device = "cpu",
@@ -67,7 +67,7 @@ def volume(
 
 
 def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
-    """Scores the light sampled from the volume along a walk, for the original and the decoded probes."""
+    """Scores light sampled from the volume along a walk through the scene, for original and decoded probes."""
     from wlm.probe.volume.light import StoredLight
     from wlm.probe.volume.walk import score_volume
 
@@ -81,7 +81,7 @@ def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[st
 
 
 def show_walks(walks: dict[str, dict[str, Any]]) -> None:
-    """Shows the scores of walks, if there are any."""
+    """Prints the scores of walks as a table; nothing if there are none."""
     if not walks:
         return
     rows = table("sampled from the cascaded volume", ["along a walk", *walks])
@@ -96,7 +96,7 @@ def show_walks(walks: dict[str, dict[str, Any]]) -> None:
 def score_pictures(
     model: "ProbeModel", probes: "ProbeSet", views: int, mesh: Path | None, device: str
 ) -> "list[ViewScore]":
-    """Scores pictures under the decoded light; 50 of them if `views` is 0."""
+    """Scores rendered pictures under the decoded light: `views` of them, or 50 if `views` is 0."""
     from wlm.formats.geometry import read_geometry
     from wlm.probe.views import VIEWS, score_views
 
@@ -107,7 +107,7 @@ def score_pictures(
 
 
 def show_pictures(scores: "list[ViewScore]") -> None:
-    """Shows the scores of pictures, if there are any."""
+    """Prints the scores of pictures as a table; nothing if there are none."""
     if not scores:
         return
     rows = table("pictures under the light", ["drawn", "light", "views", "MSE", "PSNR, dB", "SSIM", "FLIP"])

@@ -67,14 +67,14 @@ def command_of(name: str, function: Callable[..., None]) -> Any:
 
 
 class Generated(TyperCommand):
-    """A command that is built with its generated options when it is called, because that imports the settings."""
+    """A command that adds its generated options only when it is called, since this imports the settings model."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         return command_of(str(self.name), self.callback).make_context(info_name, args, parent, **extra)
 
 
 def _expanded(command: Callable[..., None], settings: "list[_Field]", into: str) -> Callable[..., None]:
-    """Gives a command an option for each field, for typer to read."""
+    """Returns the command with an option for each settings field in its signature, which typer reads."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -99,7 +99,7 @@ def _fields(model: "type[BaseModel]", path: tuple[str, ...] = ()) -> Iterator[_F
 
 
 def _bare(annotation: Any) -> Any:
-    """A type without `Annotated` and without `None`."""
+    """Returns a type annotation without `Annotated` and without `None`."""
     origin = get_origin(annotation)
     if origin is Annotated:
         return _bare(get_args(annotation)[0])
@@ -128,7 +128,7 @@ def _metavar(kind: Any) -> str:
 
 
 def _help(info: "FieldInfo") -> str:
-    """The first sentence of a field's docstring and the range of its values."""
+    """Returns the help text of a field: the first sentence of its docstring, and the range of its values."""
     text = " ".join((info.description or "").split())
     sentence = _SENTENCE_END.split(text)[0].rstrip(".;:") if text else ""
     limits = [

@@ -1,4 +1,4 @@
-"""`wlm smoke`: simulate smoke, light it, and make six-way lightmaps by a march or by the network."""
+"""`wlm smoke`: simulates and lights smoke, and makes six-way lightmaps by ray marching or with a network."""
 
 from collections.abc import Callable
 from functools import partial
@@ -64,7 +64,7 @@ _SceneName = Annotated[
 ]
 _SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
 _SceneScale = Annotated[
-    float, typer.Option(min=0.001, max=100.0, help="Factor on the number of cells along each axis of the scene.")
+    float, typer.Option(min=0.001, max=100.0, help="Factor on the scene's number of cells along each axis.")
 ]
 _Albedo = Annotated[
     str | None,
@@ -138,8 +138,8 @@ def bake(
     smoke: Input,
     output: _Lightmaps,
     options: SmokeOptions,
-    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the march in voxels.")] = 0.5,
-    supersample: Annotated[int, typer.Option(min=1, max=16, help="Rays along the edge of a pixel.")] = 1,
+    step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the ray march in voxels.")] = 0.5,
+    supersample: Annotated[int, typer.Option(min=1, max=16, help="Supersampling: rays along the edge of a pixel.")] = 1,
     g: _G = 0.0,
     fit: Annotated[
         Literal["axes", "sphere"],
@@ -151,7 +151,7 @@ def bake(
     ] = None,
     resume: Resume = False,
 ) -> None:
-    """Make six-way lightmaps by a fine march and estimate the error of its step.
+    """Make six-way lightmaps by fine ray marching, and estimate the error due to the step length.
 
     An EXR has the channels right, left, top, bottom, front, back, transparency, and emission of hot smoke. Finished
     frames are kept when the command is stopped; repeat it with --resume to make the others.
@@ -184,11 +184,11 @@ def predict(
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Network that wlm smoke train wrote; default the shipped one.")
     ] = None,
-    coarse: Annotated[bool, typer.Option("--coarse", help="Use a coarse march alone, without a network.")] = False,
+    coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
     resume: Resume = False,
 ) -> None:
-    """Predict six-way lightmaps by the network from a guiding map: the result of bake, in less time.
+    """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
 
     The files are like those of bake. Finished frames are kept when the command is stopped; repeat it with --resume to
     make the others.
@@ -213,7 +213,7 @@ def predict(
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Returns a function that makes lightmaps by a network; it notes once if the network contributes little."""
+    """Returns a function that predicts lightmaps with a network; it prints a note if the network changes little."""
     from wlm.smoke.network.prediction import SmokePredictor
 
     predictor, first = SmokePredictor(model, device), True
@@ -254,7 +254,7 @@ def light(
     albedo: _Albedo = None,
     g: _G = 0.0,
     orders: Annotated[
-        Literal["all", "single"], typer.Option(help="Orders of scattering: all, or single scattering alone.")
+        Literal["all", "single"], typer.Option(help="Orders of scattering: all, or single scattering only.")
     ] = "all",
     samples: Annotated[
         int | None, typer.Option(min=2, max=2**20, help="Trace this many paths per pixel instead of marching.")
@@ -262,11 +262,11 @@ def light(
     background: Background = None,
     white: White = 1.0,
 ) -> None:
-    """Light smoke into pictures by a march towards each light, with predicted multiple scattering, or by path tracing.
+    """Draw lit smoke: by a ray march towards each light, with predicted multiple scattering, or by path tracing.
 
-    Without --light, --point and --sky the lights are those of the scene, or one from 1,1,1. The march takes a sky as
-    twelve lights, and draws a scene's obstacles and their shadows. Path tracing has no bias and states its noise; in
-    it obstacles absorb all light, fire emits grey light, and the background is black or the sky.
+    Without --light, --point and --sky the lights are those of the scene, or else one from 1,1,1. The march replaces a
+    sky by twelve lights, and draws a scene's obstacles with their shadows. Path tracing is unbiased and prints its
+    noise; obstacles then absorb all light, fire emits grey light, and the background is black or the sky.
     """
     if samples is not None and background is not None:
         raise WlmError("--background: expected none with --samples: a traced picture shows only the sky")
@@ -348,15 +348,15 @@ def run(
     albedo: _Albedo = None,
     network: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Make the six-way lightmaps by this network of wlm smoke train."),
+        typer.Option(metavar="FILE", help="Make the six-way lightmaps with this network from wlm smoke train."),
     ] = None,
     white: White = 1.0,
     device: Device = "cpu",
 ) -> None:
     """Simulate a scene, light it and draw it frame by frame, without intermediate files.
 
-    The lights and the fire of the scene illuminate the smoke with all orders of scattering. The table has the median
-    time of each stage; on a GPU a CUDA graph replaces the stages of the light after some frames.
+    The lights and the fire of the scene illuminate the smoke with all orders of scattering. A table shows the median
+    time of each stage; on a GPU, after some frames, one CUDA graph does all lighting stages.
     """
     check_white(white)
     if orders == "all" and network is not None:
@@ -405,7 +405,7 @@ def run(
 
 
 def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
-    """Reads the numbers of `--albedo`, one for all colours or three; None if it is not given."""
+    """Parses `--albedo`, one number or R,G,B; None if it is not given."""
     if text is None:
         return None
     values = vector("--albedo", text if "," in text else ",".join([text] * 3))
@@ -415,7 +415,7 @@ def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _checked(option: str, make: Callable[..., Any], *values: Any) -> Any:
-    """Calls a function of an option's values; its ValueError becomes one line that names the option."""
+    """Calls `make` with an option's values; a ValueError becomes a WlmError that names the option."""
     try:
         return make(*values)
     except ValueError as error:
@@ -430,7 +430,7 @@ def _sky_lights(radiance: tuple[float, float, float]) -> "tuple[Light, ...]":
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    """Returns the lights of `--light` and `--point`."""
+    """Parses the lights given by `--light` and `--point`."""
     from wlm.smoke.camera import unit
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lights import PointLight, checked_colour

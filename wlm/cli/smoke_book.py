@@ -32,7 +32,7 @@ _Lightmaps = Annotated[
 ]
 _With = Annotated[
     list[Path] | None,
-    typer.Option("--with", metavar="TEXTURE", help="Second texture of a flip book; repeat for one of its opacity."),
+    typer.Option("--with", metavar="TEXTURE", help="Second texture of a flip book; repeat for an opacity texture."),
 ]
 _Cells = Annotated[
     str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book given by --with, such as 8x8.")
@@ -47,7 +47,7 @@ _Straight = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands to `wlm smoke`."""
+    """Adds the commands `shade` and `flipbook` to the group `wlm smoke`."""
     app.command()(shade)
     app.command()(flipbook)
 
@@ -72,8 +72,8 @@ def shade(
 ) -> None:
     """Light six-way lightmaps into PNGs; a folder of frames also gets the scene's obstacles and a contact sheet.
 
-    Without --light the lights are those of the scene, or one from 1,1,1. The default irradiance, 4 pi, shows a lightmap
-    unchanged.
+    Without --light the lights are those of the scene, or else one from 1,1,1. With the default irradiance, 4 pi, light
+    along an axis shows that axis's lightmap unchanged.
     """
     check_white(white)
     lights = [_light(text) for text in light or ()]
@@ -118,7 +118,7 @@ def flipbook(
     count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
     gain: Annotated[
         float | None,
-        typer.Option(help="Factor on the light; default 1 in an .exr, else the greatest without clipping."),
+        typer.Option(help="Factor on the light; default 1 in an .exr, else the largest that does not clip."),
     ] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default the scene's, or 25.")] = None,
     textures: _With = None,
@@ -136,9 +136,9 @@ def flipbook(
     ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Pack six-way lightmaps into a flip book: two textures for an importer, or a folder with shader and kit.
+    """Pack six-way lightmaps into a flip book: two textures, or a folder that also has a shader.
 
-    A folder has the textures, a shader that plays and lights them, and with --engine what puts them together.
+    A folder has the textures, a shader that plays and lights them, and with --engine files that show it in the engine.
     """
     in_files = bool(output.suffix) and not output.is_dir()
     if in_files:
@@ -197,7 +197,7 @@ def _source(
     straight: bool,
     device: str,
 ) -> "_Source":
-    """Opens lightmaps or a flip book; returns whether there is one frame, and a function that yields some frames."""
+    """Opens lightmaps or a flip book. Returns whether it has a single frame, and a function that yields frames."""
     from wlm.interop import check_device
     from wlm.smoke.data import six_way_files, spread
     from wlm.smoke.flipbook.book import Shot, is_straight, read_flipbook, read_shots

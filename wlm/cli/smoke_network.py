@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands to `wlm smoke`."""
+    """Adds the commands `train` and `export-onnx` to the group `wlm smoke`."""
     app.command(cls=Generated)(train)
     app.command("export-onnx")(export_onnx)
 
@@ -56,10 +56,10 @@ def train(
     seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
-    """Train a network on smoke that is simulated during the training, and keep the best of its validations.
+    """Train a network on smoke simulated during the training, and keep the state with the best validation.
 
     The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
-    to continue exactly. NETWORK.csv has the curves.
+    to continue exactly. NETWORK.csv has the loss curves.
     """
     check_output(output, ".safetensors")
     quiet_warp()
@@ -119,15 +119,15 @@ def evaluate(
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the images in pixels.")] = 512,
     cells: Annotated[
-        int | None, typer.Option(min=16, max=512, help="Cells of the air along an edge; default as in the training.")
+        int | None, typer.Option(min=16, max=512, help="Edge of the test simulation in cells; default as trained.")
     ] = None,
     json_path: ReportFile = None,
     device: Device = "cpu",
 ) -> None:
     """Measure a network on smoke that it was not trained on.
 
-    The test smoke is simulated, at half, once and twice its density. PSNR compares the lightmaps in sRGB. Flicker is
-    the change from frame to frame beyond the motion, relative to that of the reference.
+    The test smoke is simulated and scored at half, full and twice its density. PSNR compares lightmaps in sRGB. Flicker
+    is the change between frames that motion does not explain, relative to the reference's flicker.
     """
     if json_path is not None:
         check_output(json_path, ".json")

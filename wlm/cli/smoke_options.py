@@ -112,7 +112,7 @@ def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
-    """Reads the values of a repeatable option NAME=VALUE with known names."""
+    """Parses a repeatable option NAME=VALUE; returns the values by name. Unknown names are errors."""
     values = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
@@ -130,7 +130,7 @@ def _float(option: str, text: str) -> float:
 
 
 def vector(option: str, text: str) -> tuple[float, float, float]:
-    """Reads three finite numbers from the text of an option."""
+    """Parses three finite numbers, such as 0,0.5,1, from the text of an option."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -141,7 +141,7 @@ def vector(option: str, text: str) -> tuple[float, float, float]:
 
 
 def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
-    """Reads `X,Y,Z`, `X,Y,Z:R,G,B`, or `X,Y,Z:E` of a white light: one or two triples."""
+    """Parses `X,Y,Z`, `X,Y,Z:R,G,B` or, for white light, `X,Y,Z:E`. Returns one or two triples."""
     place, colon, colour = text.partition(":")
     values = [vector(option, place)]
     if colon:
@@ -156,7 +156,7 @@ def check_white(white: float) -> None:
 
 
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *others: str) -> Callable[[int], Path]:
-    """Checks the output, a file or for frames a folder, and returns a function for the file of a frame.
+    """Checks the output (a file, or a folder for several frames). Returns a function from frame to file path.
 
     The frames in a folder have the first suffix.
     """
@@ -191,10 +191,10 @@ def write_lightmaps(
         camera: The camera of all frames.
         output: A file, or for frames a folder.
         make: Makes the lightmaps of a volume.
-        settings: JSON values that the results depend on besides smoke and camera. An "albedo" other than None is part
-            of the lightmaps already.
+        settings: JSON values that the results depend on, besides smoke and camera. An "albedo" other than None means
+            that the lightmaps already include it.
         resume: Whether to keep the frames that an interrupted run of the same settings has made.
-        errors: Whether the lightmaps have the error of their step.
+        errors: Whether the lightmaps state the error due to the step length.
     """
     from wlm.smoke.data import NumberedFiles, write_six_way
     from wlm.smoke.march.coarse import with_surface

@@ -31,7 +31,7 @@ Detect = Callable[[Path], str]
 
 
 class Verb(TyperCommand):
-    """A command with the options of the system that its first argument belongs to."""
+    """A command whose options depend on the system (lightmap, atlas, probe or smoke) of its first argument."""
 
     detect: Detect = staticmethod(_model_system)
 
@@ -65,14 +65,14 @@ def register(
             str | None, typer.Option(metavar="|".join(SYSTEMS), help="Choose the system instead of detecting it.")
         ] = None,
     ) -> None:
-        """Only describes the verb; a call with a file runs the function of the file's system."""
+        """Placeholder that describes the verb in `--help`; a call with a file runs the function for that file."""
 
     kind = type(f"Verb{name.title()}", (Verb,), {"detect": staticmethod(detect)})
     app.command(name, cls=kind, help=help_text)(general)
 
 
 def functions(verb: str) -> dict[str, Callable[..., None]]:
-    """Returns the functions of a verb by system, for the systems that have the verb."""
+    """Returns the functions that do the work of a verb, by name of the system; systems without it are left out."""
     modules = {system: import_module(f"wlm.cli.{system}") for system in SYSTEMS}
     return {system: getattr(module, verb) for system, module in modules.items() if hasattr(module, verb)}
 
@@ -110,7 +110,7 @@ def first_argument(words: Sequence[str], options: Mapping[str, bool]) -> str | N
 
 
 def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
-    """Removes `--system NAME` from a command line; an unknown name is an error."""
+    """Removes `--system NAME` from a command line. Returns the other words, and the name or None."""
     words, system, rest = [], None, iter(args)
     for word in rest:
         if word == "--system" or word.startswith("--system="):
@@ -123,7 +123,7 @@ def _without_system(args: Sequence[str]) -> tuple[list[str], str | None]:
 
 
 def _options(verb: str) -> dict[str, bool]:
-    """Returns for each explicit option of a verb whether it takes a value."""
+    """Returns, for each option of a verb that is not generated from a setting, whether it takes a value."""
     found = {}
     for function in functions(verb).values():
         for name, parameter in inspect.signature(function).parameters.items():

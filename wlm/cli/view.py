@@ -20,16 +20,16 @@ def view(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr per frame).",
+            help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr a frame).",
         ),
     ],
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
     view: Annotated[
-        str | None, typer.Option(help="Drawing: light or tiles; for probes balls, gaussians or volume.")
+        str | None, typer.Option(help="View: light or tiles; for probes: balls, gaussians or volume.")
     ] = None,
-    outside: Annotated[bool, typer.Option("--outside", help="Also draw walls whose outside hides the room.")] = False,
+    outside: Annotated[bool, typer.Option("--outside", help="Also draw walls seen from outside the room.")] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
         list[str] | None,
@@ -49,7 +49,7 @@ def view(
     ] = None,
     up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames per second of an animation or of frames.")] = 24.0,
-    frames: Annotated[int | None, typer.Option(help="Pictures of an animation; default 48, or all frames.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Pictures in an animation; default 48, or all frames.")] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write a picture; needs no display.")

@@ -22,7 +22,7 @@ def web(
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
-    hours: Annotated[int, typer.Option(min=1, help="Most lightmaps of the original set that the page contains.")] = 6,
+    hours: Annotated[int, typer.Option(min=1, help="Largest number of original lightmaps in the page.")] = 6,
     rate: Annotated[float, typer.Option(help="Frames per second of smoke.")] = 30.0,
     up: Up = "y",
 ) -> None:

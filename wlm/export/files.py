@@ -1,4 +1,4 @@
-"""Files of a bundle's textures and buffers, and their entries in the index of a folder."""
+"""Writes the files of a bundle's textures and buffers, and their entries for the index of a folder."""
 
 from pathlib import Path
 from typing import Any

@@ -27,7 +27,7 @@ def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp
     """Checks that there is enough free memory for a grid.
 
     Raises:
-        WlmError: There is not; the message names the grid, both sizes and a remedy.
+        WlmError: There is not enough; the message names the grid, the required and free memory, and a remedy.
     """
     free = free_memory(device)
     if needed > free:
@@ -45,10 +45,10 @@ class Engine:
         spec: The settings that change the code of a step.
         device: The device.
         cells: X Y Z.
-        done: Steps done by this object's own launches; replays of a user's graph are counted only in `clock`.
+        done: Steps that this object launched itself; replays of a user's CUDA graph are counted only in `clock`.
         clock, trouble: See `wlm_kernels.fluid.lattice.step_kernel`.
         solid: uint8 [N], or [0] while no cell has ever been solid.
-        bodies: Motion of the solids.
+        bodies: Velocities and rotations of the solids.
     """
 
     def __init__(self, shape: tuple[int, int, int], spec: Spec, tau: float, eddy: float, rise: float, device) -> None:
@@ -74,7 +74,7 @@ class Engine:
 
     @staticmethod
     def bytes_needed(cells: int, lattice: str, storage: str) -> int:
-        """Returns the memory of the populations in bytes, by far the largest part."""
+        """Returns the size in bytes of the two buffers of populations, by far the largest part of the memory."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
         return 2 * len(velocity_set(lattice).c) * cells * size
 
@@ -89,7 +89,7 @@ class Engine:
     # Setting up.
 
     def set_faces(self, faces: Mapping[str, Face]) -> None:
-        """Sets the boundary conditions at the domain's faces; `prepare` makes their links."""
+        """Sets the boundary conditions at the domain's faces; `prepare` makes the links that apply them."""
         self._faces = dict(faces)
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
@@ -103,7 +103,7 @@ class Engine:
         self._graph = None
 
     def prepare(self) -> float:
-        """Makes the links if faces have been set, and returns the speed of the fastest solid."""
+        """Makes the links of faces that have been set, and returns the speed of the fastest solid in cells per step."""
         if self._links is not None:
             return 0.0
         self._bounded = wp.vec3i(*bounded_axes(self._faces))
@@ -119,7 +119,7 @@ class Engine:
         return self.find_links()
 
     def start(self, drho: wp.array, u: wp.array) -> None:
-        """Sets all air to an equilibrium."""
+        """Sets all air to the equilibrium of a density minus 1 and a velocity per cell."""
         now, spare = self.buffers
         spare.zero_()
         self._sums.zero_()
@@ -127,7 +127,7 @@ class Engine:
         self._apply_links(0, now)
 
     def cover(self, new: wp.array) -> float:
-        """Sets which cells are solid, uint8 [N], and returns the speed of the fastest solid."""
+        """Sets which cells are solid, uint8 [N], and returns the speed of the fastest solid in cells per step."""
         if self.solid.shape[0] == 0:
             self.solid = self.zeros(self.cells, wp.uint8)
             self._graph = None
@@ -192,12 +192,12 @@ class Engine:
     # Running.
 
     def run(self, steps: int) -> None:
-        """Queues steps."""
+        """Launches steps without waiting for the device."""
         for _ in range(steps):
             self._step()
 
     def run_in_graphs(self, steps: int) -> None:
-        """Queues steps as replays of a CUDA graph of `PERIOD` steps; remaining steps run without the graph."""
+        """Launches steps as replays of a CUDA graph of `PERIOD` steps; remaining steps run without the graph."""
         while steps > 0:
             if steps < PERIOD or self.done % PERIOD or self._graph is None:
                 # The first steps load the kernels' modules, which is not allowed during a capture.

@@ -24,7 +24,7 @@ class Face:
         rank: uint8 [A, B], precedence along the domain's edges.
         kind: uint8 [A, B], kinds of `lattice_links`.
         velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
-        excess: Density minus 1 of an outlet with a given density.
+        excess: Density minus 1 to which an outlet of given density relaxes.
     """
 
     rank: np.ndarray
@@ -51,7 +51,7 @@ def _velocity(size: tuple[int, int], velocity) -> np.ndarray:
 
 
 def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip: bool = False) -> Face:
-    """Makes a no-slip wall, or a slip wall, which has no velocity."""
+    """Makes a no-slip wall that moves at a velocity, or a wall without friction (`slip`), which has no velocity."""
     size = _size(shape, face)
     velocity = _velocity(size, velocity)
     if slip:
@@ -100,8 +100,7 @@ def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
 
 
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
-    """Returns the kinds of the two ends of each axis for smoke, see `advection_places`; a face that is not entirely a
-    wall is open."""
+    """Returns the kinds of each axis's two ends for smoke: periodic, closed if all of the face is a wall, or open."""
     ends = []
     for name in FACES:
         walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()

@@ -120,7 +120,7 @@ class Lattice:
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
-        """Returns the memory of a lattice without its small arrays, in bytes; arguments as for the class."""
+        """Returns the memory in bytes of a lattice, without small arrays; arguments as for the class."""
         return Engine.bytes_needed(math.prod(shape), lattice, storage)
 
     # Setting up.
@@ -141,7 +141,7 @@ class Lattice:
         Args:
             face: As for `set_wall`.
             velocity: Cells per step; (3,) or [A, B, 3] for the face's cells.
-            where: bool [A, B], the open part; None: the whole face. The rest is a wall.
+            where: bool [A, B], true in the open part of the face; elsewhere it is a wall. None: the whole face is open.
         """
         self._set_face(face, fluid_faces.inlet(self.shape, face, velocity, where))
 
@@ -236,20 +236,20 @@ class Lattice:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Runs steps, and `check` after every `CHECK_EVERY` of them.
+        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them.
 
         During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps and the
         number of earlier steps must then be multiples of `period`.
 
         Raises:
-            WlmError: As `check`.
+            WlmError: As for `check`.
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
         engine = self._engine
         if self.device.is_cuda and self.device.is_capturing:
             if not self._begun or steps % PERIOD or engine.done % PERIOD:
-                raise ValueError(f"steps: expected, in a graph, a multiple of {PERIOD} after eager ones, got {steps}")
+                raise ValueError(f"steps: in a graph, expected a multiple of {PERIOD} after eager steps, got {steps}")
             engine.run(steps)
             return
         self._prepare()

@@ -84,7 +84,7 @@ class Trajectory:
 
     @property
     def moves(self) -> bool:
-        """Whether the positions differ."""
+        """Whether the trajectory moves, that is whether its positions differ."""
         return bool((self.positions != self.positions[0]).any())
 
     def at(self, time: float) -> np.ndarray:
@@ -156,7 +156,7 @@ class Mesh:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks cells; see `Sphere.cover`."""
+        """Marks the cells inside the mesh; see `Sphere.cover`."""
         device = str(solid.device)
         if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)

@@ -93,7 +93,7 @@ class Buoyancy:
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """Returns the memory of a cell of smoke in bytes; arguments as for `Solver`."""
+    """Returns the memory in bytes of one cell of smoke; arguments as for `Solver`."""
     fields = _buffers(scheme) * (2 if temperature else 1)
     return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
@@ -102,7 +102,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
     """Checks that a grid of smoke can be indexed and allocated.
 
     Raises:
-        WlmError: It cannot.
+        WlmError: The grid has too many cells or does not fit into the memory.
     """
     x, y, z = shape
     if x * y * z >= 2**31:
@@ -170,11 +170,11 @@ class Solver:
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
         if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
-            raise ValueError(f"dissipation, cooling: expected 0 or {LEAST_HALF_LOSS:.2g} a step and more with float16")
+            raise ValueError(f"dissipation, cooling: expected 0 or {LEAST_HALF_LOSS:.2g} or more per step with float16")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
-            raise ValueError("temperature: expected True, since something asks for one")
+            raise ValueError("temperature: expected True for these sources, buoyancy or cooling")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.shape = tuple(refinement * size for size in lattice.shape)
@@ -220,7 +220,7 @@ class Solver:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Runs steps.
+        """Advances air and smoke by a number of steps.
 
         During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps, and the
         number of earlier steps, must then be multiples of `period`, `substeps` a multiple of the lattice's `period`,
@@ -235,8 +235,8 @@ class Solver:
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
-                f"steps: expected, in a graph, a multiple of {self.period} after eager ones, substeps that are one of"
-                f" {self.lattice.period} and obstacles at rest"
+                f"steps: in a graph, expected a multiple of {self.period} after eager steps, substeps a multiple of"
+                f" {self.lattice.period}, and obstacles at rest"
             )
         for _ in range(steps):
             if not capturing:
@@ -248,7 +248,7 @@ class Solver:
         """Checks that the air has not blown up; waits for the device.
 
         Raises:
-            WlmError: It has; the message names step, cell, cause and the state that was saved or loaded last.
+            WlmError: The air blew up; the message names step, cell, cause and the state that was saved or loaded last.
         """
         with self._naming_checkpoint():
             self.lattice.check()
@@ -267,7 +267,7 @@ class Solver:
 
     @property
     def temperature(self) -> wp.array | None:
-        """The temperature, as the density; None if the smoke has none."""
+        """The temperature, an array like the density; None if the smoke has none."""
         values = self._fields[0].temperature
         return values.reshape(self.shape) if values.size else None
 
@@ -382,12 +382,12 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
-        """Remembers the file of a state for error messages; steps are those of the lattice."""
+        """Remembers the file of the last saved state, and the lattice's number of steps in it, for error messages."""
         self._kept = f"; the state of step {int(steps)} is kept in {path}"
 
     @contextmanager
     def _naming_checkpoint(self) -> Iterator[None]:
-        """Adds the file of the last state to error messages."""
+        """Adds the file of the last saved state to error messages."""
         try:
             yield
         except WlmError as error:

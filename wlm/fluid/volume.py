@@ -307,7 +307,7 @@ def _check(
 
 
 def _found(bad: torch.Tensor) -> tuple[int, tuple[int, ...]]:
-    """Returns the number of bad voxels, and the first one."""
+    """Returns the number of bad voxels and the position of the first."""
     first = np.unravel_index(int(bad.flatten().to(torch.uint8).argmax()), bad.shape)
     return int(bad.sum()), tuple(int(i) for i in first)
 
@@ -416,7 +416,7 @@ def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
     if not file.names:
         raise WlmError(f"{path}: expected a grid of floats, found {', '.join(file.others) or 'no grid'}")
     if names[0] is None and (other := next((o for o in file.others if o.startswith(f"{_DENSITY} (")), None)):
-        raise WlmError(f"{path}: expected a grid of floats for the density, found {other}; name another")
+        raise WlmError(f"{path}: expected a grid of floats for the density, found {other}; choose another grid")
     most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(data)))
     grids = []
     for name in _choose(path, file.names, names):

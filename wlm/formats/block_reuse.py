@@ -45,7 +45,7 @@ def reuse_in_order(
     Args:
         blocks: uint8 [n, 16].
         decoded, target, weight, allowed: float32 [n, V], V values per block; see `reuse_blocks`.
-        window: Number of preceding blocks that are tried.
+        window: Number of preceding blocks that are tried as replacements.
 
     Returns:
         uint8 [n, 16].

@@ -78,7 +78,7 @@ def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_B
 
 @contextmanager
 def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
-    """Turns exceptions that damaged data causes in the block into a one-line error of a message and the reason.
+    """Turns the given exceptions, raised in the block by damaged data, into a one-line error: message and reason.
 
     Raises:
         WlmError: One of the exceptions was raised, or a WlmError, which is passed on unchanged.

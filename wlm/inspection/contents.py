@@ -19,9 +19,9 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
         files: One file or folder, or six-way lightmaps of smoke, one EXR a frame.
 
     Returns:
-        The kind, and the files; those of a folder of six-way lightmaps are listed. The kind is the system of a model
-        ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of smoke
-        or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
+        The kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
+        model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
+        smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
 
     Raises:
         WlmError: There is no file, a file is missing or cannot be read, or there are several of another kind than
@@ -49,10 +49,10 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
 
 
 def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> None:
-    """Checks that the options for a file have a meaning for its kind.
+    """Checks that the options `given` with a file are among those `known` for its kind.
 
     Raises:
-        WlmError: One has none.
+        WlmError: An option has no meaning for this kind of file.
     """
     for name in given:
         if name not in known:

@@ -1,7 +1,7 @@
 """Describes single files by their content and, where that is not enough, by their names.
 
-`_KINDS` is the one table of the kinds of files: `inspect` describes a file by it, and `wlm compress` finds the system
-of its input.
+`_KINDS` is the table of all kinds of files. `inspect` uses it to describe a file, and `wlm compress` to find the system
+that compresses its input.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,7 +72,7 @@ def kind_of(path: Path) -> str:
 
 
 def inspect_file(path: Path) -> Finding:
-    """Describes a file. An unreadable file gives a finding, not an error."""
+    """Describes a file. An unreadable file gives a `Finding` with a problem, not an error."""
     try:
         if kind := kind_of(path):
             return _KINDS[kind].inspect(path)
@@ -84,7 +84,7 @@ def inspect_file(path: Path) -> Finding:
 
 
 def file_system(path: Path) -> str:
-    """Returns the system that compresses a file, "" if there is none.
+    """Returns the system that compresses a file ("lightmap", "atlas", "probe" or "smoke"), "" if there is none.
 
     Raises:
         WlmError: The file cannot be read.
@@ -94,7 +94,7 @@ def file_system(path: Path) -> str:
 
 
 def document_of(path: Path) -> str | None:
-    """Returns the description of one of our JSON documents; None for other files and unreadable ones."""
+    """Returns the description of a JSON file that wlm knows; None for other files and unreadable ones."""
     try:
         content = read_json_file(path, "the file")
     except WlmError:
@@ -114,7 +114,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _value_names(names: Sequence[str]) -> list[str]:
-    """Returns the arrays of an .npz that hold probes; none if there are no positions."""
+    """Returns the names of the arrays of an .npz that hold probe values; none if it has no positions."""
     return [name for name in names if name.startswith("sh")] if "position" in names else []
 
 

@@ -31,10 +31,10 @@ class Finding:
 
 
 def command(*words: str | Path) -> str:
-    """Writes a `wlm` command, quoted for a shell."""
+    """Returns a `wlm` command line of the words, quoted for a shell."""
     return shlex.join(["wlm", *map(str, words)])
 
 
 def compress_command(*words: str | Path) -> str:
-    """Writes the command that compresses inputs with some options."""
+    """Returns the command line that compresses the given inputs, with options among the words."""
     return command("compress", *words, "-o", "OUT.wlm")

@@ -1,4 +1,4 @@
-"""Describes folders: files that belong together, and the other files in them."""
+"""Describes folders: groups of files that belong together, and single files."""
 
 import os
 import re
@@ -84,7 +84,7 @@ _REFUSED = {
 
 
 def _folder_system(folder: Path) -> str:
-    """Returns the system of a folder, a key of `_REFUSED`, or ""."""
+    """Returns the system that compresses a folder, a key of `_REFUSED` if it cannot be compressed, or ""."""
     if (folder / SET_FILE).is_file() or state_folders(folder):
         return "lightmap"
     files = [entry for entry in _entries(folder) if entry.is_file()]
@@ -99,7 +99,7 @@ def _folder_system(folder: Path) -> str:
 
 
 def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
-    """Describes a folder in a number of findings; also returns the folders in it that belong to none of them."""
+    """Describes a folder in at most `most` findings; also returns the subfolders that no finding covers."""
     findings: list[Finding] = []
     taken: set[Path] = set()
     try:
@@ -258,7 +258,7 @@ def _may_have_alpha(file: Path) -> bool:
 
 
 def _light(files: Sequence[Path]) -> dict[Path, Picture]:
-    """Reads the headers of all readable pictures of light, except reflection probes."""
+    """Returns the headers of all readable pictures of light among the files, except reflection probes."""
     found = {}
     for file in files:
         if file.suffix.lower() in SUFFIXES:

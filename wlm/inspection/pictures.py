@@ -41,18 +41,18 @@ class Picture:
 
     @property
     def size(self) -> str:
-        """The size as text."""
+        """Width and height in pixels as text, such as "512x256"."""
         return f"{self.width}x{self.height}"
 
     @property
     def is_cube(self) -> bool:
-        """Whether the sides are those of the six faces of a cube in a row."""
+        """Whether the picture has the shape of a cube map: six square faces in a row or a column."""
         short, long = sorted((self.width, self.height))
         return short > 0 and long == _FACES * short
 
     @property
     def is_six_way(self) -> bool:
-        """Whether there is a channel for the light from each of the six directions."""
+        """Whether the channels are those of a six-way lightmap of smoke: light from each of six directions."""
         if len(self.channels) < _FACES:
             return False
         # This imports torch, which takes seconds.
@@ -114,7 +114,7 @@ def inspect_picture(path: Path) -> Finding:
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
-    """Finds values in a picture [H, W, 3 or 4] that are unusual for radiance."""
+    """Returns one line for each kind of value in a picture [H, W, 3 or 4] that is unusual for radiance."""
     light = pixels[..., :3]
     problems = []
     finite = np.isfinite(light).all(-1)
@@ -139,7 +139,7 @@ def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
 
 
 def _from_level(light: np.ndarray) -> float:
-    """Returns the mean distance of values [N, 3] from the nearest of 256 levels, in levels."""
+    """Returns the mean distance of values [N, 3] from the nearest of 256 8-bit levels, in units of a level."""
     codes = light[:: max(1, len(light) // 65536)] * _LEVELS
     return float(np.abs(codes - np.rint(codes)).mean())
 

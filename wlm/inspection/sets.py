@@ -14,7 +14,7 @@ UNREADABLE_SET = "a lightmap set that cannot be read"
 
 
 def inspect_set(path: Path) -> Finding:
-    """Describes the set that a `set.json` lists, and its missing files."""
+    """Describes the lightmap set that a `set.json` lists, and names its missing files."""
     try:
         listing = list_set(path)
         if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):

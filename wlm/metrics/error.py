@@ -47,7 +47,7 @@ def check_pair(
 
 
 def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean squared error over the valid texels and all channels of linear images [H, W, C]; NaN with an empty mask.
+    """Returns the mean squared error over valid texels and channels of linear images [H, W, C]; NaN if none is valid.
 
     `mask`, [H, W], is true where a texel counts; None counts all.
 
@@ -61,8 +61,8 @@ def mse(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> fl
 
 
 def dynamic_range(ref: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Maximum minus minimum of a linear image [H, W, C] over the valid texels (neural-dynamic-gi, section 10.2); see
-    `mse`.
+    """Returns the maximum minus the minimum of a linear image [H, W, C] over the valid texels (neural-dynamic-gi,
+    section 10.2); see `mse`.
 
     Raises:
         WlmError: The mask does not fit, or a valid texel is NaN or infinite.
@@ -100,7 +100,7 @@ def psnr_from_mse(error: float, peak: float) -> float:
 
 
 def half_ulp(value: float) -> float:
-    """Step between neighbouring half floats at `value`: the resolution of a stored lightmap.
+    """Returns the step between neighbouring half floats at `value`: the resolution of a stored lightmap.
 
     Args:
         value: Any finite number; magnitudes above 65,504 return the step of the largest half float.

@@ -32,7 +32,7 @@ _EXPOSED_LIMIT = 60.0
 
 
 def flip_exposures(ref: np.ndarray, mask: np.ndarray | None = None) -> tuple[float, float] | None:
-    """First and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+    """Chooses the first and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
 
     HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
     the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
@@ -74,7 +74,7 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
 
 
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None, exposures: int = 2) -> np.ndarray:
-    """FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
+    """Computes the HDR-FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
 
     Negative values count as zero. If no valid texel of the reference is above zero, no exposure can be chosen: the
     error is zero if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].

@@ -15,7 +15,7 @@ _SIGMA = 1.5
 
 
 def ssim_map(ref: np.ndarray, test: np.ndarray, data_range: float) -> np.ndarray:
-    """Structural similarity at every texel, averaged over the channels.
+    """Computes the structural similarity (SSIM) at every texel, averaged over the channels.
 
     Args:
         ref: `[H, W, C]`, linear, finite, at least `SSIM_WINDOW` high and wide.
@@ -50,7 +50,7 @@ def ssim_map(ref: np.ndarray, test: np.ndarray, data_range: float) -> np.ndarray
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, data_range: float | None = None) -> float:
-    """Mean SSIM over the valid texels whose window lies inside the image (Wang et al. 2004).
+    """Returns the mean SSIM over the valid texels whose window lies inside the image (Wang et al. 2004).
 
     Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
     affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
@@ -77,7 +77,7 @@ def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None, data
 
 
 def ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_range: float | None) -> float:
-    """`ssim` for float64 images that are checked and already equal outside the mask."""
+    """Computes `ssim` of float64 images that are already checked, and equal outside the mask."""
     inner = np.zeros_like(valid)
     border = SSIM_WINDOW // 2
     inner[border:-border, border:-border] = valid[border:-border, border:-border]

@@ -1,4 +1,4 @@
-"""Light probes as 3D Gaussians and a small network (gaussian-probe-compression), or as principal components."""
+"""Compresses light probes to 3D Gaussians and a network (gaussian-probe-compression), or to principal components."""
 
 from wlm._facade import facade
 

@@ -1,4 +1,4 @@
-"""The bundle of a model: buffers, shader, document and reference."""
+"""Makes the bundle of a model for GPUs: buffers, shader, description and reference values."""
 
 import numpy as np
 
@@ -18,19 +18,19 @@ _ABOUT = {
 
 
 def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
-    """Returns what a GPU holds of a model, in the layout of the model's method.
+    """Returns a model's data for a GPU, in the layout of the model's method.
 
     Args:
         model: The model.
-        device: Where the reference is decoded, "cpu" or "cuda:N".
+        device: Where the reference values are decoded, "cpu" or "cuda:N".
 
     Returns:
-        Gaussians: buffers `gaussians` and `network`; principal components: buffer `probes`; and `positions` if the
-        model stores them. The reference has `values` float32 [M, D], at points `position` float64 [M, 3] of
-        Gaussians, or of the live probes `live` int32 [M] of components.
+        The buffers `gaussians` and `network` for Gaussians, or `probes` for principal components; and `positions` if
+        the model stores them. The reference has the decoded `values`, float32 [M, D], with their points `position`,
+        float64 [M, 3], for Gaussians, or the live probes' numbers `live`, int32 [M], for principal components.
 
     Raises:
-        WlmError: The device does not exist, the light is not finite, or a number does not fit floats.
+        WlmError: The device does not exist, the light is not finite, or a number exceeds float32.
     """
     form = model.content.gpu_form(model, model.decoder(device))
     if not np.isfinite(form.reference["values"]).all():

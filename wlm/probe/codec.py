@@ -1,6 +1,6 @@
-"""Probe models in files.
+"""Reads and writes probe models as files.
 
-A file is a compact artifact (`wlm.formats.compact`), so that a handful of probes is not mostly header. Its body is
+A file is a compact artifact (`wlm.formats.compact`), whose header is small even for a few probes. Its body is
 
 =========  =======================================================================================================
 field      content
@@ -62,7 +62,7 @@ class _NameHeader(Header):
 
 
 def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns settings, parts and source of a model's file, as `wlm.formats.artifact` takes them.
+    """Returns the settings, parts and source hash of a model's file, as `wlm.formats.artifact` takes them.
 
     Raises:
         ValueError: The content has not been quantised.
@@ -89,7 +89,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> ProbeModel:
-    """Builds the model of a file; everything that `encode` stored comes back bit for bit, except the end of the source.
+    """Builds the model of a file; all that `encode` stored is restored bit for bit, except the end of the source hash.
 
     Raises:
         WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
@@ -138,7 +138,7 @@ def decode(artifact: Artifact) -> ProbeModel:
 
 
 def _table(header: _Header) -> dict[str, Part]:
-    """Returns the table of parts of a file."""
+    """Returns the types and shapes of a file's parts, by name."""
     live = header.probes if header.live is None else header.live
     table = {"box": Part(np.float64, (7,))}
     if header.live is not None:
@@ -151,7 +151,7 @@ def _table(header: _Header) -> dict[str, Part]:
 
 
 def _planes(part: np.ndarray) -> bytes:
-    """Returns the bytes of a part, plane by plane."""
+    """Returns the bytes of a part, split into planes: first the lowest byte of every number, then the next bytes."""
     if part.dtype == np.int32:
         part = ((part << 1) ^ (part >> 31)).view(np.uint32)
     little = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
@@ -159,7 +159,7 @@ def _planes(part: np.ndarray) -> bytes:
 
 
 def _split(frame: bytes, table: Mapping[str, Part], size: int) -> dict[str, np.ndarray]:
-    """Unpacks the parts of a frame: undoes `_planes`."""
+    """Returns the parts of a zstd frame, with the planes of `_planes` merged again."""
     sizes = {name: math.prod(part.shape) * np.dtype(part.dtype).itemsize for name, part in table.items()}
     total, most = sum(sizes.values()), _SURE + _PER_BYTE * size
     if total > most:

@@ -1,9 +1,8 @@
-"""Spherical harmonics in the conventions of engines and of this package.
+"""Converts spherical harmonics between the conventions of engines and of this package.
 
 The canonical numbers, those of this package, are the radiance L projected onto the orthonormal real basis, c_lm =
 integral of L Y_lm (gaussian-probe-compression, eq. 1), all signs plus, in the order 1; y, z, x; xy, yz, 3z2-1, xz,
-x2-y2; and so on, m from -l to l in band l. All engines here have that order and differ by one factor for each
-coefficient:
+x2-y2; and so on, m from -l to l in band l. All engines here use this order, and differ by one factor each:
 
 =======  ==========================================  ========  ========================================
 name     type in the engine                          bands     engine's number / canonical number
@@ -16,7 +15,7 @@ unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
 
 - three.js: `getAt` is the radiance and `getIrradianceAt` the irradiance.
 - Godot: the baker averages 4 L Y over the sphere where the integral is 4 pi times the average, so that its shader,
-  which folds in pi, 2 pi / 3 and pi / 4, gets irradiance / pi without a division. Not convolved.
+  which folds in pi, 2 pi / 3 and pi / 4, gets irradiance / pi without a division. Not convolved with the cosine.
 - Unreal: y, x, yz and xz have a minus sign, z, xy, 3z2-1 and x2-y2 have none. Its tables end with band 2. These are the
   vectors of the engine's own maths, not the packed bricks of a volumetric lightmap.
 - Unity: `Evaluate` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
@@ -65,7 +64,7 @@ def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def from_canonical(values: np.ndarray, name: str) -> np.ndarray:
-    """Converts canonical coefficients to an engine's; arguments and errors as for `to_canonical`."""
+    """Converts canonical coefficients to an engine's convention; arguments and errors are those of `to_canonical`."""
     return _checked(values) * _factors(values.shape[1], name)[:, None]
 
 
@@ -76,7 +75,7 @@ def _checked(values: np.ndarray) -> np.ndarray:
 
 
 def _factors(coefficients: int, name: str) -> np.ndarray:
-    """Returns the factors of the module's table, float64 [C]."""
+    """Returns the factors of an engine in the module's table, one per coefficient, float64 [C]."""
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:

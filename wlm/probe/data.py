@@ -1,6 +1,6 @@
-"""The input: light probes at free positions, read from `.npz`, `.json`, Godot's `.lmbake` or Unity's `.asset`.
+"""Reads light probes at free positions from `.npz`, `.json`, Godot's `.lmbake` or Unity's `.asset`.
 
-A probe holds spherical harmonics (gaussian-probe-compression, eq. 1; 3, 12 or 27 numbers there), or any other numbers.
+A probe holds spherical harmonics (gaussian-probe-compression, eq. 1, with 3, 12 or 27 numbers), or any other numbers.
 The table of hard cases in docs/probe.md lists what is repaired and what is refused. `ProbeSet.warnings` has a line for
 each kind of repair; probes are counted from 0.
 """
@@ -52,7 +52,7 @@ class ProbeSet:
             (`wlm.probe.conventions`), RGB last.
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
-        source: 16 hexadecimal digits of BLAKE2b over the positions, the values and `live`.
+        source: Hash of the positions, the values and `live`, 16 hexadecimal digits of BLAKE2b.
         warnings: Repairs, one line each.
         normal: float64 [N, 3], unit normal of each probe's surface, 0 for a probe on no surface; None if unknown.
     """
@@ -68,23 +68,23 @@ class ProbeSet:
 
     @property
     def probes(self) -> int:
-        """Number of probes, N, live and dead."""
+        """The number of probes, N, live and dead."""
         return self.values.shape[0]
 
     @property
     def outputs(self) -> int:
-        """Numbers per probe, D: 27 for L2 in RGB."""
+        """The count of numbers per probe, D: 27 for L2 spherical harmonics in RGB."""
         return self.values.shape[1]
 
     @property
     def float_bytes(self) -> int:
-        """Bytes of the values in float32, with which compressed sizes are compared."""
+        """The bytes of all values in float32, to which compressed sizes are compared."""
         return self.probes * self.outputs * 4
 
 
 @dataclass(frozen=True)
 class _Raw:
-    """The content of a file before it is checked; `key` is the name of `values`, `convention` as the file states it."""
+    """The unchecked content of a file; `key` is the name of `values`, `convention` the name that the file states."""
 
     position: np.ndarray
     values: np.ndarray
@@ -108,8 +108,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"). None takes
             the only array whose name begins with "sh".
         convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
-            own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, otherwise the canonical
-            one.
+            own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, or else canonical.
 
     Returns:
         The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
@@ -130,8 +129,8 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     """Reads the positions of a probe file, or a list of points.
 
     Args:
-        path: A file as for `load`; `.npz` and `.json` need no values. Or JSON, `[[x, y, z], ...]`: a file with any
-            other suffix is read as JSON.
+        path: A file as for `load`; `.npz` and `.json` need no values. Any other file is read as JSON, `[[x, y, z],
+            ...]`.
 
     Returns:
         float64 [M, 3], finite, M at least 1.
@@ -277,7 +276,8 @@ _READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".as
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
-    """Finds the array of values by its name, with or without "sh_", or the only one that begins with "sh"."""
+    """Returns the name of the values' array: the given name, with or without "sh_", or the only one with this
+    prefix."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
@@ -296,7 +296,7 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
 
 
 def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.ndarray, str], np.ndarray]) -> np.ndarray:
-    """Converts [N, C, 3] or [N, D] from or to a convention; the result is [N, C, 3] where D = 3 C, else [N, D]."""
+    """Converts values [N, C, 3] or [N, D] from or to a convention. Returns [N, C, 3] if D = 3 C, else [N, D]."""
     if name not in CONVENTIONS:
         raise WlmError(f"{where}: {_CONVENTION}: expected {', '.join(CONVENTIONS)}, got {name!r}")
     coefficients = sh_count(int(np.prod(values.shape[1:])))
@@ -317,7 +317,7 @@ def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.nda
 
 
 def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
-    """Checks and repairs the content of a file."""
+    """Checks the content of a file and returns it as a set, repaired where possible."""
     position, values, key, beside = _check_positions(where, raw.position), raw.values, raw.key, raw.beside
     count = len(position)
     if values.dtype.kind not in "iuf":
@@ -390,7 +390,7 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
 
 
 def _repeated(position: np.ndarray) -> int:
-    """Counts the probes at the position of an earlier probe."""
+    """Returns how many probes have the same position as an earlier probe."""
     ordered = position[np.lexsort(position.T)]
     return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())
 
@@ -400,7 +400,7 @@ def _probes(count: int) -> str:
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
-    """Returns 16 hexadecimal digits that identify the input, the same on every machine."""
+    """Returns a hash of the input, 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(values.shape, "<i8").tobytes())
     digest.update(np.ascontiguousarray(position, "<f8"))
@@ -410,7 +410,7 @@ def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
 
 
 def _check_valid(where: str, valid: np.ndarray, count: int) -> np.ndarray:
-    """Returns the valid ones of `count` probes, bool [N], for `valid` [N] of true or false or of 0 to 1."""
+    """Returns which of `count` probes are valid, bool [N]. `valid`, [N], has booleans or numbers from 0 to 1."""
     _check_field(where, _VALID, valid, "biuf", (count,))
     bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
     if len(bad):

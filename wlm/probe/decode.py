@@ -1,4 +1,4 @@
-"""The runtime path: light of a model's own probes and of any other points, on a device."""
+"""Decodes at runtime, on a device, the light of a model's own probes and of any other points."""
 
 from abc import ABC, abstractmethod
 
@@ -11,19 +11,19 @@ from wlm.probe.volume.light import Light
 
 
 class Decoder(ABC):
-    """A model on a device; the base of each method's decoder.
+    """A model on a device; the base class of each method's decoder.
 
     Attributes:
-        model, device: The arguments.
+        model, device: The model, and the name of its device.
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
-        """Checks the arguments.
+        """Stores the model after checking the arguments.
 
         Args:
             model: The model.
             device: "cpu" or "cuda:N".
-            position: [N, 3], of the model's own probes, in the order of the fit; None: those stored with the model.
+            position: [N, 3], positions of the model's probes, in the order of the fit; None: those stored with it.
 
         Raises:
             WlmError: The device does not exist, or the positions are not those of the model's probes.
@@ -37,11 +37,11 @@ class Decoder(ABC):
     @property
     @abstractmethod
     def device_bytes(self) -> int:
-        """Bytes of memory that the model takes on the device."""
+        """The bytes of memory that the model takes on the device."""
 
     @abstractmethod
     def decode(self, position: np.ndarray) -> np.ndarray:
-        """Computes the light at any points.
+        """Returns the light at any points.
 
         Args:
             position: [M, 3], in the unit of the probes' positions; points outside the probes' box are moved to its
@@ -57,7 +57,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def decode_probes(self) -> np.ndarray:
-        """Computes the light of the model's own probes, float32 [N, D], zero where a probe is dead.
+        """Returns the light of the model's own probes, float32 [N, D], zero for dead probes.
 
         Raises:
             WlmError: The method needs the positions of the probes, and there are none.
@@ -65,18 +65,18 @@ class Decoder(ABC):
 
     @abstractmethod
     def light(self, position: np.ndarray) -> Light:
-        """Returns the light of probes at positions [N, 3] for a volume, decoded on demand.
+        """Returns a source of light of the probes at positions [N, 3] for a volume, which decodes probes on demand.
 
         Raises:
-            WlmError: A position is not finite, or the model is not of Gaussians and these are not its own probes.
+            WlmError: A position is not finite, or is not a probe's and the model has principal components.
         """
 
     def own_positions(self) -> np.ndarray:
-        """Returns the positions of the model's own probes, float64 [N, 3]; a WlmError if none are known."""
+        """Returns the positions of the model's own probes, float64 [N, 3]; raises a WlmError if none are known."""
         return self.model.stored_positions() if self._position is None else self._position
 
     def check_own(self, position: np.ndarray) -> None:
-        """Raises a WlmError if the number or the box of positions is not that of the model's own probes."""
+        """Raises a WlmError if the positions differ from those of the model's own probes in number or bounding box."""
         if not self.model.has_probes_at(np.asarray(position, np.float64)):
             expected = f"expected the positions of its own {self.model.probes} probes, in their order"
             raise WlmError(f"{self.model.name}: {expected}")

@@ -1,7 +1,7 @@
-"""Scoring decoded probes against their input (gaussian-probe-compression, section 5.2).
+"""Measures the error of decoded probes against the original probes (gaussian-probe-compression, section 5.2).
 
-The paper scores pictures rendered in an engine. This module scores the coefficients themselves, and the irradiance of a
-diffuse surface under them, which needs neither a scene nor a camera; `wlm.probe.views` scores pictures.
+The paper compares pictures rendered in an engine. This module compares the coefficients themselves, and the irradiance
+that they give a diffuse surface, without a scene or a camera; `wlm.probe.views` compares pictures.
 """
 
 import math
@@ -36,21 +36,21 @@ class Report(BaseReport):
 
     Attributes:
         name: Name of the set.
-        probes, live, outputs: N, number of live probes, D.
+        probes, live, outputs: Number of probes N, number of live probes, and numbers per probe D.
         bytes: Size of the file on disk.
         bits_per_probe: `bytes * 8 / N`, over all probes; the paper's bpp.
-        ratio: File bytes over those of the input as float32, `N * D * 4`.
+        ratio: Bytes of the file divided by `N * D * 4`, the bytes of the input in float32.
         gpu_bytes: Bytes of the buffers that a GPU holds; 0 if unknown.
         peak: Range of the input's coefficients.
         psnr: PSNR over all coefficients of all probes.
-        psnr_live: PSNR over the live probes; the others decode to zero exactly.
+        psnr_live: PSNR over the live probes; dead probes decode exactly to zero.
         mse, max_abs_error: Errors over all coefficients of all probes.
-        worst_probe: The probe of the largest mean squared error: `probe` (its index), `psnr` and `position`; None if
-            all are exact.
+        worst_probe: The probe with the largest mean squared error: `probe` (index), `psnr`, `position`; None if all are
+            exact.
         psnr_by_band: PSNR of each SH band over all probes and RGB.
         irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
-            range of the input's irradiance there.
-        warnings: Lost light that the means hide.
+            range of the input's irradiance.
+        warnings: Lines of text about lost light that the means hide.
         between_psnr: The result of `between_psnr`; None if it was not computed.
     """
 
@@ -95,7 +95,7 @@ def evaluate(
         The report.
 
     Raises:
-        WlmError: The device does not exist, or as for `score`.
+        WlmError: The device does not exist, or an error of `score`.
     """
     meter = Meter(progress, "evaluate", 2)
     if len(probes.position) != model.probes:
@@ -125,8 +125,8 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         file_bytes: Size of the compressed file.
 
     Returns:
-        The report. A PSNR is 120 dB at most, the cap of `wlm.metrics`, and NaN if all numbers of the input are equal
-        or no probe is live. The scores of bands and irradiance are None if D is not 3 (l + 1)².
+        The report. A PSNR is 120 dB at most, the cap of `wlm.metrics`, and NaN if all numbers of the input are equal or
+        no probe is live. The PSNRs of bands and irradiance are None if D is not 3 (l + 1)² for any band l.
 
     Raises:
         WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.
@@ -211,12 +211,10 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
 
 
 def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
-    """Scores decoded light half-way from each live probe to its nearest neighbour, where no bake exists.
-
-    The decoder must have the positions of its probes. The reference at those points is the input, interpolated from the
-    eight nearest probes with weights 1 / distance². The PSNR is over the range of the live probes, and NaN for fewer
-    than two of them.
-    """
+    """Returns the PSNR in dB of decoded light half-way from each live probe to its nearest neighbour, where no bake
+    exists. The decoder must have the positions of its probes. The reference at those points is the input, interpolated
+    from the eight nearest probes with weights 1 / distance². The PSNR is over the range of the live probes, and NaN for
+    fewer than two of them."""
     place, values = probes.position[probes.live], probes.values[probes.live]
     if len(place) < 2:
         return float("nan")
@@ -227,7 +225,7 @@ def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
 
 
 def by_distance(probes: ProbeSet, position: np.ndarray, count: int) -> np.ndarray:
-    """Interpolates the nearest live probes at points [M, 3] with weights 1 / distance^2; float64 [M, D]."""
+    """Interpolates the `count` nearest live probes at points [M, 3] with weights 1 / distance^2; float64 [M, D]."""
     place, values = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
     count = min(count, len(place))
     distance, index = cKDTree(place).query(position, k=np.arange(1, count + 1))

@@ -1,4 +1,4 @@
-"""The decode in float64, from a model's stored codes to light: the reference of the kernels."""
+"""Decodes in float64 from a model's stored codes to light: the reference for the kernels."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,10 +12,10 @@ _SHORTEST = 1e-12  # length of a quaternion that has a direction
 
 
 def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
-    """Computes the light of Gaussians at points by the sum over all of them.
+    """Returns the light of Gaussians at points, by the sum over all Gaussians.
 
     Implements gaussian-probe-compression, eq. 2 to 7 and 14. The sum jumps where a Gaussian's support ends, by up to
-    exp(-CUT^2 / 2) = 0.011 times its latent. A point that float32 puts on the other side of an edge differs by that.
+    exp(-CUT^2 / 2) = 0.011 times the Gaussian's latent. A point that float32 rounds across the edge differs.
 
     Args:
         model: A model of Gaussians.
@@ -48,7 +48,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
 
 
 def components64(model: ProbeModel) -> np.ndarray:
-    """Computes the light of all probes of a model of principal components (`wlm.probe.pca.model`), float64 [N, D]."""
+    """Returns the light of all probes of a model of principal components (`wlm.probe.pca.model`), float64 [N, D]."""
     content = model.content
     low, step = content.bounds.astype(np.float64)
     number = low + content.code * step

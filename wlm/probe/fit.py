@@ -1,4 +1,4 @@
-"""Compressing a probe set: from checked input to a model."""
+"""Compresses a checked probe set to a model."""
 
 import math
 import os
@@ -39,7 +39,7 @@ def open_checkpoint(
 
     Args:
         output: The file that the fit is for.
-        probes, profile, seed: As for `compress`; the checkpoint is only valid for these.
+        probes, profile, seed: The arguments of `compress`; the checkpoint is only valid for them.
         device: Only its kind matters: a fit can continue on another GPU.
         resume: Whether to continue from the file, if it exists.
         every: Seconds between two saves of a running fit; 0: after every few steps.
@@ -70,8 +70,8 @@ def compress(
     """Compresses a probe set.
 
     A profile of the method "auto", as all shipped Gaussian profiles are, yields Gaussians unless principal components
-    have less error in no more GPU memory, which is so for a few hundred probes; `ProbeModel.choice` says why. Dead
-    probes take no part in the fit: the model has a bit for each probe if any is dead.
+    have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
+    Dead probes take no part in the fit: the model has a bit for each probe if any is dead.
 
     Args:
         probes: The set.
@@ -164,7 +164,7 @@ def _fit_gaussians(
 
 
 def _better(gaussians: ProbeModel, make: Callable[..., ProbeModel], probes: ProbeSet, device: str) -> ProbeModel:
-    """Returns Gaussians, or principal components where they have less error in no more GPU memory."""
+    """Returns the Gaussians, or principal components if they have less error in no more GPU memory."""
     values, most = probes.values[probes.live], gaussians.content.nbytes
     peak = float(np.ptp(probes.values))
 

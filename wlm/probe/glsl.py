@@ -1,4 +1,4 @@
-"""A part of all shaders of probes: storage buffers, and macros that read them."""
+"""Generates GLSL that all shaders of probes share: storage buffers, and macros that read them."""
 
 _BUFFER = """\
 #ifndef WLM_{PART}_{NAME}
@@ -15,12 +15,12 @@ layout(std430, binding = WLM_{PART}_{NAME}_BINDING) readonly buffer Wlm{Part}{Na
 
 
 def buffer_glsl(part: str, name: str, number: int, kind: str = "uint") -> str:
-    """Returns the GLSL of a storage buffer and of `WLM_PART_NAME(i)`, which reads its entry i.
+    """Returns the GLSL of a storage buffer and of the macro `WLM_PART_NAME(i)`, which reads entry i of the buffer.
 
     Args:
-        part, name: Words of the macro's name, in any case.
-        number: Default binding.
-        kind: Type of an entry.
+        part, name: Words for PART and NAME in the macro's name, in upper or lower case.
+        number: Default binding of the buffer.
+        kind: GLSL type of an entry.
     """
     part, name = part.lower(), name.lower()
     words = {"part": part, "name": name, "Part": part.title(), "Name": name.title()}

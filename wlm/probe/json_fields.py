@@ -1,4 +1,4 @@
-"""Probes in JSON: an object of lists, or a list of objects, one for each probe."""
+"""Reads probes from JSON: an object of lists, or a list of objects, one for each probe."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ _FLAGS = ("valid",)  # fields that may be booleans
 
 
 def read_json(path: Path) -> Any:
-    """Reads a file.
+    """Reads a JSON file and returns its content.
 
     Raises:
         WlmError: The file is missing, too long or not JSON.
@@ -70,7 +70,8 @@ def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
 
 
 def _array(value: object, kinds: str) -> np.ndarray | None:
-    """Converts a value to an array of the given NumPy kinds; None for text, null and ragged lists."""
+    """Converts a value to an array if its NumPy kind is in `kinds`; None for other values, text, null and ragged
+    lists."""
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError):
@@ -79,7 +80,7 @@ def _array(value: object, kinds: str) -> np.ndarray | None:
 
 
 def kind_of(value: object) -> str:
-    """Describes a JSON value briefly."""
+    """Returns a short description of a JSON value for messages."""
     if isinstance(value, dict):
         return "an object"
     text = json.dumps(value)

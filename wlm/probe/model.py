@@ -1,7 +1,7 @@
 """The model of a probe set: the settings of a fit, and the compressed light with its frame.
 
 The method of compression is data: `ProbeModel.content` holds the light, either as Gaussians and a small network
-(`wlm.probe.gaussian`) or as principal components (`wlm.probe.pca`). Everything else is the same for both.
+(`wlm.probe.gaussian`) or as principal components (`wlm.probe.pca`). Everything else is the same for both methods.
 """
 
 from abc import ABC, abstractmethod
@@ -86,7 +86,7 @@ class Content(ABC):
     @property
     @abstractmethod
     def nbytes(self) -> int:
-        """Bytes of the buffers that a GPU holds, those of `wlm.probe.bundle`."""
+        """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
 
     @abstractmethod
     def decoder(self, model: "ProbeModel", device: str, **options: Any) -> Any:
@@ -94,11 +94,11 @@ class Content(ABC):
 
     @abstractmethod
     def gpu_form(self, model: "ProbeModel", decoder: Any) -> GpuForm:
-        """Returns the form in which a GPU holds a model with this content; `decoder` computes the reference."""
+        """Returns the GPU form of a model with this content; `decoder` computes the reference values."""
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
-        """Returns figures for `wlm info`, as JSON values by name."""
+        """Returns values that `wlm info` shows, as JSON values by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +108,17 @@ class ProbeModel(Model):
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
-        profile: Settings of the fit, with the method that was taken; of PCA the name alone.
-        probes: N.
-        outputs: D, 27 for L2 spherical harmonics in RGB.
+        profile: Settings of the fit, with the method that was used; for PCA only the name.
+        probes: Number of probes, N.
+        outputs: Numbers per probe, D: 27 for L2 spherical harmonics in RGB.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.
         extent: Longest side of the box; 1 if all probes coincide.
         size: float64 [3], sides of the box divided by `extent`, each in [0, 1].
         dead: bool [N], probes that decode to zero: all their numbers were zero, or one was not finite. Empty if
             there are none.
-        positions: uint16 [N, 3], positions over the box, if they are stored with the model; else empty.
+        positions: uint16 [N, 3], positions in 1/65535 of the box, if they are stored with the model; else empty.
         content: The light, in the form of the method.
-        choice: Sentence that says why the fit took this method. Files do not store it.
+        choice: Sentence that says why the fit used this method. Files do not store it.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -138,12 +138,12 @@ class ProbeModel(Model):
 
     @property
     def method(self) -> str:
-        """Name of the method, "gaussians" or "pca"."""
+        """The name of the method, "gaussians" or "pca"."""
         return self.content.METHOD
 
     @property
     def live(self) -> np.ndarray:
-        """bool [N], probes that hold light."""
+        """Which probes hold light, bool [N]."""
         return ~self.dead if len(self.dead) else np.ones(self.probes, bool)
 
     @property
@@ -164,14 +164,9 @@ class ProbeModel(Model):
         return self.content.decoder(self, device, **options)
 
     def normalise(self, position: np.ndarray) -> np.ndarray:
-        """Converts positions to the normalised frame and clamps them to the probes' box.
-
-        Args:
-            position: [M, 3], in the unit of the probes' positions.
-
-        Returns:
-            float32 [M, 3]. The difference is computed in float64, so that a box far from the origin loses nothing.
-        """
+        """Returns positions relative to the probes' box, float32 [M, 3] in [0, 1], clamped to the box. Positions [M, 3]
+        are in the unit of the probes' positions. The difference is computed in float64, so that a box far from the
+        origin loses nothing."""
         x = (np.asarray(position, np.float64) - self.origin) / self.extent
         return np.clip(x, 0.0, self.size).astype(np.float32)
 
@@ -183,12 +178,12 @@ class ProbeModel(Model):
         """
         if not self.has_positions:
             raise WlmError(
-                f"{self.name}: the file stores no positions: give those of the probes, or fit with positions"
+                f"{self.name}: the file stores no positions: give the probes' positions, or store them in the fit"
             )
         return self.origin + self.extent * self.size * (self.positions / CODES)
 
     def has_probes_at(self, position: np.ndarray) -> bool:
-        """Whether positions, float64 [M, 3], can be those of the model's own probes: same number, same box."""
+        """Tests whether positions, float64 [M, 3], have the number and the box of the model's own probes."""
         if len(position) != self.probes:
             return False
         box = np.stack([self.origin, self.origin + self.extent * self.size])
@@ -198,7 +193,7 @@ class ProbeModel(Model):
 
 
 def box_of(position: np.ndarray) -> dict[str, Any]:
-    """Returns `origin`, `extent` and `size` of a model for probes at float64 [N, 3]."""
+    """Returns `origin`, `extent` and `size` of `ProbeModel` for probes at positions float64 [N, 3]."""
     low, high = position.min(0), position.max(0)
     # A single position has no extent: any unit will do.
     extent = float((high - low).max()) or 1.0
@@ -206,11 +201,11 @@ def box_of(position: np.ndarray) -> dict[str, Any]:
 
 
 def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
-    """Checks points in space.
+    """Checks points in space and returns them as float64.
 
     Args:
         position: [M, 3].
-        letter: Name of the first axis in an error.
+        letter: Name of the first axis in error messages.
 
     Returns:
         float64 [M, 3].

@@ -14,7 +14,7 @@ _SPREAD = (
 
 
 def morton_keys(cell: np.ndarray) -> np.ndarray:
-    """Interleaves the bits of x, y and z; uint64 [M] for cells int64 [M, 3] below 2 ** 21."""
+    """Returns Morton keys, uint64 [M], of cells int64 [M, 3] below 2 ** 21: the interleaved bits of x, y and z."""
     bits = cell.astype(np.uint64)
     for shift, mask in _SPREAD:
         bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
@@ -22,6 +22,6 @@ def morton_keys(cell: np.ndarray) -> np.ndarray:
 
 
 def morton_order(x: np.ndarray) -> np.ndarray:
-    """Returns the order of points [N, 3] of the unit cube along a Z-curve, int [N]; ties keep their order."""
+    """Returns indices that sort points [N, 3] of the unit cube along a Z-curve, int [N]; ties keep their order."""
     cell = np.clip(x * _CELLS, 0, _CELLS).astype(np.int64)
     return np.argsort(morton_keys(cell), kind="stable")

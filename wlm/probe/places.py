@@ -1,4 +1,4 @@
-"""Positions of a model's probes, and radius and exposure of balls that show them."""
+"""Finds positions of a model's probes, and the radius and exposure of balls that show the probes."""
 
 import os
 from typing import NamedTuple
@@ -17,13 +17,13 @@ _SHARE = 0.45  # radius of a ball over the median distance between neighbours, s
 
 
 class Known(NamedTuple):
-    """Positions of a model's probes, with their original light where it is given.
+    """Positions of a model's probes, and their original light if the input was given.
 
     Attributes:
         position: float64 [N, 3].
         values: float32 [N, D], the input of the fit; None if it was not given.
-        live: bool [N].
-        normal: float64 [N, 3], as in `wlm.probe.ProbeSet`; None if there are none.
+        live: bool [N], false for dead probes.
+        normal: float64 [N, 3], as in `wlm.probe.ProbeSet`; None if unknown.
     """
 
     position: np.ndarray
@@ -33,11 +33,11 @@ class Known(NamedTuple):
 
 
 def probes_of(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None = None) -> Known:
-    """Finds the positions of a model's probes, and in the input of the fit their numbers and normals.
+    """Finds the positions of a model's probes, and reads their values and normals from the input of the fit.
 
     Args:
         model: The model.
-        original: The file that was compressed; None: the positions stored with the model are taken.
+        original: The file that was compressed; None: the positions stored with the model are used.
         key: Name of the file's array, as for `wlm.probe.load`.
 
     Raises:
@@ -58,7 +58,7 @@ def probes_of(model: ProbeModel, original: str | os.PathLike[str] | None, key: s
 
 
 def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> np.ndarray | None:
-    """Reads the positions of a model's probes from another file, float64 [N, 3]; None without a file.
+    """Reads the positions of a model's probes from another file, float64 [N, 3]; None if no file is given.
 
     Raises:
         WlmError: The file cannot be read or has other probes.
@@ -72,12 +72,12 @@ def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> 
 
 
 def ball_exposure(values: np.ndarray) -> float:
-    """Returns the exposure at which white diffuse balls under SH radiance [N, C, 3] are almost all below white."""
+    """Returns the exposure at which nearly all of white diffuse balls, lit by SH radiance [N, C, 3], is below white."""
     return exposure(irradiance(values, fibonacci_sphere(_NORMALS)) / np.pi)
 
 
 def ball_radius(position: np.ndarray) -> float:
-    """Returns a radius at which balls at positions [N, 3] stay apart; 1 if there is only one position."""
+    """Returns a radius for balls at positions [N, 3] with which they don't touch; 1 if there is only one position."""
     nearest = cKDTree(position).query(position, k=2)[0][:, 1] if len(position) > 1 else np.zeros(0)
     apart = nearest[nearest > 0]
     return _SHARE * float(np.median(apart)) if apart.size else 1.0

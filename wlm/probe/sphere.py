@@ -13,7 +13,8 @@ _UNIT_TOLERANCE = 1e-3  # for a direction's length; float16 normals are within 6
 
 
 def sh_count(outputs: int) -> int | None:
-    """Returns the coefficients C of a probe of `outputs` numbers, or None if they are not whole bands in RGB."""
+    """Returns the number C of coefficients of a probe with `outputs` numbers, or None if it has no whole SH bands in
+    RGB."""
     count = outputs // 3
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
@@ -31,11 +32,9 @@ def coefficient_bands(coefficients: int) -> np.ndarray:
 
 
 def cosine_factor(band: int) -> float:
-    """Returns the factor of a band under convolution with a clamped cosine: pi, 2 pi/3, pi/4, 0, -pi/24, 0, ...
-
-    Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment Maps, 2001, eq. 8. Odd bands
-    above the first do not contribute to diffuse surfaces.
-    """
+    """Returns the factor by which convolution with a clamped cosine multiplies a band: pi, 2 pi/3, pi/4, 0, -pi/24, 0,
+    ... Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment Maps, 2001, eq. 8. Odd bands
+    above the first do not contribute to diffuse surfaces."""
     if band == 1:
         return 2.0 * math.pi / 3.0
     if band % 2:
@@ -45,7 +44,7 @@ def cosine_factor(band: int) -> float:
 
 
 def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
-    """Evaluates the SH basis in some directions.
+    """Evaluates the SH basis in M directions.
 
     Args:
         directions: [M, 3], of unit length.
@@ -88,17 +87,17 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
 
 
 def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Computes the irradiance of surfaces at the probe; divided by pi, it is the radiance of a white diffuse surface.
+    """Returns the irradiance of surfaces at a probe; divided by pi, it is the radiance of a white diffuse surface.
 
     Args:
-        values: [..., C, 3].
+        values: [..., C, 3], SH coefficients of radiance.
         normals: [M, 3], of unit length.
 
     Returns:
         float64 [..., M, 3], pi times the radiance if that is constant.
 
     Raises:
-        ValueError: As for `basis`.
+        ValueError: An error of `basis`, or the shape is different.
     """
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:

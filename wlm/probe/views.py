@@ -1,17 +1,17 @@
-"""Scoring pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
+"""Compares pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
 
 50 viewers stand along the loop of `wlm evaluate --volume`, each looking in another direction with a field of view of 90
-degrees. They see balls at some of the probes, and the scene's mesh if it is given, both diffuse and white. Three kinds
-of light are compared with the original probes:
+degrees. They see balls at a subset of the probes, and the scene's mesh if it is given; all surfaces are diffuse and
+white. Three kinds of light are compared with the original probes:
 
 - "decoded": the decoded probes;
 - "lossless, volume": the original probes, read through a complete cascaded volume around the viewer;
 - "decoded, volume": the decoded probes, read in the same way, as an engine would draw them.
 
 A ball is lit by its own probe, or by the volume at its centre. A point of the mesh is lit by the eight nearest probes,
-weighted by the inverse square of their distance, or by the volume. The paper reads all probes through its volume, and
-compares the third kind with the second. Pictures are compared as displayed: at the exposure of the balls under the
-original light, with Reinhard's curve, in sRGB.
+weighted by the inverse square of their distance, or by the volume. The paper reads all light through its volume, and
+compares "decoded, volume" with "lossless, volume". Pictures are compared as displayed: at the exposure of the balls
+under the original light, with Reinhard's curve, in sRGB.
 """
 
 import math
@@ -58,7 +58,8 @@ class ViewScore(Report):
         drawn: "balls" or "mesh".
         light: One of `KINDS`.
         views: Number of views that show the surface.
-        mse, psnr, ssim, flip: Errors over the pixels that show it, as in `wlm.metrics.Pictures`; NaN without a view.
+        mse, psnr, ssim, flip: Errors over the pixels that show the surface, as in `wlm.metrics.Pictures`; NaN if no
+            view shows it.
     """
 
     drawn: str
@@ -94,7 +95,7 @@ def score_views(
         progress: Called about twice a second, with the number of finished views.
 
     Returns:
-        A score for each kind of surface and light.
+        A score for each kind of surface and each kind of light.
 
     Raises:
         WlmError: A setting is out of its range, a probe's numbers are not spherical harmonics, or the device does not
@@ -104,7 +105,7 @@ def score_views(
     if count is None:
         raise WlmError(f"{probes.name}: expected spherical harmonics, found {probes.outputs} numbers per probe")
     if views < 1 or not 16 <= resolution <= 4096:
-        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels, got {views} of {resolution}")
+        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels a side, got {views} of {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
     things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})
@@ -130,7 +131,8 @@ def score_views(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles without shared corners, normals float64 [V, 3], and the probe of each triangle or -1."""
+    """Triangles without shared corners, vertex normals float64 [V, 3], and the probe's number of each triangle or
+    -1."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -158,7 +160,7 @@ class _Scene:
         ]
 
     def balls(self) -> _Mesh:
-        """Returns separate balls at some probes, evenly spaced by index."""
+        """Returns a mesh of separate balls at a subset of the probes, evenly spaced by index."""
         chosen = np.unique(np.linspace(0, len(self._position) - 1, min(len(self._position), _BALLS)).astype(int))
         unit = fibonacci_sphere(_BALL_POINTS)
         hull = ConvexHull(unit)
@@ -172,12 +174,13 @@ class _Scene:
         return _Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), chosen.repeat(len(triangle)))
 
     def stand(self, eye: np.ndarray) -> None:
-        """Moves the volumes to a viewer."""
+        """Moves the volumes to a viewer's position."""
         for volume in self._volumes:
             settle(volume, eye)
 
     def lights(self, place: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
-        """Yields SH float64 [P, C, 3] at points [P, 3] or at their probes: the original light, then each of `KINDS`."""
+        """Yields SH coefficients, float64 [P, C, 3], at points [P, 3] or at their probes (`owner`): the original light,
+        then each of `KINDS`."""
         ahead = None
         if owner[0] >= 0:
             direct = [values[owner] for values in self._values]
@@ -208,7 +211,8 @@ def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.nda
 def _look(
     mesh: _Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the visible pixels, bool [H, W], and for each of these P points and normals [P, 3] and probes [P]."""
+    """Renders a mesh from a viewer. Returns the visible pixels, bool [H, W], and for the P visible pixels the points
+    and normals, [P, 3] each, and the probes' numbers, [P]."""
     triangle = torch.arange(len(mesh.position), dtype=torch.int32, device=device).reshape(-1, 3)
     clip = torch.tensor(clip_from(mesh.position, eye, forward, up), device=device)
     with torch.no_grad():
@@ -226,7 +230,8 @@ def _look(
 
 
 def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
-    """Returns a picture, sRGB [H, W, 3], of white diffuse points under SH [P, C, 3]; black elsewhere."""
+    """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3]; pixels not in `seen` are
+    black."""
     count = values.shape[1]
     factor = np.array([cosine_factor(band) for band in coefficient_bands(count).tolist()])
     light = np.einsum("pc,pcd->pd", basis(normal, count) * factor, values) / math.pi * exposure

@@ -1,16 +1,6 @@
 """Settings of a scene to simulate and render, a YAML file: box, air, smoke, inlets, obstacles, camera, lights.
 
 Lengths are in metres, times in seconds, directions in the world, with +y up by default. A class is named `...Settings`
-a cell not of 1e-9 to 1e9 metres         error
-more than 1,000,000 steps a frame        error that names the cause
-a path whose times do not increase       error
-no inlet, no source                      valid: the box stays empty
-an obstacle over an inlet                valid: no inflow through the covered part
-a camera or a light along an axis        valid, also along the vertical
-an obstacle or an inlet too fast for     error in the simulation, which names the obstacle or the inlet
-the time step
-=======================================  =============================================================
-=======
 if the object that is made from it has the plain name.
 """
 

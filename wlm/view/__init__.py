@@ -1,1 +1,1 @@
-"""Pictures of what went in and what came out."""
+"""Draws originals and decoded light: pictures, contact sheets, and an interactive window."""

@@ -1,4 +1,4 @@
-"""Pictures of a scene under its lightmaps: the original, the decoded ones, and their errors."""
+"""Draws a scene with its original and its decoded lightmaps, and their errors."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -30,12 +30,12 @@ def draw(
         samplers: Decoders by name.
         view: The camera.
         resolution: Pixels along a side.
-        device: "cpu" or "cuda:N", the decoders'.
-        state: The number of the state.
+        device: "cpu" or "cuda:N", the device of the decoders.
+        state: The index of the lighting state.
 
     Returns:
-        For each decoder float32 [resolution, resolution, 3], linear light, 0 where no sheet is visible; and bool
-        [resolution, resolution], true where one is.
+        For each decoder float32 [resolution, resolution, 3], linear light, 0 where no lightmap is visible; and bool
+        [resolution, resolution], true where one is visible.
     """
     hit, points = points_at(scene, *next(iter(visible_uv(scene, [view], resolution, device))))
     pictures = {}
@@ -58,8 +58,8 @@ def comparison(
 ) -> None:
     """Writes a contact sheet: one row per view with the original, each decoder, and each decoder's absolute error.
 
-    All share one exposure: the 99.5th percentile of the original over all views is white, and light is encoded as sRGB.
-    Errors are linear and multiplied by a gain. Each view is cropped to the mesh.
+    All pictures share one exposure: the 99.5th percentile of the original over all views is white. Light is shown in
+    sRGB. Errors are linear and multiplied by a gain. Each view is cropped to the mesh.
 
     Args:
         path: The PNG to write; its folder must exist.

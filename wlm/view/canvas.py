@@ -1,4 +1,4 @@
-"""Drawing of meshes, lines and volumes in the panels of a window; each has a name, by which it is updated."""
+"""Draws named meshes, lines and volumes in the panels of a window; drawing a name again updates it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class Canvas:
 
         Args:
             panel, name: Index of the panel, and name of the mesh.
-            position, triangle, uv: [V, 3], int [F, 3] and [V, 2], with v down.
+            position, triangle, uv: Vertices [V, 3], triangles int [F, 3] and UVs [V, 2], with v down.
             picture: uint8 [H, W, 3].
             nearest: Whether the texture is read without a filter.
             one_sided: Whether triangles that face away from the camera are hidden.
@@ -156,7 +156,7 @@ class Canvas:
                 self._drawn[panel, name][0].visibility = False
 
     def hit(self, x: int, y: int) -> Hit | None:
-        """Finds the triangle at a pixel of the window, counted from the lower left."""
+        """Finds the mesh triangle at a pixel of the window (origin at the lower left); None if there is none."""
         from vtkmodules.vtkRenderingCore import vtkCellPicker
 
         for panel, renderer in enumerate(self.renderers):

@@ -22,7 +22,7 @@ class Display:
     """How linear light is converted to screen colours.
 
     Attributes:
-        exposure: Factor on linear light, whose product 1 is white.
+        exposure: Factor on linear light; a product of 1 is white.
         tone: One of `TONES`.
         gain: Factor on errors.
     """
@@ -39,11 +39,11 @@ class Display:
         return to_srgb(x)
 
     def picture(self, light: np.ndarray) -> np.ndarray:
-        """Converts linear light of any shape to bytes."""
+        """Converts linear light of any shape to sRGB bytes, uint8."""
         return _bytes(self.screen(light))
 
     def error(self, decoded: np.ndarray, original: np.ndarray) -> np.ndarray:
-        """Shows the error of the displayed picture: the largest channel's difference times the gain, as `heat`.
+        """Returns false colours (`heat`) of the displayed error: the largest difference of a channel times `gain`.
 
         Args:
             decoded, original: Linear light [..., 3].

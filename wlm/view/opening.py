@@ -1,4 +1,4 @@
-"""`open_scene`: the scene of any file that a window can show."""
+"""`open_scene`: makes the scene that a window shows from any supported file."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -34,9 +34,9 @@ def open_scene(
 
     Args:
         files: One file or folder, or six-way lightmaps of smoke, one EXR a frame; docs/view.md lists what is shown.
-        mesh: The scene that the light belongs to; for lightmaps with their UVs.
+        mesh: Mesh file that the light belongs to; for lightmaps it needs their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
-        key: Array of a probe file with several.
+        key: Name of the array to show of a probe file with several.
         walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
         block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
         extinction: Extinction of a volume of smoke, per unit of length at density 1.

@@ -1,4 +1,4 @@
-"""PNG files: single pictures and contact sheets."""
+"""Writes PNG files: single pictures and contact sheets."""
 
 import math
 import os

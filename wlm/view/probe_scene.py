@@ -53,9 +53,9 @@ class Probes:
         coefficients: Number C of coefficients.
         values: float32 [N, C, 3] by name, "decoded" or "original" or both.
         decode: Function that returns light float32 [M, 3 C] at points [M, 3].
-        light: Light of the probes, for a volume.
+        light: Light of the probes in the form that the cascaded volume takes.
         model: The model, if it has Gaussians; otherwise None.
-        note: Text of the caption.
+        note: Text for the caption of the window.
     """
 
     position: np.ndarray

@@ -20,7 +20,7 @@ _TRIAL_SECONDS = 60.0
 
 @functools.cache
 def require_opengl() -> None:
-    """Renders in a child process first, since VTK crashes its process if no OpenGL works.
+    """Checks in a child process that VTK can render: it crashes its process if no OpenGL works.
 
     Raises:
         WlmError: The child process failed.

@@ -11,7 +11,7 @@ from wlm.view.display import TONES, Display
 
 @dataclass(frozen=True)
 class Slider:
-    """A slider.
+    """A slider below the picture, with its range and the format of its label.
 
     Attributes:
         name: Name, shown as a label; also the name of the command's option.

@@ -24,7 +24,7 @@ _AMBIENT = 0.2
 
 
 class Drawing:
-    """Draws pictures from one camera, under fixed lights, into buffers that are allocated once.
+    """Draws pictures of smoke from one camera, under fixed lights, into buffers that are allocated once.
 
     At a pixel an obstacle is in front of all of the smoke or behind all of it, depending on the depth of the smoke's
     surface. Obstacles shadow this surface from directional lights. Point lights cast no shadows of obstacles and do
@@ -124,7 +124,7 @@ class Drawing:
 
         Args:
             smoke: On the device: lightmaps with transparency and, if there are obstacles, with depth; or smoke that was
-                lit by the drawing's lights; light of all orders already includes its albedo.
+                lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
 
         Returns:
             `image`.
@@ -165,7 +165,7 @@ class Drawing:
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Returns emitted light, vec3 [H, W]; fire lights smoke in the mean colour of the visible fire."""
+        """Returns the light of fire, vec3 [H, W]: emitted, plus scattered by smoke in the fire's mean colour."""
         if emission is None:
             return None
         ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))
@@ -201,7 +201,7 @@ def picture(
 
     Args:
         smoke: Lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
-            was lit by lights of its own, by light scattered once or of all orders.
+            was lit before, by single or multiple scattering.
         lights: Lights of the lightmaps; None for smoke that was lit already.
         albedo, background, ramp, obstacles, rule: As of `Drawing`.
         time: Time of the obstacles, seconds.

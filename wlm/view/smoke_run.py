@@ -1,7 +1,7 @@
 """Simulation, lighting and drawing of a scene frame by frame, in memory.
 
-On CUDA the lighting of a frame, from the march to the picture, is one graph, except if a network makes the lightmaps,
-which has its own graph.
+On CUDA the lighting of a frame, from the march to the picture, is one CUDA graph. If a network makes the lightmaps,
+only the network has a graph.
 """
 
 import time
@@ -38,7 +38,7 @@ class Lighting:
     """A way to light the smoke of a frame.
 
     Attributes:
-        albedo: R, G, B, for light of all orders of each light and of fire; None: light scattered once, by six-way
+        albedo: R, G, B albedo for multiple scattering of all lights and of fire; None: single scattering by six-way
             lightmaps, as engines show it.
         network: Network that makes the lightmaps; None: a coarse march.
     """
@@ -52,7 +52,7 @@ class Lighting:
         return "lightmaps" if self.albedo is None else "light of all orders"
 
     def __call__(self, volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight]) -> SixWay | ScatteredSmoke:
-        """Lights the smoke on its device; the result has the depth of its surface."""
+        """Lights the smoke on its device. The result includes the depth of the smoke's surface."""
         if self.albedo is not None:
             return scatter(volume, camera, lights, self.albedo)
         if self.network is None:

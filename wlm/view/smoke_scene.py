@@ -200,13 +200,13 @@ class _VolumeScene(Scene):
 
 
 def _toward(state: State) -> np.ndarray:
-    """Returns the unit vector to the light: right, up and towards the viewer."""
+    """Returns the unit vector to the light in camera axes: right, up, towards the viewer."""
     turn, height = (math.radians(state.values[name]) for name in ("turn", "height"))
     return np.array([math.sin(turn) * math.cos(height), math.sin(height), math.cos(turn) * math.cos(height)])
 
 
 def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
-    """Reduces a volume to at most `most` voxels, by averaging cubes of voxels."""
+    """Returns a volume with at most `most` voxels, by averaging cubes of voxels."""
     factor = next(n for n in itertools.count(1) if math.prod(-(-side // n) for side in volume.shape) <= most)
     if factor == 1:
         return volume

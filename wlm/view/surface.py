@@ -42,7 +42,7 @@ def flat_geometry(height: int, width: int) -> Geometry:
 
 
 def compared(decoded: bool, original: bool) -> tuple[str, ...]:
-    """Titles of the panels."""
+    """Returns the titles of the panels, left to right, for a decoded lightmap, its original, or both."""
     if decoded and original:
         return ("decoded", "original", "error")
     return ("decoded",) if decoded else ("original",)
@@ -71,7 +71,7 @@ class SurfaceScene(Scene):
 
     @abstractmethod
     def tell_texel(self, row: int, column: int, state: State) -> str:
-        """Further facts about a texel, besides its position and light."""
+        """Text with further facts about a texel, besides its position and light."""
 
     @abstractmethod
     def tile_colours(self) -> np.ndarray:

@@ -124,7 +124,7 @@ class Window:
         self.draw()
 
     def outside(self, seen: bool) -> None:
-        """Shows or hides the walls of a room when seen from outside.
+        """Shows or hides the walls of a room that are seen from outside.
 
         Raises:
             WlmError: The scene is not a room.
@@ -302,7 +302,7 @@ class Window:
             plotter.add_key_event(key, lambda key=key: self.press(key))
 
     def _shows(self, name: str) -> bool:
-        """Whether a slider has an effect in the current view."""
+        """Returns whether a slider has an effect in the current view."""
         views = self.sliders[name].views
         return not views or self.state.view in views
 
@@ -357,7 +357,7 @@ class Window:
             self.set(name, self.state.values[name] + steps * self.sliders[name].step)
 
     def _main(self) -> str | None:
-        """Name of the slider of the arrow keys: the first one of the scene in this view."""
+        """Returns the name of the slider that arrow keys move: the scene's first slider in this view."""
         return next((slider.name for slider in self.scene.sliders if self._shows(slider.name)), None)
 
     def _toggle(self) -> None:
@@ -376,7 +376,7 @@ class Window:
             self._plotter.render()
 
     def _count(self, frames: int | None) -> int:
-        """Number of pictures of a movie."""
+        """Returns the number of pictures of a movie; `frames` if given."""
         name = self._player()
         slider = None if name is None else self.sliders[name]
         return frames or (round(slider.high - slider.low) + 1 if slider is not None and slider.whole else _FRAMES)

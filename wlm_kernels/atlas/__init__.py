@@ -1,1 +1,1 @@
-"""Kernels of lightmap atlases: reading tiles and cascades, tuning steps, and the clustering of triangles."""
+"""Kernels for lightmap atlases: reads of tiles and cascades, steps of tuning, and the grouping of similar triangles."""

@@ -1,14 +1,14 @@
-"""Reading a cascade of two textures, its backward pass, and the points and losses of a tuning step
+"""Reads a cascade of two textures, differentiates the read, and computes the points and losses of a tuning step
 (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
-C(u) = T_p(F(T_c(u))) (eq. 7): T_c gives a coordinate, the triangle wave F folds it into [0, 1], T_p gives the colour.
-Both textures are read bilinearly and clamped at their borders, see `wlm_kernels.raster.texture`. An empty T_c means
-that there is none: C(u) = T_p(u).
+C(u) = T_p(F(T_c(u))) (eq. 7): the lookup texture T_c gives a coordinate, the triangle wave F folds it into [0, 1], the
+colour texture T_p gives the colour. Both textures are read bilinearly and clamped at their borders, see
+`wlm_kernels.raster.texture`. An empty T_c means that there is none: C(u) = T_p(u).
 
 Two points of the paper are corrected or made precise. Eq. 8 has a floor in place of an absolute value, and would be -2
-or 0 everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, two waves
-per point; acting on T_c's texels it would be eight, with the same result where they are in [0, 1], the range of
-unsigned 16-bit numbers. F(x) = x there, so a decoder of a stored T_c computes no wave.
+or 0 everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, and not
+on each texel of T_c. For texels in [0, 1], the range of unsigned 16-bit numbers, both are equal and F(x) = x, so a
+decoder of a stored T_c computes no wave.
 
 A point is a coordinate u. A NaN coordinate is an empty point: it reads NaN, its loss is 0, it has no gradient.
 Gradients of textures are added by atomics: on CUDA in any order, so that the last bits change from run to run.
@@ -30,7 +30,7 @@ _CHANNELS = wp.constant(3)
 
 @wp.struct
 class _Place:
-    """The texels of T_c (if any) and T_p that a coordinate reads."""
+    """The texels of the lookup texture T_c (if any) and of the colour texture T_p that a coordinate reads."""
 
     lut_x: Axis
     lut_y: Axis
@@ -169,7 +169,7 @@ def _or_zero(x: float) -> float:
 
 @wp.func
 def _sign(x: float) -> float:
-    """Returns the sign, 0 at 0 where L1 has no slope; `wp.sign` is 1 there."""
+    """Returns -1, 0 or 1; 0 at 0, where L1 has no slope (`wp.sign` returns 1)."""
     return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
 
 
@@ -223,41 +223,41 @@ def _check(colour, lut) -> None:
 
 
 def sample(colour, lut, uv, out) -> None:
-    """Reads C(u), float [N, 3], at points vec2 [N] (eq. 7): u right, v down, clamped to [0, 1]; NaN reads NaN.
-
-    T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y of T_p, any numbers; [0, 0, 2]: none.
-    """
+    """Writes the cascade's colours C(u), float [N, 3], at points vec2 [N] (eq. 7): u right, v down, clamped to [0, 1];
+    NaN gives NaN. T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y in T_p, any numbers; [0, 0,
+    2] if there is no T_c."""
     _check(colour, lut)
     wp.launch(_sample, uv.shape, inputs=[colour, lut, uv], outputs=[out], device=colour.device)
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
-    """Adds the gradients of the textures of `sample`, for the gradient of its result, float [N, 3]."""
+    """Adds the gradients of the two textures of `sample` to `grad_colour` and `grad_lut`; `grad_out`, float [N, 3], is
+    the gradient of the colours."""
     _check(colour, lut)
     inputs = [colour, lut, uv, grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_colour, grad_lut], device=colour.device)
 
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
-    """Interpolates coordinates vec2 [N] at points in triangles int [N], from weights of the corners 0 and 1, vec2 [N],
-    and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1."""
+    """Writes coordinates vec2 [N] of points in triangles int [N], interpolated from barycentric weights of corners 0
+    and 1, vec2 [N], and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1."""
     wp.launch(
         _corner_points, triangle.shape, inputs=[triangle, barycentric, corner], outputs=[uv], device=triangle.device
     )
 
 
 def surface_points(area, corner, distance: float, seed: int, step, triangle, barycentric) -> None:
-    """Draws pairs of random points: the first stratified over a surface, the second near it in the same triangle.
+    """Draws pairs of random points: the first point stratified over a surface, the second near it in the same triangle.
 
     Args:
         area: float64 [F], cumulative areas of the triangles; the last is above 0.
-        corner: vec2 [F, 3], coordinates of the corners, of any area.
-        distance: Distance between the two points, in units of the coordinates. Where the triangle ends before that in
-            the direction drawn, the points are equal.
+        corner: vec2 [F, 3], coordinates of the triangles' corners; triangles may have no area.
+        distance: Distance between the two points, in units of the coordinates. If the triangle ends sooner in the
+            random direction, the two points are equal.
         seed: Seed of the draw, together with the step.
-        step: int [1], on the device.
+        step: int [1], number of the step, on the device.
         triangle: int [2 N], written: the first points, then the second.
-        barycentric: vec2 [2 N], written, weights of the corners 0 and 1.
+        barycentric: vec2 [2 N], written, barycentric weights of the corners 0 and 1.
     """
     count = triangle.shape[0] // 2
     inputs = [area, corner, distance, seed, step]
@@ -265,18 +265,16 @@ def surface_points(area, corner, distance: float, seed: int, step, triangle, bar
 
 
 def image_loss(difference, weight: float, grad) -> None:
-    """Computes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3).
-
-    The loss is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of
-    neighbours p and q, horizontal and vertical. d, float [H, W, 3], is the image minus the reference; NaN, which counts
-    as 0, where neither shows the mesh.
-    """
+    """Writes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3). The loss
+    is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of neighbours p
+    and q, horizontal and vertical. d = `difference`, float [H, W, 3], is the image minus the reference; NaN, where
+    neither shows the mesh, counts as 0."""
     device = difference.device
     wp.launch(_image_loss, difference.shape, inputs=[difference, weight], outputs=[grad], device=device)
 
 
 def pair_loss(difference, weight: float, grad) -> None:
-    """Computes the gradient of the loss of pairs of points: the sums of |d| and of `weight` |d_i - d_(N + i)|, for d
-    float [2 N, 3]; NaN counts as 0."""
+    """Writes the gradient of the loss of N pairs of points: the sum of |d| plus `weight` times the sum of |d_i - d_(N +
+    i)|, where d = `difference`, float [2 N, 3]; NaN counts as 0."""
     size = (difference.shape[0] // 2, 3)
     wp.launch(_pair_loss, size, inputs=[difference, weight], outputs=[grad], device=difference.device)

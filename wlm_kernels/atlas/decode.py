@@ -1,12 +1,12 @@
 """Reads lightmaps from tiles: one entry of a lookup texture, then bilinear reads of a small texture.
 
 Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
-entry names its rectangle in the texture or in a second texture, which consists of blocks. The rectangle's
-outermost samples lie on the tile's borders. `decode` reads the tiles of one lightmap; `decode_shared` reads tiles that
-many sheets and states share, where light is a sum of components, rectangles beside each other, times the state's
-factors.
+entry names its rectangle in the texture or in a second texture, which consists of blocks. The rectangle's outermost
+samples lie on the tile's borders. `decode` reads the tiles of one lightmap; `decode_shared` reads tiles that many
+sheets and states share, where light is a sum of components times the state's factors; the components' rectangles lie
+beside each other.
 
-Read `wlm/atlas/exact.py` first: it is the same in float64 NumPy.
+`wlm/atlas/exact.py` computes the same in float64 NumPy and is easier to read.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ _COARSE_MASK = wp.constant(15)
 
 @wp.struct
 class Axis:
-    """Two texels along an axis, and the weight of the second."""
+    """Two neighbouring texels along an axis, and the weight of the second."""
 
     low: int
     high: int
@@ -33,7 +33,8 @@ class Axis:
 
 @wp.func
 def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """Returns the tile that contains a coordinate, and the place in it from 0 to 1; tile 0 and NaN for NaN."""
+    """Returns the index of the tile that contains a coordinate, and the position in the tile from 0 to 1; tile 0 and
+    NaN for NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
@@ -43,7 +44,7 @@ def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 @wp.func
 def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """Returns the two texels between which a place in a tile lies."""
+    """Returns the two texels between which a position in a tile lies, along one axis, and the second texel's weight."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
     if last >= first_block_code:
@@ -79,7 +80,7 @@ def _decode(
     # out:
     out: wp.array1d[wp.vec3],
 ):
-    """One point per thread."""
+    """Reads one point of a lightmap in tiles per thread."""
     i = wp.tid()
     u = uv[i]
     across = tile_place(u[0], width, size, lut.shape[1])
@@ -95,17 +96,17 @@ def _decode(
 
 
 def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None, first_block_code=16) -> None:
-    """Reads light at points.
+    """Writes the light of one lightmap in tiles at points.
 
     Args:
         uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
         height, width: Texels of the lightmap.
         size: B, texels along a tile.
         lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
-        texels: vec3h [Hp, Wp].
+        texels: vec3h [Hp, Wp], the colour texture.
         out: vec3 [N], written.
-        blocks: vec3h [Hb, Wb], multiples of 4: the second texture; None: there is none.
-        first_block_code: The least number in the low bits of an entry that names the second texture, in blocks: the
+        blocks: vec3h [Hb, Wb], sides multiples of 4: the second texture; None if there is none.
+        first_block_code: Entries whose low 4 bits are at least this number name the second texture, in blocks: the
             first block << 4 | `first_block_code` + number of blocks - 1.
     """
     inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
@@ -114,7 +115,7 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
 
 @wp.func
 def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
-    """Reads bilinearly from the rectangle that begins some columns to the right."""
+    """Reads a page bilinearly, with the rectangle shifted by `right` columns."""
     left = right + x.low
     next = right + x.high
     top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
@@ -124,7 +125,7 @@ def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y:
 
 @wp.func
 def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """Computes `axis_at` for a component of one block."""
+    """Returns the same as `axis_at`, for a component that is a single block."""
     return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
 
 
@@ -143,7 +144,7 @@ def _decode_shared(
     # out:
     out: wp.array1d[wp.vec3],
 ):
-    """One point per thread."""
+    """Reads one point of shared tiles per thread."""
     i = wp.tid()
     u = uv[i]
     s = sheet[i]
@@ -196,15 +197,16 @@ def _decode_shared(
 
 
 def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
-    """Reads light at points of shared tiles.
+    """Writes the light of shared tiles at points.
 
     Args:
         uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
         sheet: int [N], the row of each point's sheet or level in `sheets`.
         sheets: int [S, 7]: rows and columns of texels; first row and column in the lookup texture; rows and columns of
-            tiles; one number that isn't read.
+            tiles; one number that is ignored.
         size: B, texels along a tile.
-        factor: vec3 [C], a constant of each mixture and then one factor of each component.
+        factor: vec3 [C], the factors of a state. Tiles of a mixture share a constant, followed by one factor for each
+            component.
         lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
             - 1; number of its mixture's constant; page << 12 | number of coarse components << 8 | number of components.
             With one component and one page only the first two numbers exist, [ty, tx, 2].

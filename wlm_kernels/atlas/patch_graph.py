@@ -1,11 +1,11 @@
-"""The graph of patches that are alike (lightmap-uv-clustering-cascade, section 3.2).
+"""The graph of similar patches, which store the colours of triangles (lightmap-uv-clustering-cascade, section 3.2).
 
-Few pairs need all their samples compared. Lower and upper bounds of the distance (`Bounds`) decide most;
-they are in float32, with a margin larger than its rounding, and so never change a result. Patches are sorted by their
-mean level, which differs by less than lambda where two are alike: patches farther apart are not compared.
+Lower and upper bounds of the distance (`Bounds`) decide for most pairs of patches, so that few pairs need all their
+samples compared. Bounds are in float32, with a margin larger than the rounding, and so never change a result. Patches
+are sorted by their mean colour; if two means differ by lambda or more, the patches can't be alike and are not compared.
 
-Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): they compute the same with the whole
-matrix.
+Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): it computes the same with the whole matrix
+of distances.
 """
 
 import math
@@ -32,17 +32,17 @@ _MARGIN = wp.constant(4.0e-3)
 
 @wp.struct
 class Bounds:
-    """Quantities of one patch that bound Dist on one lattice, in levels.
+    """Quantities of one patch that bound the distance Dist between two patches on one lattice, in 8-bit colour levels.
 
     With weights w = (i, j, k) / (n - 1), which add up to 1, and the colours T of one patch and T' of the other:
 
     - From below: the sum over v of |mean of w_v (T - T')| is at most the mean of |T - T'|.
-    - From above: with L = sum of w_v C_v, the mean of |T - T'| is at most those of |T - L|, of |T' - L'| and of
-      w_v |C_v - C'_v|, summed over v; the mean of w_v is a third.
+    - From above: with L = sum of w_v C_v, the mean of |T - T'| is at most those of |T - L|, of |T' - L'| and of w_v
+      |C_v - C'_v|, summed over the vertices v. The mean of w_v is 1/3.
 
     Attributes:
         moment: Row v: the mean over the samples of w_v T.
-        corner: Row v: C_v of the best L by least squares.
+        corner: Row v: C_v, the colour at vertex v of the linear function L that fits T best by least squares.
         residual: Mean over the samples of |T - L|, summed over the channels.
     """
 
@@ -53,14 +53,14 @@ class Bounds:
 
 @wp.struct
 class Rule:
-    """Thresholds below which patches are alike.
+    """Thresholds below which two patches are alike. A level is 1 of 255 in an 8-bit colour.
 
     Attributes:
-        colour: Largest squared distance of two dominant colours, in bins.
+        colour: Largest squared distance of two patches' dominant colours, in bins of the colour histogram.
         level: Mean difference, summed over the channels, in levels.
-        whole: The same rounded up: a whole number is below `level` where it is below this one.
+        whole: `level` rounded up, for comparisons with whole numbers.
         same: [len(SIZES)], for two patches of one size: sum of the differences of all samples and channels, in levels.
-        mixed: [len(SIZES)], the same where the larger has this size, in 1 / (n - 1) of a level.
+        mixed: [len(SIZES)], the same for two sizes, of which the larger is this one, in 1 / (n - 1) of a level.
     """
 
     colour: int
@@ -78,7 +78,7 @@ def _bounds(
     # out:
     bounds: wp.array2d[Bounds],
 ):
-    """One patch and lattice per thread. Lattices smaller than the patch's own are never used and stay unset."""
+    """Computes the bounds of one patch on one lattice per thread; lattices smaller than the patch's own stay unset."""
     t, level = wp.tid()
     p = patches[t]
     if level < p.level:
@@ -135,14 +135,14 @@ def _row_differences(a: wp.mat33, b: wp.mat33) -> wp.mat33:
 
 @wp.func
 def _along(m: wp.mat33, order: int) -> float:
-    """Computes the sum of m[p[k], k]."""
+    """Returns the sum of m[p[k], k] over k, where p is the permutation `ORDERS[order]`."""
     p = turned(wp.vec3i(0, 1, 2), order)
     return m[p[0], 0] + m[p[1], 1] + m[p[2], 2]
 
 
 @wp.func
 def _near(rule: Rule, a: int, b: int) -> bool:
-    """Tests whether two dominant colours are within lambda_h of each other."""
+    """Tests whether the dominant colours a and b are within lambda_h of each other."""
     r = channel(a, 0) - channel(b, 0)
     g = channel(a, 1) - channel(b, 1)
     b_ = channel(a, 2) - channel(b, 2)
@@ -153,7 +153,7 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 def _alike(
     samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
 ) -> bool:
-    """Tests if Dist is below lambda in any order (eq. 3, 4)."""
+    """Tests whether the distance Dist of patches x and y is below lambda in any order of the vertices (eq. 3, 4)."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
@@ -215,7 +215,8 @@ def _spans(
     low: wp.array1d[float],
     high: wp.array1d[float],
 ):
-    """One patch per thread: its mean level, summed over the channels, on its own lattice and all larger ones."""
+    """Writes the lowest and highest mean colour, summed over the channels, of one patch per thread, over its own
+    lattice and all larger ones."""
     i = wp.tid()
     least = float(wp.inf)
     most = float(-wp.inf)
@@ -239,7 +240,7 @@ def _take(
     taken: wp.array1d[Patch],
     taken_bounds: wp.array2d[Bounds],
 ):
-    """One patch per thread."""
+    """Copies one patch and its bounds per thread."""
     i = wp.tid()
     taken[i] = patches[index[i]]
     for level in range(bounds.shape[1]):
@@ -259,7 +260,7 @@ def _edges(
     # out:
     edge: wp.array2d[wp.uint8],
 ):
-    """One patch per thread; each pair once, by the thread of the first."""
+    """Finds the edges of one patch per thread; each pair is tested once, by the thread of its first patch."""
     a = offset + wp.tid()
     last = high[a] + rule.level + _MARGIN
     for b in range(a + 1, low.shape[0]):
@@ -288,7 +289,7 @@ def _join(
     # out:
     joined: wp.array1d[int],
 ):
-    """One node per thread."""
+    """Finds for one node per thread the first head that it is like."""
     i = offset + wp.tid()
     a = nodes[i]
     margin = rule.level + _MARGIN
@@ -303,8 +304,8 @@ def _join(
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """Makes the thresholds lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest distance of two
-    dominant colours), interpreted as the exact decimal fractions that they print as."""
+    """Makes the thresholds on a device from lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest
+    distance of two dominant colours), taken as the exact decimal fractions that they print as."""
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
@@ -318,7 +319,7 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
 
 
 def bounds(samples, patches, levels: int):
-    """Computes `Bounds` [F, levels] of patches, for one level more than the highest of a patch."""
+    """Returns the `Bounds` [F, levels] of F patches on the lattices of the sizes `SIZES[:levels]`."""
     out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
     wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
     return out
@@ -329,11 +330,11 @@ class Graph:
     """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
 
     Attributes:
-        samples, patches, bounds, rule: The samples of all patches; and of the M nodes, by rising `low`.
+        samples, patches, bounds, rule: The samples of all patches; for M nodes, sorted by `low`.
         low, high: float [M], least and largest mean level on any lattice; the means of two patches that are alike on
             any lattice differ by less than lambda.
-        means: float32 [M], `low` on the host.
-        reach: The largest difference of the two in any patch.
+        means: float32 [M], copy of `low` in the CPU's memory.
+        reach: The largest difference of `high` and `low` in any patch.
     """
 
     samples: wp.array
@@ -350,7 +351,7 @@ class Graph:
 
 
 def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of some patches; also returns the number of each of its nodes among them, int64 [M]."""
+    """Makes the graph of some patches. Also returns the index among the patches of each of the M nodes, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
     wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
@@ -362,7 +363,7 @@ def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
-    """Makes the subgraph of some nodes, int [N], ascending."""
+    """Makes the subgraph of N nodes, int [N], ascending."""
     spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
     taken = _taken(whole.patches, whole.bounds, nodes)
     return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
@@ -378,14 +379,15 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
-    """Finds the edges between patches `begin` to `end` - 1 and any later one: 1 in both places of uint8 [M, M], which
-    is 0."""
+    """Finds the edges between the patches `begin` to `end` - 1 and all later ones: writes 1 at both places of a pair in
+    `edge`, uint8 [M, M], which must be 0 before."""
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
-    """Writes for nodes `begin` to `end` - 1, int [N], the rank of the first head that they are like, H for none. Heads,
-    int [H], are ascending nodes, `head_low` their `low`, and `rank` the order in which they are compared."""
+    """Writes for the nodes at `begin` to `end` - 1 of int [N] the rank of the first head that each is like, or H for
+    none. `heads`, int [H], are ascending nodes, `head_low` the `low` of each, and `rank` the order in which heads are
+    compared."""
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

@@ -19,7 +19,7 @@ depends on the device:
 
 The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].
 
-Read `tests/reference/patches.py` first: it is the same per triangle in float64 NumPy.
+`tests/reference/patches.py` computes the same per triangle in float64 NumPy and is easier to read.
 """
 
 import itertools
@@ -50,11 +50,11 @@ class Patch:
     """A patch without its samples.
 
     Attributes:
-        start: Its first sample in the array of all samples.
-        level: Level of its size, n = `SIZES[level]` = 2 ** level + 1.
-        low: Lowest level of each channel, packed.
-        high: Highest level of each channel, packed.
-        colour: Bin of the dominant colour, packed as a colour.
+        start: Index of the patch's first sample in the array of all samples.
+        level: Index of the patch's size n in `SIZES`: n = 2 ** level + 1.
+        low: Lowest value of each channel, packed as a colour.
+        high: Highest value of each channel, packed as a colour.
+        colour: Bin of the dominant colour in the histogram, packed as a colour.
     """
 
     start: int
@@ -65,7 +65,7 @@ class Patch:
 
 
 def samples_of(size):
-    """Returns the number of samples of a patch of size n, n (n + 1) / 2."""
+    """Returns the number of samples of a patch of size n: n (n + 1) / 2."""
     return size * (size + 1) // 2
 
 
@@ -86,7 +86,7 @@ def channel(colour: int, c: int) -> int:
 
 @wp.func
 def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
-    """Computes a sample's place along an axis of `side` texels, in 1/256 texel, clamped to the outermost centres."""
+    """Returns a sample's position along an axis of `side` texels, in 1/256 texel, clamped to the outermost centres."""
     steps = wp.int64(i + j + k)
     last = wp.int64(side - 1) * wp.int64(65536) * steps
     at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
@@ -105,7 +105,7 @@ def _sample(
     patches: wp.array1d[Patch],
     bright: wp.array1d[wp.uint8],
 ):
-    """One triangle per thread."""
+    """Samples the colours of one triangle per thread."""
     t = wp.tid()
     n = size_of(level[t])
     rows = lightmap.shape[0]
@@ -151,7 +151,7 @@ def _sample(
 
 @wp.func
 def _bin(colour: int) -> int:
-    """Returns the number of a colour's bin, with red in the highest bits."""
+    """Returns the index of a colour's histogram bin, with red in the highest bits."""
     r = channel(colour, 0) >> _BIN_SHIFT
     g = channel(colour, 1) >> _BIN_SHIFT
     b = channel(colour, 2) >> _BIN_SHIFT
@@ -165,7 +165,7 @@ def _dominant(
     # out:
     patches: wp.array1d[Patch],
 ):
-    """One patch per thread: a pass over its samples for each of its few bins, in rising order."""
+    """Finds the dominant colour of one patch per thread, by a pass over its samples for each bin, in rising order."""
     t = wp.tid()
     p = patches[t]
     size = size_of(p.level)
@@ -201,7 +201,8 @@ def _difference(a: int, b: int) -> int:
 
 @wp.func
 def turned(w: wp.vec3i, order: int) -> wp.vec3i:
-    """Returns (w[p[0]], w[p[1]], w[p[2]]) for the permutation p of an order."""
+    """Returns the vector w in another order, (w[p[0]], w[p[1]], w[p[2]]), where p is the permutation
+    `ORDERS[order]`."""
     if order == 0:
         return w
     if order == 1:
@@ -217,7 +218,8 @@ def turned(w: wp.vec3i, order: int) -> wp.vec3i:
 
 @wp.func
 def _inverse(order: int) -> int:
-    """Returns the inverse permutation; all orders except the two rotations, 3 and 4, are self-inverse."""
+    """Returns the index of the inverse permutation of an order; only the two rotations, 3 and 4, are not their own
+    inverse."""
     if order == 3:
         return 4
     if order == 4:
@@ -227,7 +229,8 @@ def _inverse(order: int) -> int:
 
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
-    """Computes `2 ** level` times a patch's colour at (i, j) of the lattice of this level, its own or a higher one."""
+    """Returns `2 ** level` times a patch's interpolated colour at (i, j) of the lattice of `level`, at least the
+    patch's own."""
     # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
@@ -263,7 +266,8 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
 
 @wp.func
 def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
-    """Sums differences with vertex k of the small patch on vertex p[k] of the large one; stops above the limit."""
+    """Sums the colour differences of two patches, with vertex k of the small patch on vertex p[k] of the large patch, p
+    = `ORDERS[order]`; stops once the sum exceeds `limit`."""
     steps = 1 << large.level
     size = steps + 1
     at = large.start
@@ -296,7 +300,7 @@ def _compare(
     order: wp.array1d[wp.int8],
     distance: wp.array1d[wp.float64],
 ):
-    """One pair of patches per thread."""
+    """Compares one pair of patches per thread."""
     t = wp.tid()
     a = patches[representative[t]]
     b = patches[member[t]]
@@ -324,17 +328,17 @@ def _compare(
 
 
 def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) -> tuple:
-    """Samples the patches of triangles (section 3.1).
+    """Samples the colours of triangles as patches (section 3.1).
 
     Args:
         lightmap: uint16 [H, W, 4]: red, green, blue, and 1 where the texel is too bright, else 0.
         corner: int64 [F, 3, 2], (x, y) of the vertices in 1/65536 of a texel from the centre of texel (0, 0).
-        level: int32 [F], levels of the patches' sizes.
+        level: int32 [F], index of each patch's size in `SIZES`.
         device: Where the arrays go.
 
     Returns:
-        The samples of all patches, int; Patch [F], without their dominant colours; and uint8 [F], 1 where a patch reads
-        a texel that is too bright.
+        The samples of all patches, int; the patches, Patch [F], still without dominant colours; and uint8 [F], 1 for
+        patches that read a texel that is too bright.
 
     Raises:
         ValueError: There are more samples than 32 bits can count.
@@ -356,18 +360,15 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 
 
 def dominant(samples, patches) -> None:
-    """Writes the dominant colours of `sample`'s patches: the most frequent of 32 x 32 x 32 bins, and the lowest of
-    equally frequent ones (section 3.2.1)."""
+    """Writes the dominant colour of each patch of `sample`: the most frequent of 32 x 32 x 32 histogram bins; on a tie
+    the lowest bin (section 3.2.1)."""
     wp.launch(_dominant, patches.shape, inputs=[samples], outputs=[patches], device=samples.device)
 
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the order with the least distance of each pair of patches, the first of equals, and that distance (eq. 2
-    and 3).
-
-    Returns int8 [N], o such that vertex k of the member maps to vertex `ORDERS[o][k]` of the representative; and
-    float64 [N], Dist, in [0, 1].
-    """
+    """Finds for each of N pairs of patches the order of vertices with the least distance Dist, on a tie the first, and
+    that distance (eq. 2 and 3). Returns the orders o, int8 [N], such that vertex k of the member maps to vertex
+    `ORDERS[o][k]` of the representative; and the distances, float64 [N], in [0, 1]."""
     device, count = samples.device, member.shape[0]
     order = wp.empty(count, dtype=wp.int8, device=device)
     distance = wp.empty(count, dtype=wp.float64, device=device)

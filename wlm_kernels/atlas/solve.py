@@ -1,7 +1,7 @@
-"""Samples of tiles by weighted least squares: one thread per tile, or per channel of a tile.
+"""Solves for the samples of tiles by weighted least squares, with one thread per tile or per channel of a tile.
 
-A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample only with its
-eight neighbours, so they are gathered from the points once, and conjugate gradients then iterate over samples.
+A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample only with its eight
+neighbours, so they are computed from the points once, and conjugate gradients then iterate over samples.
 
 Arrays may have any strides; on CUDA the stride along the tiles should be 1.
 """
@@ -19,13 +19,13 @@ _TINY = wp.constant(1e-30)
 
 @wp.struct
 class Grid:
-    """Samples and points of a tile.
+    """The grids of samples and points of a tile.
 
     Attributes:
         points: m, points along an axis.
         nx, ny: Samples along x and y, at most `MOST`.
         first_x, first_y: [m], the sample before each point; 0 if there is only one sample.
-        share_x, share_y: [m], the weight of the next sample; 0 if there is only one sample.
+        share_x, share_y: [m], each point's weight of the next sample; 0 if there is only one sample.
     """
 
     points: int
@@ -39,13 +39,15 @@ class Grid:
 
 @wp.struct
 class System:
-    """The normal equations of T tiles; S = nx * ny, row by row.
+    """The normal equations of T tiles; samples, S = nx * ny, are stored row by row.
 
     Attributes:
         own: [T, S], coefficient of a sample with itself.
-        right, down: [T, S], coefficients with the next sample along x and y; 0 beyond the last.
-        cross: [T, S], coefficient with the sample to the lower right, equal to that of the right with the lower one.
-        diagonal: [T, S], sum of a row: the points' weights times the sample's interpolation weights.
+        right, down: [T, S], coefficients with the next sample along x and y; 0 for the last sample.
+        cross: [T, S], coefficient with the sample to the lower right, equal to the one between the right and the lower
+            sample.
+        diagonal: [T, S], sum of the sample's row of the matrix: the points' weights times the sample's interpolation
+            weights.
     """
 
     own: wp.array2d[float]
@@ -243,13 +245,13 @@ def _errors(
 
 
 def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System) -> None:
-    """Gathers the normal equations from the weights of the points' squared errors, float [T, m * m], times the tiles'
-    factors, float [T]."""
+    """Writes the normal equations to `system`, from the weights of the points' squared errors, float [T, m * m], times
+    a factor for each tile, float [T]."""
     wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
 
 
 def gather(light: wp.array, grid: Grid, out: wp.array) -> None:
-    """Applies the transpose of interpolation: light at points [T, 3, m * m] to samples [T, 3, S]."""
+    """Applies the transpose of interpolation: writes samples [T, 3, S] from light at points [T, 3, m * m]."""
     wp.launch(_gather, light.shape[:2], inputs=[light, grid, out], device=light.device, block_dim=_BLOCK)
 
 
@@ -265,13 +267,13 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the equations from a start, float [T, 3, S], with ridge regularisation towards it, by rounds of conjugate
-    gradients. `work` are three arrays of the same shape."""
+    """Solves the equations by conjugate gradients that begin at `start`, float [T, 3, S], with ridge regularisation
+    towards `start`. `work` has three arrays of the same shape."""
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
 
 
 def errors(light: wp.array, weight: wp.array, grid: Grid, samples: wp.array, out: wp.array) -> None:
-    """Computes the weighted squared errors of samples [T, 3, S], float64 [T, 3], written."""
+    """Writes the weighted squared errors of samples [T, 3, S] to `out`, float64 [T, 3]."""
     inputs = [light, weight, grid, samples, out]
     wp.launch(_errors, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)

@@ -105,7 +105,7 @@ class Fields:
 
 @functools.cache
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
-    """Builds (once) a kernel over runs of `RUN` cells along x; with bricks, over the workers times the runs of a brick.
+    """Builds (once) a kernel that advects runs of `RUN` cells along x; with bricks, over workers x runs of a brick.
 
     Without solids the code is half as long, and without temperatures it uses fewer registers.
 
@@ -216,7 +216,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
-        """Returns the first cell of run i of the whole domain, or of the k-th listed brick."""
+        """Returns the first cell of the i-th run of the whole domain, or of the k-th listed brick."""
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])

@@ -157,7 +157,7 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
 
 @wp.func
 def stencil_index(at: Stencil, k: int) -> wp.vec3i:
-    """Returns the k-th of the eight cells."""
+    """Returns the index of the k-th of a stencil's eight cells."""
     return wp.vec3i(
         wp.where(k // 4 == 0, at.low[0], at.high[0]),
         wp.where(k // 2 % 2 == 0, at.low[1], at.high[1]),
@@ -167,7 +167,7 @@ def stencil_index(at: Stencil, k: int) -> wp.vec3i:
 
 @wp.func
 def stencil_weight(at: Stencil, k: int) -> float:
-    """Returns the trilinear weight of the k-th cell."""
+    """Returns the trilinear weight of the k-th of a stencil's eight cells."""
     x = wp.where(k // 4 == 0, 1.0 - at.f[0], at.f[0])
     y = wp.where(k // 2 % 2 == 0, 1.0 - at.f[1], at.f[1])
     z = wp.where(k % 2 == 0, 1.0 - at.f[2], at.f[2])
@@ -386,13 +386,12 @@ def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
 
 
 def rings_for(cells: float) -> int:
-    """Returns the number of rings of bricks that smoke may enter if a trace has a given length in fine cells; a read
-    needs one more cell."""
+    """Returns how many rings of bricks a trace of a length in fine cells can reach, with one more cell for a read."""
     return -(-(int(cells) + 2) // BRICK)
 
 
 def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
-    """Makes the bricks of a domain, all busy and none listed; the arguments are attributes of `Bricks`."""
+    """Makes the bricks of a domain, all busy and none listed; for the other arguments see `Bricks`."""
     total = box.bricks[0] * box.bricks[1] * box.bricks[2]
     bricks = Bricks()
     # The brick across a periodic face may be cut short, so that smoke reaches the one behind it.
@@ -438,7 +437,7 @@ def _list(
 
 
 def relist(box: Box, bricks: Bricks) -> None:
-    """Lists the bricks to compute in the next step and the bricks that are no longer computed; then none is busy."""
+    """Lists the bricks to compute in the next step and those that no longer are; then marks no brick as busy."""
     bricks.count.zero_()
     bricks.retired_count.zero_()
     wp.launch(_list, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)

@@ -38,13 +38,13 @@ _BRICK_CELLS = wp.constant(BRICK**3)
 
 @dataclass(frozen=True)
 class SourceKernels:
-    """The kernels of one storage.
+    """The kernels of one storage type.
 
     Attributes:
-        source: Over the cells of a box around a source.
+        source: Adds or sets the smoke of a source, over the cells of a box around it.
         cover: Empties cells that become solid and fills cells that become fluid, over coarse cells.
-        lift: Acceleration of the air, over coarse cells.
-        empty: Empties retired bricks, over workers times a brick's cells.
+        lift: Computes the acceleration of the air, over coarse cells.
+        empty: Sets retired bricks to 0, over workers times the cells of a brick.
     """
 
     source: wp.Kernel

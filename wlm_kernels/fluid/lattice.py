@@ -100,7 +100,7 @@ class Spec:
 
 @functools.cache
 def _relax(spec: Spec) -> Any:
-    """Builds (once) the collision of a cell: arriving scaled populations and their moments -> leaving populations."""
+    """Builds (once) the collision, a function from a cell's arriving scaled populations and moments to leaving ones."""
     velocities = lattice(spec.lattice)
     c, w, axes, flat = velocities.c, velocities.w, velocities.axes, velocities.axes == 2
     vec = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide).vec
@@ -174,7 +174,7 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the step for a spec, over all cells.
+    """Builds (once) the kernel that does a step with the settings of a spec, over all cells.
 
     Args of the kernel:
         n: Cells along x, y and z.

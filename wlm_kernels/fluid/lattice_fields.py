@@ -136,10 +136,10 @@ class FluidKernels:
     """The kernels of one lattice and storage, each over all cells.
 
     Attributes:
-        fields: Density less 1 and velocity of every cell.
+        fields: Computes the density minus 1 and the velocity of every cell.
         start: Sets every cell to an equilibrium.
-        neighbours: Mean of the fluid around each cell that becomes fluid.
-        uncover: Sets these cells to the equilibrium of that mean.
+        neighbours: Computes the mean of the fluid around each cell that becomes fluid.
+        uncover: Sets each cell that becomes fluid to the equilibrium of this mean.
     """
 
     fields: wp.Kernel

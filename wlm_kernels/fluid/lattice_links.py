@@ -74,9 +74,9 @@ class LinkKernels:
     """The kernels of one lattice and storage.
 
     Attributes:
-        values: First pass, over the links, rounded up to `BLOCK`.
-        write: Second pass, over the links.
-        force: The force of the fluid on each body, over the links.
+        values: First pass: computes the value of each link, over the links, rounded up to `BLOCK`.
+        write: Second pass: writes these values into the populations, over the links.
+        force: Sums the force of the fluid on each body, over the links.
     """
 
     values: wp.Kernel
@@ -99,7 +99,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """Returns the cell whose mirror image in a slip wall sends population q to cell i, and its direction."""
+        """Returns the cell and direction from which population q of cell i comes, mirrored by a slip wall."""
         p = cell_of(n, i)
         c = t.c[q]
         x = _beyond(p[0] - c[0], n[0], bounded[0])
@@ -298,8 +298,8 @@ def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, 
         links: The links, modified.
 
     Returns:
-        Number of these links, int [1], which may exceed the size of the arrays; speed of the fastest surface, float
-        [1].
+        Number of the solids' links, int [1], which may exceed the size of the arrays; speed of the fastest surface,
+        float [1].
     """
     count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
     inputs = [tables, n, bounded, solid, bodies, links]

@@ -135,7 +135,7 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Tests if the population that leaves a cell for p is stored in the cell's element; otherwise a link writes it."""
+    """Tests if a population that leaves a cell towards p is stored in its own element; else a link writes it."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 
@@ -162,7 +162,7 @@ class MemoryFunctions:
         gather: (f, n, p) -> scaled vec, the populations that arrive at cell p: each is read from the cell that it left,
             or from cell p itself at a wall at rest that closes a whole axis.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
-        put: (f, q, i, value), writes a scaled number.
+        put: (f, q, i, value), writes a number that is already scaled.
         load: (f, q, i) -> float, reads a number and removes the scale.
         store: (f, q, i, value), scales and writes a number.
     """

@@ -1,1 +1,1 @@
-"""Kernels of light probes."""
+"""Kernels for light probes: training and decoding of Gaussians, principal components, and cascaded volumes."""

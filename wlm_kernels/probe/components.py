@@ -1,4 +1,4 @@
-"""Decoding probes from principal components, one thread per number; the reference is in `wlm/probe/exact.py`."""
+"""Decodes probes from principal components, one thread per number; `wlm/probe/exact.py` is the reference."""
 
 import warp as wp
 
@@ -30,7 +30,7 @@ def _decode_components(
 def decode_components(
     code: wp.array, bounds: wp.array, basis: wp.array, row: wp.array, numbers: wp.array, out: wp.array
 ) -> None:
-    """Decodes probes.
+    """Decodes probes to their D numbers.
 
     Args:
         code: uint8 [V, 1 + K], codes of magnitude and coefficients.

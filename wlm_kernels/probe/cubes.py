@@ -1,11 +1,11 @@
-"""Lists of the Gaussians that may reach each cube of a grid (gaussian-probe-compression, section 3.2).
+"""Lists the Gaussians that may reach each cube of a grid (gaussian-probe-compression, section 3.2).
 
 `build` counts the cubes of each Gaussian, adds the counts up, writes the pairs (cube, Gaussian), sorts them by cube,
 and finds where each cube's pairs begin. The sort is stable: a cube lists its Gaussians by rising number, so that a sum
 over a list always adds in the order of a sum over all Gaussians.
 
 A cube lists a Gaussian if it meets the Gaussian's support, an ellipsoid or a sphere (eq. 6). Supports are enlarged by
-more than the rounding of float32, so that no list lacks a Gaussian that reaches a point of its cube. Cubes at the
+more than the rounding error of float32, so that no list lacks a Gaussian that reaches a point of its cube. Cubes at the
 border of the grid extend to infinity, since a point outside uses the list of the nearest cube. The reference is `reach`
 and `nearest` in `tests/reference/gaussians.py`.
 """
@@ -90,10 +90,8 @@ def _place_margin(cubes: Cubes) -> float:
 
 @wp.func
 def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
-    """Returns the first and last cube along each axis that meet the box of half side `reach` around `centre`.
-
-    If these are NaN or infinite, it returns the whole grid, since each point is tested again.
-    """
+    """Returns the first and last cube along each axis that meet the box of half side `reach` around `centre`. If these
+    are NaN or infinite, it returns the whole grid, since each point is tested again."""
     pad = _place_margin(cubes)
     wide = (1.0 + REACH_MARGIN) * reach + wp.vec3(pad, pad, pad)
     low = centre - wide
@@ -108,7 +106,7 @@ def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
 
 @wp.func
 def _on_edge(p: wp.vec3d, q: wp.vec3d, low: wp.float64, high: wp.float64) -> wp.float64:
-    """Returns the least |p + t q|^2 for low <= t <= high."""
+    """Returns the minimum of |p + t q|^2 for low <= t <= high."""
     t = wp.clamp(-wp.dot(p, q) / wp.dot(q, q), low, high)
     return wp.length_sq(p + t * q)
 
@@ -123,7 +121,7 @@ def _on_face(
     r_low: wp.float64,
     r_high: wp.float64,
 ) -> wp.float64:
-    """Returns the least |p + s q + t r|^2 for s between q_low and q_high, and t likewise."""
+    """Returns the minimum of |p + s q + t r|^2 for s between q_low and q_high, and t between r_low and r_high."""
     across = r - (wp.dot(q, r) / wp.dot(q, q)) * q
     t = -wp.dot(p, across) / wp.dot(across, across)
     s = -wp.dot(p + t * r, q) / wp.dot(q, q)
@@ -141,13 +139,11 @@ def _on_face(
 
 @wp.func
 def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
-    """Returns the least |W d|^2 for d in a box, exact except for rounding.
-
-    The minimum of a convex function over a box that does not contain its global minimum d = 0 is on a face whose plane
-    separates the box from d = 0, of which there are at most three: otherwise a step towards d = 0 would stay in the box
-    and reduce the value. Likewise, if the minimum over the plane of that face is outside the face, the minimum over the
-    face is on one of at most two edges. A face or an edge at infinity separates nothing.
-    """
+    """Returns the minimum of |W d|^2 over all d in a box, W = `whiten`, exact except for rounding. The minimum of a
+    convex function over a box that does not contain its global minimum d = 0 is on a face whose plane separates the box
+    from d = 0, of which there are at most three: otherwise a step towards d = 0 would stay in the box and reduce the
+    value. Likewise, if the minimum over the plane of that face is outside the face, the minimum over the face is on one
+    of at most two edges. A face or an edge at infinity separates nothing."""
     zero = wp.float64(0.0)
     best = wp.float64(wp.inf)
     outside = int(0)
@@ -174,7 +170,8 @@ def _nearest(whiten: wp.mat33d, low: wp.vec3d, high: wp.vec3d) -> wp.float64:
 
 @wp.func
 def _limit(shape: Shape) -> float:
-    """Returns the bound of the test: the squared radius of a sphere, or the squared cut of an ellipsoid."""
+    """Returns the limit for squared distances from a Gaussian: the squared radius of a sphere, or the squared cut of an
+    ellipsoid."""
     if shape.radius > 0.0:
         return shape.radius
     w = shape.whiten
@@ -185,7 +182,7 @@ def _limit(shape: Shape) -> float:
 
 @wp.func
 def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i) -> bool:
-    """Returns whether a cube of the span meets the support itself."""
+    """Tests whether a cube meets the Gaussian's support itself, and not only the support's bounding box."""
     if not wp.isfinite(shape.reach):
         return True
     pad = _place_margin(cubes)
@@ -277,13 +274,13 @@ def _find_starts(
 
 
 def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
-    """Sorts pairs by their first number, in a stable order.
+    """Sorts pairs of a cube and a Gaussian by the cube, in a stable order.
 
     Args:
         keys: int [2 * count], indices of cubes; the second half is scratch memory.
-        items: int [2 * count], second numbers of the pairs, likewise.
+        items: int [2 * count], indices of Gaussians; the second half is scratch memory.
         count: Number of pairs.
-        cubes: C.
+        cubes: Number of cubes, C.
         start: int [C + 1], written: index at which each cube's pairs begin.
     """
     wp.utils.radix_sort_pairs(keys, items, count, end_bit=max(1, (cubes - 1).bit_length()))
@@ -291,21 +288,20 @@ def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
 
 
 def build(shapes, low, high, size: float | None = None) -> Cubes:
-    """Builds the lists of a grid over a box.
+    """Builds a grid of cubes over a box, with the list of each cube.
 
     Args:
-        shapes: Shape [K], made for the cut and support that the sums will have.
+        shapes: Shape [K] of the Gaussians, made for the same cut and support as later sums.
         low, high: Three numbers each, lowest and highest corner of the points' box; it may be flat along any axis.
         size: Side of a cube, positive, in the frame of the points. None: a quarter of the median reach of the Gaussians
-            along their widest axis, doubled until there are at most 8 cubes and 256 pairs to test per Gaussian, and
-            4,096 more of either.
+            along their widest axis, doubled until there are at most 8 K + 4,096 cubes and 256 K + 4,096 pairs to test.
 
     Returns:
         The lists, on the shapes' device.
 
     Raises:
-        ValueError: An argument is wrong, or there would be more than `MOST_PAIRS` cubes or pairs to test; nothing of
-            that size is allocated before.
+        ValueError: An argument is wrong, or there would be more than `MOST_PAIRS` cubes or pairs to test; this is
+            checked before memory is allocated.
     """
     corners = np.array([low, high], np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
@@ -340,10 +336,10 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
 
 
 def everything(count: int, device) -> Cubes:
-    """Returns one cube that lists all Gaussians, for sums without lists.
+    """Returns a grid of one cube that lists all Gaussians, for sums without lists.
 
     Args:
-        count: K.
+        count: Number of Gaussians, K.
         device: Device of the list.
     """
     cubes = _grid(np.zeros((2, 3)), 1.0)
@@ -363,7 +359,7 @@ def _grid(corners: np.ndarray, size: float) -> Cubes:
 
 
 def _tested(shapes, cubes: Cubes) -> int:
-    """Returns the pairs of cubes and Gaussians to test."""
+    """Returns the number of pairs of a cube and a Gaussian that have to be tested."""
     counts = wp.empty(shapes.shape[0], dtype=wp.int64, device=shapes.device)
     wp.launch(_candidates, counts.shape, inputs=[shapes, cubes], outputs=[counts], device=shapes.device)
     return int(counts.numpy().sum())

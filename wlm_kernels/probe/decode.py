@@ -1,4 +1,4 @@
-"""Decoding points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
+"""Decodes points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
 
 On CUDA a block of 128 threads decodes up to 64 points: several threads share the Gaussians that a point's cube lists,
 their sums are added in shared memory, and the network runs on all points together (`native/layers.cuh`, then
@@ -19,7 +19,7 @@ from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_a
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The decode of one network shape on one kind of device.
+    """The kernel that decodes points, for one size of network and one kind of device.
 
     Attributes:
         device_kind: "cpu" or "cuda".
@@ -31,14 +31,14 @@ class DecodeKernels:
     _kernel: Any
 
     def launch(self, rows, shapes, cubes, cut, net, gain, x, out) -> None:
-        """Decodes points.
+        """Decodes points to their D numbers.
 
         Args:
-            rows: float [K, 10 + L].
+            rows: float [K, 10 + L], the Gaussians.
             shapes: Shape [K], made from the rows with this cut.
             cubes: `cubes.Cubes` of the shapes; points outside use the list of the nearest cube.
             cut: Radius of a support in standard deviations.
-            net: float [P], see `network`.
+            net: float [P], weights of the network, see `network`.
             gain: Factor of the network's outputs.
             x: vec3 [M], in the normalised frame.
             out: float [M, D], written.
@@ -57,12 +57,12 @@ class DecodeKernels:
 
 @functools.cache
 def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> DecodeKernels:
-    """Builds the kernel of a shape, once.
+    """Builds the kernel for one size of network; later calls return the same kernel.
 
     Args:
-        latent: L >= 1.
-        hidden: H, a multiple of 8.
-        outputs: D >= 1.
+        latent: Length of a latent, L >= 1.
+        hidden: Units of a hidden layer, H, a multiple of 8.
+        outputs: Numbers per probe, D >= 1.
         device_kind: "cpu" or "cuda".
     """
     fn = functions(latent)
@@ -136,7 +136,7 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
-    """Returns the code of the network for a block of points, from the partial sums of their latents."""
+    """Returns the CUDA code that sums partial latents and runs the network for a block of points."""
     snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)

@@ -1,9 +1,10 @@
-"""The Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
+"""Computes the Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
 
-With `cubes` a point only evaluates the Gaussians that its cube lists, with the same result as all. `backward` computes
-the gradient of the rows, one Gaussian per thread over the points of the cubes within its reach; `backward_points` that
-of the points, one point per thread. There are no atomic additions. The gradients treat the set of Gaussians that reach
-a point as constant. The reference is `wlm.ops.plain.gaussian_sum`; for probes that do not move, `step` trains faster.
+With `cubes` a point only evaluates the Gaussians that its cube lists, with the same result as from all Gaussians.
+`backward` computes the gradient of the Gaussians, one per thread, over the points of the cubes within its reach;
+`backward_points` computes the gradient of the points, one per thread. There are no atomic additions. The gradients
+treat the set of Gaussians that reach a point as constant. The reference is `wlm.ops.plain.gaussian_sum`; for probes
+that do not move, `step` trains faster.
 """
 
 import functools
@@ -60,7 +61,7 @@ def _cubes_of(
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The kernels of one latent length."""
+    """The kernels for one length of latents."""
 
     forward: Any
     backward: Any
@@ -69,7 +70,7 @@ class _Kernels:
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds the kernels of `sum` and its adjoints for latents of length L, once."""
+    """Builds the kernels of `sum` and its gradients for latents of length L; later calls return the same kernels."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope
@@ -158,10 +159,10 @@ def sum_kernels(latent: int) -> _Kernels:
 
 
 def shapes(rows, cut: float, support: str = "ellipsoid"):
-    """Builds the `Shape` of each row.
+    """Builds the `Shape` of each Gaussian.
 
     Args:
-        rows: float [K, 10 + L], see `gaussians`.
+        rows: float [K, 10 + L], the Gaussians, see `gaussians`.
         cut: Radius of a support in standard deviations.
         support: "ellipsoid", or "sphere": the sphere of the longest axis (eq. 6).
 
@@ -176,7 +177,7 @@ def shapes(rows, cut: float, support: str = "ellipsoid"):
 def sum(rows, shapes, cubes, x, f, cut: float) -> None:
     """Computes F(x) = sum of F_k w_k(x) over the Gaussians that reach x (eq. 5).
 
-    The result does not depend on the lists, bit for bit, as long as no list lacks a Gaussian that reaches its points.
+    The result is the same bit for bit for any lists, as long as no list lacks a Gaussian that reaches its points.
 
     Args:
         rows: float [K, 10 + L].
@@ -192,7 +193,7 @@ def sum(rows, shapes, cubes, x, f, cut: float) -> None:
 
 
 def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
-    """Computes the gradient of `sum` with respect to its rows.
+    """Computes the gradient of `sum` with respect to the Gaussians' rows.
 
     Args:
         rows, shapes, cubes, x, cut: As for `sum`.

@@ -5,10 +5,10 @@ S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-`Shape` is a row prepared for use. The backward pass sums the symmetric a w u u^T and the vector a w u with
-a = dL/dF . F_k over the points; `chain` converts the sums to gradients of the row, without differences of large
-numbers. For needles and sheets u itself is such a difference: for these Gaussians alone it is computed in float64. The
-reference is `tests/reference/gaussians.py`.
+`Shape` is a row prepared for use. The backward pass sums the symmetric a w u u^T and the vector a w u with a = dL/dF .
+F_k over the points; `chain` converts the sums to gradients of the row, without differences of large numbers. For very
+thin Gaussians u itself is a difference of large numbers, and is computed in float64. The reference is
+`tests/reference/gaussians.py`.
 """
 
 import functools
@@ -28,15 +28,15 @@ _SLENDER = wp.constant(100.0)
 
 @wp.struct
 class Shape:
-    """A Gaussian without its latent.
+    """A Gaussian without its latent, prepared for evaluation.
 
     Attributes:
-        centre: In the frame of the points.
+        centre: Centre, in the frame of the points.
         whiten: W = S^-1 R^T.
         rest: Rounding error of W, for slender Gaussians; else 0.
         reach: Half the size of the support's bounding box.
         radius: Squared radius of a spherical support; 0 for an ellipsoid.
-        slender: 1 if u needs float64.
+        slender: 1 if u needs float64, else 0.
     """
 
     centre: wp.vec3
@@ -67,10 +67,10 @@ def _rotation(q: wp.vec4d) -> wp.mat33d:
 
 @wp.func
 def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere: int) -> Shape:
-    """Builds the `Shape` of one row.
+    """Returns the `Shape` of one Gaussian.
 
     Args:
-        centre, log_scale, q: The row's first ten numbers.
+        centre, log_scale, q: The first ten numbers of the Gaussian's row.
         cut: Radius of the support in standard deviations.
         sphere: 1: the support is the sphere of the longest axis (eq. 6); 0: the ellipsoid.
     """
@@ -120,7 +120,7 @@ def _reaches(shape: Shape, x: wp.vec3, d2: float, cut: float) -> bool:
 
 @wp.func
 def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
-    """Returns whether the bounding box of a Gaussian's support meets another box.
+    """Tests whether the bounding box of a Gaussian's support meets another box.
 
     Args:
         shape: The Gaussian.
@@ -132,16 +132,16 @@ def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
 
 @dataclass(frozen=True)
 class GaussianFunctions:
-    """The `wp.func`s for latents of one length; `rows` is float [K, 10 + L], `cut` in standard deviations.
+    """The `wp.func`s for one length of latents; `rows` is float [K, 10 + L], `cut` in standard deviations.
 
     Attributes:
         vec_latent: vec of L floats.
         vec_sums: vec of 9 + L floats, sums of `accumulate` over points.
-        add: (f, shape, rows, k, x, cut) -> f with Gaussian k at x added.
-        accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums with the point x added.
+        add: (f, shape, rows, k, x, cut) -> f plus Gaussian k at x.
+        accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums plus the terms of point x.
         slope: (shape, rows, k, x, grad_f, cut) -> contribution of Gaussian k to the gradient of x.
-        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; the other sums are that of the
-            latent.
+        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; the last L sums are the
+            gradient of the latent.
     """
 
     vec_latent: Any
@@ -157,7 +157,7 @@ _vec10 = wp.types.vector(LATENT, float)
 
 @functools.cache
 def functions(latent: int) -> GaussianFunctions:
-    """Builds the functions for latents of length L, once."""
+    """Builds the functions for latents of length L; later calls return the same functions."""
     vec_latent = wp.types.vector(latent, float)
     vec_sums = wp.types.vector(SHAPE_NUMBERS + latent, float)
 

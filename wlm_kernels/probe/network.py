@@ -24,34 +24,33 @@ CPU_LANES = 2
 
 
 def padded(outputs: int) -> int:
-    """Returns the length of a padded row of the last layer."""
+    """Returns the length of a row of the last layer, padded to a multiple of four numbers."""
     return -(-outputs // 4) * 4
 
 
 def most_outputs(latent: int, hidden: int) -> int:
-    """Returns the largest number of outputs with which a block of the fewest probes fits its shared memory on CUDA."""
+    """Returns the largest number of outputs for which a CUDA block with the fewest probes fits in shared memory."""
     rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
     return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
 
 
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
-    """Returns the probes per block of threads on CUDA that fit its shared memory, 64 at most.
-
-    Above `most_outputs` none fit: the kernels then run on the CPU only, where the number has no effect.
-    """
+    """Returns how many probes, at most 64, a CUDA block can evaluate within its shared memory. Above `most_outputs`
+    none fit; the kernels then only run on the CPU, where this number has no effect."""
     rows = latent + 3 + 2 * hidden + padded(outputs)
     return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns CUDA code of the forward pass of a block, the beginning of a function's body (`native/layers.cuh`)."""
+    """Returns the CUDA code for the forward pass of a block of probes, to begin a function's body
+    (`native/layers.cuh`)."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
 
 @dataclass(frozen=True)
 class NetworkKernels:
-    """The network of one shape on one kind of device.
+    """The kernels of the network for one size and one kind of device.
 
     Attributes:
         device_kind: "cpu" or "cuda".
@@ -63,7 +62,7 @@ class NetworkKernels:
     _kernel: Any
 
     def parts(self, probes: int) -> int:
-        """Returns the number of partial gradients that a launch over a number of probes writes."""
+        """Returns the number of partial gradients that a launch for `probes` probes writes."""
         return CPU_LANES if self.device_kind == "cpu" else probes // self.probes
 
     def load(self, device) -> None:
@@ -76,13 +75,13 @@ class NetworkKernels:
         Args:
             groups: `step.Groups`.
             f: float [S, L, N], the Gaussians' sums as S partial sums.
-            target: float [D, N].
-            weight: float [D].
-            net: float [P].
+            target: float [D, N], the probes' numbers.
+            weight: float [D], weight of each number.
+            net: float [P], weights of the network.
             grad_f: float [L, N], written.
             partial: float [B, P], B = `parts(N)`: written on CUDA, added to on the CPU.
-            loss: float [B], likewise.
-            base, count: On the CPU, first probe and number of probes of this launch; one lane has base 0.
+            loss: float [B], partial losses: written on CUDA, added to on the CPU.
+            base, count: On the CPU, first probe and number of probes of this launch.
         """
         probes = groups.x.shape[0]
         if self.device_kind == "cuda":
@@ -101,12 +100,12 @@ class NetworkKernels:
 
 @functools.cache
 def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> NetworkKernels:
-    """Builds the network of a shape, once.
+    """Builds the kernels for one size of network; later calls return the same kernels.
 
     Args:
-        latent: L >= 1.
-        hidden: H, a multiple of 8.
-        outputs: D >= 1.
+        latent: Length of a latent, L >= 1.
+        hidden: Units of a hidden layer, H, a multiple of 8.
+        outputs: Numbers per probe, D >= 1.
         device_kind: "cpu" or "cuda".
     """
     options = {"enable_backward": False}
@@ -153,7 +152,7 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
 
 @dataclass(frozen=True)
 class CpuNetwork:
-    """The `wp.func`s of the network of a CPU thread.
+    """The `wp.func`s with which a CPU thread evaluates the network.
 
     Attributes:
         vec_in, vec_hidden, vec_out: Vectors of the inputs, of the units of a layer, and of the padded outputs.
@@ -171,7 +170,7 @@ class CpuNetwork:
 
 @functools.cache
 def cpu_network(latent: int, hidden: int, outputs: int) -> CpuNetwork:
-    """Builds the functions of one shape, once."""
+    """Builds the functions for one size of network; later calls return the same functions."""
     inputs, wide = latent + 3, padded(outputs)
     second = (inputs + 1) * hidden
     third = second + (hidden + 1) * hidden

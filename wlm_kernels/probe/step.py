@@ -1,4 +1,5 @@
-"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3); `network` has the rest of it.
+"""A training step of the Gaussians (gaussian-probe-compression, section 3.2 and 3.3), except for the network
+(`network`).
 
 Probes are sorted along a space-filling curve and divided into groups of 64 neighbours, each with a bounding box. A step
 has five launches: bit masks of the Gaussians that meet each group (`touch`); the Gaussians' sum at each probe
@@ -34,10 +35,10 @@ _vec8 = wp.types.vector(8, float)
 
 @wp.struct
 class Groups:
-    """Probes in groups; N is a multiple of `GROUP`, G = N / GROUP.
+    """Probes in groups of `GROUP` neighbours; N is a multiple of `GROUP`, and there are G = N / GROUP groups.
 
     Attributes:
-        x: [N], positions in the normalised frame; positions after `count` only fill the last group.
+        x: [N], positions in the normalised frame; positions from index `count` on only fill up the last group.
         middle, half: [G], centres and half sizes of the groups' boxes.
         count: Number of probes.
     """
@@ -50,13 +51,13 @@ class Groups:
 
 @wp.struct
 class Optimiser:
-    """Settings of the two optimisers.
+    """Settings of the optimisers of the Gaussians and of the network.
 
     Attributes:
         control: int [1], number of the step, from 1.
         schedule: float [steps], factor of all rates at each step.
-        rates: float [10 + L], of each channel of a Gaussian.
-        net_rate: Rate of the network.
+        rates: float [10 + L], learning rate of each channel of a Gaussian.
+        net_rate: Learning rate of the network.
         bounds: float [2, 10 + L], lowest and highest value of each channel.
         keep: 1 to clamp the rows to `bounds`.
         move: 0 to leave the Gaussians unchanged.
@@ -93,7 +94,7 @@ def next_bit(bits: wp.uint32) -> int:
 #endif
 """)
 def _ballot(bit: int) -> wp.uint32:
-    """Returns a word with a bit for each of the 32 threads of a warp."""
+    """Returns a word in which each of the 32 threads of a warp has set one bit."""
     ...
 
 
@@ -170,7 +171,7 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
 
 @dataclass(frozen=True)
 class StepKernels:
-    """The launches of one latent length on one kind of device."""
+    """The launches of a step for one length of latents and one kind of device."""
 
     device_kind: str
     _shapes: Any
@@ -184,14 +185,14 @@ class StepKernels:
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
-        """Rounds the parameters to codes, if asked for, and converts them to shapes.
+        """Rounds the Gaussians' parameters to codes, if `quantised`, and converts them to shapes.
 
         Args:
             rows: float [K, 10 + L], the parameters.
             bounds: float [2, 10 + L], lowest and highest value of each channel.
             quantised: 1 to round to codes (eq. 13 and 14), 0 to use the rows unchanged.
             levels: float [10 + L], highest code of each channel.
-            cut, sphere: As for `gaussians.shape_of`.
+            cut, sphere: The arguments of `gaussians.shape_of`.
             used: float [K, 10 + L], written.
             shapes: Shape [K], written.
         """
@@ -204,11 +205,11 @@ class StepKernels:
         )
 
     def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
-        """Computes the sum of the Gaussians at each probe.
+        """Computes the Gaussians' sum at each probe.
 
         Args:
-            groups, shapes, used, by_group, cut: As above.
-            f: float [S, L, N], written: S parts of the sum, S = `SPLITS` on CUDA and 1 on the CPU.
+            groups, shapes, used, by_group, cut: The same as for `touch` and `shapes`.
+            f: float [S, L, N], written: S partial sums, S = `SPLITS` on CUDA and 1 on the CPU.
             base, count: On the CPU, first probe and number of probes of this launch.
         """
         probes = groups.x.shape[0]
@@ -226,8 +227,8 @@ class StepKernels:
         """Sums the terms of each Gaussian's gradient over the probes.
 
         Args:
-            groups, shapes, used, by_gaussian, cut: As above.
-            grad_f: float [L, N], the gradient of the sum; 0 after `groups.count`.
+            groups, shapes, used, by_gaussian, cut: The same as for `touch` and `shapes`.
+            grad_f: float [L, N], the gradient of the sum; 0 from index `groups.count` on.
             sums: float [K, 9 + L], written.
             base, count: On the CPU, first Gaussian and number of Gaussians of this launch.
         """
@@ -247,13 +248,13 @@ class StepKernels:
 
         Args:
             optimiser: The settings.
-            rows: float [K, 10 + L], updated.
+            rows: float [K, 10 + L], parameters of the Gaussians, updated.
             used: float [K, 10 + L], values at which the gradients were taken.
             shapes: Shape [K].
-            sums: float [K, 9 + L], of `collect`.
-            moments: float [4, K, 10 + L], updated.
-            net: float [P], updated.
-            net_moments: float [2, P], updated.
+            sums: float [K, 9 + L], result of `collect`.
+            moments: float [4, K, 10 + L], the optimiser's running means, updated.
+            net: float [P], weights of the network, updated.
+            net_moments: float [2, P], Adam's running means for the network, updated.
             partial: float [B, P], partial gradients of the network.
         """
         wp.launch(
@@ -267,10 +268,10 @@ class StepKernels:
 
 @functools.cache
 def step_kernels(latent: int, device_kind: str) -> StepKernels:
-    """Builds the launches, once.
+    """Builds the launches of a step; later calls return the same launches.
 
     Args:
-        latent: L.
+        latent: Length of a latent, L.
         device_kind: "cpu" or "cuda".
     """
     fn = functions(latent)
@@ -426,7 +427,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 
 def _block_sum(vec_sums, numbers: int):
-    """Sums a vector over a CUDA block in a fixed order into row k of an array."""
+    """Sums a vector over the threads of a CUDA block, in a fixed order, into row k of an array."""
 
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
@@ -436,7 +437,7 @@ def _block_sum(vec_sums, numbers: int):
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds the kernel of `step.StepKernels.update` for latents of length L, once."""
+    """Builds the kernel of `step.StepKernels.update` for latents of length L; later calls return the same kernel."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent

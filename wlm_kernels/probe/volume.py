@@ -1,4 +1,4 @@
-"""Reading light at any point from nested grids of blocks around a viewer, through a page table.
+"""Reads light at any point from nested grids of blocks around a viewer, through a page table.
 
 A block of level l is the cell `[b s, (b + 1) s)` of a grid of cubes of side s_l, with integer coordinates b; its D
 numbers are the light at its centre. The window of level l has `side` blocks along each axis and starts at base_l. The
@@ -7,7 +7,7 @@ slot of a block is its coordinates modulo `side`, so that a window that moves by
 numbers of the window's block, or -1 where the block is missing.
 
 Arrays: pool float [R, D]; pages int [L * side^3], by slot; bases vec3i [L]; views vec4 [L], position of the points'
-origin in the grid, `origin / s - (base + side / 2 + 1/2)`, and 1 / s. None has a gradient. The reference is
+origin in the grid, `origin / s - (base + side / 2 + 1/2)`, and 1 / s. Gradients are not computed. The reference is
 `tests/reference/volume.py`.
 """
 
@@ -121,25 +121,23 @@ def _read(
 
 
 def read(pool, pages, bases, views, side: int, points, normals, out, answered, weight) -> None:
-    """Reads the light at points, from the finest level that has it.
+    """Writes the light at points, from the finest level that has it.
 
     At each level, from the finest, the 8 blocks whose centres surround a point have trilinear weights. Blocks that are
-    present add their share; the weight of the missing ones passes on to the next level. The sum is divided by the
-    weight of all blocks that were present. The light is thus continuous across missing blocks, borders of windows and
-    changes of level. If the finest level has all 8 blocks, it alone answers, and reproduces a linear field.
+    present add their weighted light; the weight of missing blocks passes on to the next level. The sum is divided by
+    the weight of all blocks that were present. The light is thus continuous across missing blocks, borders of windows
+    and changes of level. If the finest level has all 8 blocks, only this level is read, and a linear field is
+    reproduced.
 
     Args:
-        pool: float [R, D].
-        pages: int [L * side^3].
-        bases: vec3i [L].
-        views: vec4 [L].
+        pool, pages, bases, views: The arrays that the module's docstring describes.
         side: Blocks along an axis of a window, even.
-        points: vec3 [M], relative to the origin of `views`. Nothing covers a point that is NaN or far away.
-        normals: vec3 [M], of unit length: a point is read half a block in front of its surface, so that the far side of
-            a wall contributes less; or [0]: the points are read where they are.
-        out: float [M, D], written; 0 where nothing covers the point.
-        answered: int [M], written: the level with the largest share, -1 without any.
-        weight: float [M], written: share of the weight that blocks of any level cover, 0 to 1.
+        points: vec3 [M], relative to the origin of `views`. No block covers a point that is NaN or far away.
+        normals: vec3 [M], of unit length: light is read half a block in front of the point's surface, so that the far
+            side of a wall contributes less; or an empty array, [0]: light is read at the point itself.
+        out: float [M, D], written; 0 where no block covers the point.
+        answered: int [M], written: the level with the largest weight, -1 if no block covers the point.
+        weight: float [M], written: fraction of the weight that blocks of any level cover, 0 to 1.
     """
     channels = out.shape[1]
     # Several threads of a GPU share a point's channels; on a CPU each would look the blocks up again.

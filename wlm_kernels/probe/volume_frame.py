@@ -1,11 +1,11 @@
-"""A frame of the cascaded volume on its device: finding new blocks, their probes, and their rows of the pool.
+"""Runs a frame of the cascaded volume on its device: finds new blocks, their probes, and their rows of the pool.
 
 The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 
 1. `look` takes the new windows; `scroll` finds for each slot its block, whether a probe is near that block, and whether
    the pool still has it. Other blocks wait, and are counted by their distance to the viewer.
 2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
-   decoded, by distances in units of their own side; of two equal ones the finer block, then the one of the lower slot.
+   decoded, by distances in units of their own side; on a tie first the finer block, then the lower slot.
 3. `allocate` gives each block a row of the pool: the least recently used row of a group that no other block takes from.
    Groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
@@ -54,14 +54,14 @@ class Index:
     """Probes sorted by cell, and the blocks near probes; see `wlm.probe.volume.index`.
 
     Attributes:
-        key: [N], rising.
-        number: [N].
-        cell: [N].
-        place: [N].
+        key: [N], Morton keys of the probes' cells, rising.
+        number: [N], index of each probe in the input.
+        cell: [N], cell of each probe.
+        place: [N], position in the cell, 0 to 1.
         normal: [N], unit normal of each probe's surface; 0 for a probe on no surface, or if it is unknown.
-        block: [W], rising within a level.
-        level_start: [L + 1].
-        ratios: [L], sides of the levels over the finest.
+        block: [W], Morton keys of the blocks, rising within a level.
+        level_start: [L + 1], index in `block` at which each level begins.
+        ratios: [L], side of each level divided by the finest side.
     """
 
     key: wp.array1d[wp.int64]
@@ -76,15 +76,15 @@ class Index:
 
 @wp.struct
 class Windows:
-    """The slots of each level's window, S in all.
+    """The S slots of the windows of all levels, each for one block.
 
     Attributes:
         bases: [L].
         views: [L], see `wlm_kernels.probe.volume`.
-        held: [S], the block of each slot.
-        wanted: [S], its number among the index's blocks, -1 if no probe is near.
-        pages: [S], its row of the pool, or -1.
-        away: [S], squared distance of a waiting block from the viewer, in sides; -1 for other blocks.
+        held: [S], coordinates of the block of each slot.
+        wanted: [S], the block's number in the index, -1 if no probe is near.
+        pages: [S], the block's row in the pool, or -1.
+        away: [S], squared distance of a waiting block from the viewer, in units of its side; -1 for other blocks.
     """
 
     bases: wp.array1d[wp.vec3i]
@@ -97,11 +97,11 @@ class Windows:
 
 @wp.struct
 class Pool:
-    """The R rows of the pool, in use or cached.
+    """The R rows of the array that stores the light of blocks, in use or cached.
 
     Attributes:
         stamp: [R], last frame in which the row's block was in a window; -1 for an empty row.
-        owner: [R], its block's number in the index, or -1.
+        owner: [R], number in the index of the row's block, or -1.
         rows: [W], the row of each block of the index, or -1.
     """
 
@@ -116,21 +116,22 @@ class Work:
 
     Attributes:
         clock: [1], the frame's number.
-        counters: [7].
+        counters: [7], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of waiting blocks by distance.
-        limit: [1], the last bin that is gathered.
-        gathered: [MOST], slots.
-        distance: [MOST], distance of each, as in `Windows.away`.
-        chosen: [B], slots, or -1.
-        taken: [B], rows of the pool, or -1.
-        begin, count: [B, 64], ranges of the index.
+        limit: [1], the last bin of the histogram whose blocks are gathered.
+        gathered: [MOST], slots of the gathered blocks.
+        distance: [MOST], distance of each gathered block, as in `Windows.away`.
+        chosen: [B], slots of the chosen blocks, or -1.
+        taken: [B], rows of the pool for these blocks, or -1.
+        begin, count: [B, 64], ranges of probes in the index.
         picked: [B], number of probes that contribute to a block, 16 at most.
-        noise: [B], variance of the noise of each of them.
-        places: [B, 16], positions of the probes from the block's centre, in sides, and the additional noise of each.
+        noise: [B], variance of the noise of each contributing probe.
+        places: [B, 16], positions of the probes from the block's centre, in units of its side, and the additional noise
+            of each.
         rows: [B, 16], covariance of each probe with the probes before it and with itself, then 0.
         hats: [B, 16], covariance of each probe with the block.
         numbers: [B * 16], indices of the probes.
-        weights: [B, 16].
+        weights: [B, 16], weights of the probes.
     """
 
     clock: wp.array1d[int]
@@ -169,7 +170,7 @@ def morton(cell: wp.vec3i) -> wp.int64:
 
 @wp.func
 def _lower(keys: wp.array1d[wp.int64], first: int, last: int, key: wp.int64) -> int:
-    """Returns the first index of rising keys[first:last] whose key is not below a given key, or `last`."""
+    """Returns the first index of the rising numbers keys[first:last] whose key is at least the given key, or `last`."""
     low = first
     high = last
     while low < high:
@@ -259,7 +260,8 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
 
 @wp.func
 def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
-    """Returns the first of 16 counts at which the sum reaches the budget, or the last one; and the sum before it."""
+    """Finds the first of 16 counts at which the running sum reaches the budget, or the last count. Returns its index
+    and the sum before it."""
     counts = vec16i()
     for i in range(16):  # unrolled, so that all loads are in flight at once
         counts[i] = histogram[first + i]
@@ -400,9 +402,9 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
 
 
 class Look:
-    """Takes the windows and the index of a frame; only the arguments of this launch change from frame to frame.
+    """The launch that copies the windows and the index of a frame; only its arguments change from frame to frame.
 
-    A volume makes it once, since packing all arguments anew takes longer than the launch.
+    A volume makes one such object, since packing all arguments again takes longer than the launch.
 
     Args:
         windows, work: Written by every launch.
@@ -431,7 +433,7 @@ class Look:
 
 
 def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
-    """Finds the block of each slot, and the blocks that wait."""
+    """Finds the block of each slot, and which blocks wait to be decoded."""
     inputs = [index, windows, pool, side, work]
     wp.launch(_scroll, windows.held.shape, inputs=inputs, device=work.clock.device)
 
@@ -445,33 +447,33 @@ def choose(windows: Windows, side: int, work: Work) -> None:
 
 
 def allocate(windows: Windows, pool: Pool, work: Work) -> None:
-    """Gives the chosen blocks their rows; a block whose group has no free row keeps waiting."""
+    """Gives the chosen blocks rows of the pool; a block whose group has no free row keeps waiting."""
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
     wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
 
 
 def search(index: Index, windows: Windows, side: int, work: Work) -> None:
-    """Finds the probes of the chosen blocks, as ranges of the index."""
+    """Finds the probes within reach of the chosen blocks, as ranges of the index."""
     inputs = [index, windows, side, work]
     wp.launch(_find_ranges, work.count.shape, inputs=inputs, device=work.clock.device)
 
 
 def combine(work: Work, light: wp.array, pool: wp.array) -> None:
-    """Writes the light of the blocks.
+    """Writes the light of the chosen blocks to their rows of the pool.
 
     Args:
-        work: With the weights.
-        light: float [B * 16, D], of the probes `work.numbers`.
+        work: Scratch arrays, with the weights computed.
+        light: float [B * 16, D], light of the probes `work.numbers`.
         pool: float [R, D], written.
     """
     wp.launch(_combine, (work.chosen.shape[0], pool.shape[1]), inputs=[work, light, pool], device=pool.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies rows [M, D] of an array [N, D] by their indices [M]."""
+    """Copies the rows of `values` [N, D] with indices `numbers` [M] to `out` [M, D]."""
     wp.launch(_take_rows, out.shape, inputs=[values, numbers, out], device=out.device)
 
 
 def take_points(points: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies points [M] of an array [N] by their indices [M]."""
+    """Copies the points of `points` [N] with indices `numbers` [M] to `out` [M]."""
     wp.launch(_take_points, out.shape, inputs=[points, numbers, out], device=out.device)

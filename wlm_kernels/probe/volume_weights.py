@@ -1,13 +1,13 @@
-"""The weights of a block's probes in a frame of the cascaded volume.
+"""Computes the weights of a block's probes in a frame of the cascaded volume.
 
-Reading is trilinear: the light at x is A(x) g, the hat functions of the lattice of blocks times the blocks' light g.
-The light of a block follows from up to 16 probes as the best linear unbiased estimate (ordinary kriging), under the
+Light is read trilinearly: at x it is A(x) g, the hat functions of the lattice of blocks times the blocks' light g. The
+light of a block follows from up to 16 probes as the best linear unbiased estimate (ordinary kriging), under the
 assumption that g is white noise on the lattice plus a smooth part, so that the covariance of the light at x and y is
 
     k(x, y) = A(x) A(y)^T + 0.3 exp(-|x - y| / (3 s)),
 
-and each probe has noise of variance 0.03, or up to 0.3 where 16 probes represent many more. Because of the first part
-the light that is read at a probe is nearly that probe's own, which a weighted mean would blur.
+and each probe has noise of variance 0.03, or up to 0.3 where 16 probes represent many more. Because of the white noise,
+the light that is read at a probe is nearly the probe's own, which a weighted mean would blur.
 
 If normals are known and the block's centre is d sides behind a probe's surface, the noise of that probe is larger by
 3 d^2. A block thus takes its light from probes on its own side of a wall, if there are any.
@@ -33,7 +33,7 @@ _Square = wp.types.matrix(shape=(PROBES, PROBES), dtype=float)
 
 @wp.func
 def _overlap(x: float, y: float) -> float:
-    """Returns A(x) A(y)^T along one axis, in sides, with blocks at integers."""
+    """Returns A(x) A(y)^T along one axis; x and y are in units of a block's side, with blocks at integers."""
     low = wp.floor(x)
     other = wp.floor(y)
     a = x - low
@@ -49,7 +49,7 @@ def _overlap(x: float, y: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _pick(index: Index, windows: Windows, side: int, work: Work):
-    """Picks the probes of a block, one per thread."""
+    """Picks the probes that contribute to one block per thread."""
     k, i = wp.tid()
     total = int(0)
     for j in range(_HALVES):
@@ -85,7 +85,7 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
 
 @wp.kernel(enable_backward=False)
 def _relate(work: Work):
-    """Computes the covariance of one probe with those before it, itself and the block, one probe per thread."""
+    """Computes the covariance of one probe per thread with the probes before it, with itself and with the block."""
     k, i = wp.tid()
     if i < work.picked[k]:
         x = work.places[k, i]
@@ -105,7 +105,7 @@ def _relate(work: Work):
 
 @wp.kernel(enable_backward=False)
 def _weigh(work: Work):
-    """Computes the weights of one block per thread by Cholesky decomposition; entries of unknown rows are 0."""
+    """Computes the weights of one block's probes per thread by Cholesky decomposition; unused entries become 0."""
     k = wp.tid()
     count = work.picked[k]
     lower = _Square()
@@ -144,10 +144,8 @@ def _weigh(work: Work):
 
 
 def weigh(index: Index, windows: Windows, side: int, work: Work) -> None:
-    """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found.
-
-    There are three launches, since only the last one, the longest, is limited to one thread per block.
-    """
+    """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found. There are three launches,
+    since only the last one, the longest, is limited to one thread per block."""
     device = work.clock.device
     wp.launch(_pick, work.weights.shape, inputs=[index, windows, side, work], block_dim=32, device=device)
     wp.launch(_relate, work.weights.shape, inputs=[work], block_dim=32, device=device)

@@ -160,7 +160,7 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
 
 def interpolate_backward(attribute, triangle, visible, barycentric, grad_out, grad_attribute, grad_barycentric) -> None:
-    """Backward pass of `interpolate`.
+    """Backward pass of `interpolate`: gradients of the attributes and of the barycentrics.
 
     On CUDA pixels are added to `grad_attribute` in any order, so that the last bits change from run to run.
 

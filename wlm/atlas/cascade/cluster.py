@@ -1,14 +1,14 @@
 """Groups of triangles whose lighting is alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
 
-Patches of the triangles (`wlm_kernels.atlas.patches`) are the nodes of a graph, with an edge where Dist is below
-lambda in one of the six orders of the vertices. The node with most edges (the lowest number of equals) represents a
-group: itself and its neighbours. The group is removed and the edges of the rest are counted again, until no edge is
-left (eq. 6).
+Patches of the triangles (`wlm_kernels.atlas.patches`) are the nodes of a graph, with an edge where their distance Dist
+(eq. 2) is below lambda in one of the six orders of the vertices. The node with most edges (on a tie the one with the
+lowest number) represents a group: itself and its neighbours. The group is removed and the edges of the remaining nodes
+are counted again, until no edge is left (eq. 6).
 
-That is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of that size, all others
-join the first representative that they are like, and the same is repeated with the rest. Each triangle is still like
-its representative, and no two representatives are alike. Edges are stored within a sample alone, so that memory grows
-with the triangles and the texels that they cover.
+The cost of this is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of `SAMPLE`
+triangles. Every other triangle joins the first representative that it is like, and triangles that joined none are
+sampled again. Each triangle is still like its representative, and no two representatives are alike. Only edges within a
+sample are stored, so that memory grows linearly with the triangles and the texels that they cover.
 
 The following points are not specified by the paper or differ from it:
 
@@ -16,7 +16,7 @@ The following points are not specified by the paper or differ from it:
 - R_s uses lengths in texels, which is also right where the lightmap isn't square.
 - A triangle is excluded if its patch reads a texel above `max_radiance` in any channel. The samples of a triangle
   larger than `largest` lie more than a texel apart, and texels between them are not read.
-- Colours are fractions of `max_radiance`, and so are lambda and lambda_h: a dark map needs a lower maximum. Negative
+- Colours, lambda and lambda_h are fractions of `max_radiance`: a dark lightmap needs a lower `max_radiance`. Negative
   radiance counts as 0.
 """
 
@@ -45,13 +45,13 @@ class Clusters:
     """Groups of F triangles.
 
     Attributes:
-        group: int32 [F], number of each triangle's group. Groups of several come first, in the order in which they
-            were formed, then single triangles, by number.
-        representative: int32 [G], a triangle of each group.
+        group: int32 [F], number of each triangle's group. Groups of several triangles come first, in the order in which
+            they were formed, then groups of one triangle.
+        representative: int32 [G], for each of G groups the triangle that represents it.
         order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]` of
             `wlm_kernels.atlas.patches`. The first of equally good orders; 0 for representatives.
         distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
-        excluded: bool [F], too bright or not active: each is a separate group.
+        excluded: bool [F], true for triangles that are too bright or not active: each is a group of its own.
     """
 
     group: np.ndarray
@@ -81,7 +81,7 @@ def cluster(
         triangle: int [F, 3], vertices.
         lightmap: [H, W, 3], linear RGB, finite.
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
-        max_radiance: Triangles that are brighter stay alone (section 4.1.1); it also maps to 255 of 8 bits; above 0.
+        max_radiance: Above 0. Brighter triangles share with no other (section 4.1.1). It is 255 in 8-bit colours.
         active: bool [F], which triangles take part; None for all.
         largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
@@ -120,7 +120,7 @@ def cluster(
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """Converts the lightmap for the kernels: 16 bits per channel, and 1 in the fourth where it is too bright."""
+    """Converts the lightmap to 16 bits per channel; a fourth channel is 1 where a texel is too bright."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
     fraction = lightmap.astype(np.float64) / max_radiance
     texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
@@ -129,20 +129,21 @@ def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
 
 
 def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Converts vertices to 1/65536 of a texel from the first texel's centre, int64 [F, 3, 2]."""
+    """Returns the corners of F triangles, int64 [F, 3, 2], in 1/65536 of a texel from the first texel's centre."""
     place = (uv * [shape[1], shape[0]] - 0.5) * 65536.0
     return np.rint(place).astype(np.int64)[triangle.astype(np.int64)]
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Computes each patch's level, int32 [F]: size R_s (eq. 1) or the next larger of `SIZES`, at most `largest`."""
+    """Returns each patch's level, int32 [F]: the index in `SIZES` of the smallest size not below R_s (eq. 1)."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
-    """Forms groups of several nodes, each with its representative; the nodes' triangles [M] break ties."""
+    """Yields each group of several nodes with its representative. Where nodes have equally many edges, the one with the
+    lowest triangle number in `number`, int [M], is chosen."""
     count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
@@ -173,7 +174,7 @@ def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
 
 
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
-    """Finds the first head that each node is like, int [N]; the number of heads where there is none."""
+    """Finds the first of the representatives `heads` that each node is like, int [N]; their number if there is none."""
     device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
@@ -192,7 +193,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
-    """Computes the edges, uint8 [M, M]; `done` triangles are already grouped."""
+    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike; `done` is only for the progress."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
@@ -206,7 +207,7 @@ def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
 
 
 def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Forms groups of several nodes, each with its representative, and removes them from the graph (section 3.2.2)."""
+    """Yields each representative with the members of its group, for groups of several nodes (section 3.2.2)."""
     degree = edge.sum(1, dtype=np.int64)
     remains = np.ones(len(number), bool)
     # Among equals the lowest number comes first.

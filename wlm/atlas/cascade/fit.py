@@ -1,8 +1,8 @@
 """The paper's method: group triangles, pack them, and tune two small textures (lightmap-uv-clustering-cascade,
 sections 3.1 to 3.3).
 
-T_p starts as the regenerated lightmap downscaled by epsilon_p, T_c as the coordinates of its texels' centres;
-`wlm_kernels.atlas.cascade` describes how they are read. Adam then tunes both:
+T_p, the colour texture, starts as the repacked lightmap downscaled by epsilon_p. T_c, the lookup texture, starts as the
+coordinates of its own texels' centres; `wlm_kernels.atlas.cascade` describes how they are read. Adam then tunes both:
 
     space "views"   A step draws the mesh from one random camera of `views`, once with the old UVs and the lightmap,
                     its gaps filled, and once with the new UVs and the cascade. The loss is the L1 of the colours plus
@@ -54,16 +54,16 @@ _PIXELS_PER_POINT = 4  # for space "uv": about a quarter of a view's pixels show
 
 @dataclass(frozen=True, eq=False)
 class Textures:
-    """A cascade before it is stored: T_p, float32 [Hp, Wp, 3], linear radiance; T_c, float32 [Hc, Wc, 2], x and y over
-    the size of T_p, [0, 0, 2] for none."""
+    """A cascade before it is stored: the colour texture T_p, float32 [Hp, Wp, 3], linear radiance; and the lookup
+    texture T_c, float32 [Hc, Wc, 2], coordinates in T_p as fractions of its size, [0, 0, 2] if there is no T_c."""
 
     colour: np.ndarray
     lut: np.ndarray
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0, where no triangle
-    shares texels."""
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0: none share
+    texels."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -99,17 +99,17 @@ def fit_cascade(
     *,
     repack: bool = True,
 ) -> AtlasModel:
-    """Compresses a lightmap whose triangles are grouped; None: no triangle shares.
+    """Compresses a lightmap to a cascade of two textures.
 
     Args:
         scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles.
+        clusters: The groups of its triangles; None: no triangles share texels.
         profile, seed, stages: As for `wlm.atlas.fit.compress`.
-        repack: Whether charts are packed anew (section 3.3.1). Else the mesh keeps its UVs, the cascade begins as the
-            lightmap itself, and neither `clusters` nor the profile's `scale` counts (section 4.5.2).
+        repack: Whether charts are packed anew (section 3.3.1). If false, the mesh keeps its UVs, the cascade starts as
+            the lightmap itself, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
 
     Returns:
-        A model of method "cascade", or "plain" where `lut_scale` is 0: T_p alone, under the same UVs.
+        A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
 
     Raises:
         WlmError: An error of `pack` or `tune`, or a package for the blocks of T_p is missing.
@@ -154,12 +154,9 @@ def fit_cascade(
 
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
-    """Makes the textures that tuning starts from (section 3.3.3): T_p, each texel the mean of those that it covers, and
-    T_c.
-
-    The regenerated lightmap is float32 [H_r, W_r, 3], its used texels are bool [H_r, W_r]; the others are filled from
-    them.
-    """
+    """Makes the textures from which tuning starts (section 3.3.3). Each texel of T_p is the mean of the lightmap's
+    texels that it covers, and T_c holds the coordinates of its texels' centres. The repacked lightmap is float32 [H_r,
+    W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts, from which all others are filled."""
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
     colour = resized(fill_gaps(lightmap, mask), mask, *sides, "box").numpy().astype(np.float32)
@@ -181,8 +178,8 @@ def tune(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
-    """Tunes a cascade, read under the corners' UVs, float32 [F, 3, 2], so that the mesh looks as with its lightmap. The
-    checkpoint keeps the state of the steps as batch 1.
+    """Tunes the textures of a cascade so that the mesh looks as with its lightmap. `uv`, float32 [F, 3, 2], are the
+    corners' UVs for the cascade. The checkpoint keeps the state of the steps as batch 1.
 
     Raises:
         WlmError: No such device, or the fit diverged.
@@ -217,7 +214,8 @@ def tune(
 
 
 def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    """Reads the groups of `count` triangles that an interrupted compression had formed; None: there are none."""
+    """Reads the groups of `count` triangles that an interrupted compression saved in the checkpoint; None: no
+    groups."""
     triangle = Part(np.int32, (count,), least=0, most=count - 1)
     table = {
         "group": triangle,
@@ -311,7 +309,7 @@ class _Step:
             self._lut.clamp_(0.0, 1.0)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state that later steps depend on."""
+        """Returns the arrays that later steps depend on, by name."""
         tensors = {"step": self._step}
         for group in self._adam.param_groups:
             for parameter in group["params"]:
@@ -322,7 +320,7 @@ class _Step:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores a `state`.
+        """Restores the arrays that `state` returned.
 
         Raises:
             ValueError: The state belongs to another fit; nothing has changed.
@@ -348,7 +346,7 @@ class _Step:
 
     @property
     def done(self) -> int:
-        """Steps done."""
+        """The number of steps done."""
         return int(self._step.item())
 
     def textures(self) -> Textures:
@@ -357,7 +355,7 @@ class _Step:
 
 
 class _Views:
-    """Points of space "views": the pixels of one random view per step."""
+    """Supplies the points of each step for the space "views": the pixels of one random view."""
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         side = profile.resolution
@@ -388,7 +386,7 @@ class _Views:
 
 
 class _Surface:
-    """Points of space "uv": pairs of random points on the mesh, new ones per step."""
+    """Supplies the points of each step for the space "uv": new pairs of random points on the mesh."""
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))

@@ -7,10 +7,11 @@ each chart's rigid motion is fitted to its result by least squares and then appl
 
 The paper leaves two points open. Here charts have two texels between them (one around each), so that a bilinear read in
 one never reads another's texel, and a triangle that is too thin for the packer gets a separate place, half a texel
-high. The atlas is as large as its charts need, W_r x H_r of eq. 9, be that less or more than epsilon W x epsilon H.
+high. The atlas has the size that its charts need, W_r x H_r texels (eq. 9), and not exactly the lightmap's size times
+epsilon.
 
-A triangle that isn't `active` takes no texels: it reads one point of a neighbour, else (0, 0). Triangles that fold over
-each other in a chart, or of which three and more share an edge, are in separate charts.
+A triangle that isn't `active` takes no texels: it reads one point of an active neighbour, or (0, 0) if it has none.
+Triangles that fold over each other in a chart, or of which three and more share an edge, are in separate charts.
 """
 
 import math
@@ -42,11 +43,11 @@ class Packed:
 
     Attributes:
         height, width: H_r and W_r, texels of the atlas.
-        corner: float64 [F, 3, 2], the corners' new x and y in texels; the origin is the first texel's outer corner.
-        uv: float32 [F, 3, 2], the same over (W_r, H_r).
-        source: int32 [F], the triangle whose texels each one reads: itself or its representative; -1 where it isn't
-            active.
-        chart: int32 [F], the new chart of these texels, -1 where it isn't active.
+        corner: float64 [F, 3, 2], the corners' new x and y in texels, from the outer corner of the first texel.
+        uv: float32 [F, 3, 2], the corners' new UVs: `corner` divided by width and height.
+        source: int32 [F], the number of the triangle whose texels each triangle reads: its own or its representative's;
+            -1 for a triangle that isn't active.
+        chart: int32 [F], the new chart that each triangle reads; -1 for a triangle that isn't active.
         to_lightmap: float64 [C, 2, 3], for each chart the affine map from (x, y, 1) in texels of the atlas to x and y
             in texels of the lightmap.
     """
@@ -108,13 +109,10 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
 
 
 def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
-    """Renders the atlas: each texel that a bilinear read of a chart can reach takes the lightmap's colour there.
-
-    Inside a triangle that is the place with the same barycentrics, the paper's three steps. Since a chart moved
-    rigidly, one affine map gives it for all its triangles, and beyond its border, where the lightmap's gaps are filled.
-
-    Returns float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts.
-    """
+    """Renders the atlas: each texel that a bilinear read of a chart can reach takes the lightmap's colour at that
+    place. A point in a triangle takes the colour at the same barycentric coordinates in the old UVs, as in the paper.
+    Since a chart moves rigidly, one affine map converts all its points, also those just beyond its border. Returns
+    float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts."""
     height, width = packed.height, packed.width
     heads = np.flatnonzero(packed.source == np.arange(len(packed.source)))
     outline = _dilated(packed.corner[heads])  # [N, 7, 2]
@@ -136,9 +134,9 @@ def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.nd
 def _pack_charts(
     name: str, old: np.ndarray, numbers: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Packs the charts of corners [N, 3, 2] in texels of the lightmap, whose numbers [N, 3] are equal where corners
-    coincide. Returns the chart of each triangle, int [N]; its motion, complex [C] twice, as `_motions`; and W_r and
-    H_r."""
+    """Packs the charts of N triangles, whose corners [N, 3, 2] are in texels of the lightmap; corners with equal
+    `numbers` [N, 3] coincide. Returns each triangle's chart, int [N]; the rotation and the shift of each chart, complex
+    [C] each, as `_motions`; and the atlas's W_r and H_r."""
     label = charts(numbers)
     # Triangles are made counter-clockwise, since the packer would mirror clockwise ones.
     winding = np.where((_signed_area(old) < 0)[:, None], [0, 2, 1], [0, 1, 2])
@@ -162,11 +160,9 @@ def _pack_charts(
 def _uvunwrap(
     name: str, points: np.ndarray, numbers: np.ndarray, label: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Calls the packer, which leaves out triangles that are too thin for it.
-
-    Returns new corners in texels, float64 [N, 3, 2]; the chart, int [N], -1 where there is none; whether the triangle
-    has new corners, bool [N]; and W_r and H_r.
-    """
+    """Calls the packer `uvunwrap`, which leaves out triangles that are too thin for it. Returns new corners in texels,
+    float64 [N, 3, 2]; each triangle's chart, int [N], -1 if it has none; whether the triangle has new corners, bool
+    [N]; and the atlas's width and height."""
     uvunwrap = need("uvunwrap", "atlas")
     if not len(points):
         return np.zeros((0, 3, 2)), np.zeros(0, np.int64), np.zeros(0, bool), np.ones(2)
@@ -206,11 +202,9 @@ def _chart_meshes(
     points: np.ndarray, numbers: np.ndarray, label: np.ndarray
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Makes each chart a flat mesh with its lower corner at the origin: places float32 [v, 3], triangles uint32 [f, 3]
-    and the same places as UVs; also returns the triangles [N] in the order of the meshes.
-
-    In one mesh charts that meet at a point would be joined, and the thinnest triangle that the packer takes and the
-    resolution of float32 depend on a mesh's extent.
-    """
+    and the same places as UVs; also returns the triangles [N] in the order of the meshes. If all charts were one mesh,
+    charts that meet at a point would be joined. The precision of float32 and the thinnest triangle that the packer
+    accepts also depend on the extent of a mesh."""
     charts = np.arange(int(label.max()) + 2)
     low = np.full((len(charts) - 1, 2), np.inf)
     np.minimum.at(low, label, points.min(1))
@@ -229,7 +223,8 @@ def _chart_meshes(
 def _motions(
     name: str, old: np.ndarray, place: np.ndarray, chart: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fits each chart's rigid motion as a complex map, x + iy to rotation (x + iy) + shift: complex [C] each."""
+    """Fits each chart's rigid motion, x + iy to rotation (x + iy) + shift; returns rotation and shift, complex [C]
+    each."""
     before, after = _complex(old).reshape(-1), _complex(place).reshape(-1)
     chart = np.repeat(chart, 3)
     count = int(chart.max(initial=-1)) + 1
@@ -250,7 +245,7 @@ def _motions(
 
 
 def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray) -> None:
-    """Collapses each triangle [F] that isn't active to a corner that it shares with an active one, else to (0, 0)."""
+    """Collapses each triangle that isn't active to a corner that it shares with an active one, or to (0, 0)."""
     if active.all():
         return
     shared = np.full(int(numbers.max()) + 1, -1)
@@ -261,7 +256,7 @@ def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray)
 
 
 def _thickened(points: np.ndarray, height: float) -> np.ndarray:
-    """Makes right triangles [N, 3, 2] around thin ones [N, 3, 2], at least `height` high and at least as long."""
+    """Makes right triangles [N, 3, 2] around thin triangles [N, 3, 2], at least `height` high and at least as long."""
     out = np.empty_like(points)
     for i, corner in enumerate(points):
         ends = [(corner[k], corner[(k + 1) % 3]) for k in range(3)]
@@ -277,10 +272,7 @@ def _thickened(points: np.ndarray, height: float) -> np.ndarray:
 
 def _dilated(corner: np.ndarray) -> np.ndarray:
     """Computes outlines [N, 7, 2] of triangles [N, 3, 2], dilated by one texel along both axes: the reach of bilinear
-    reads.
-
-    Each is the Minkowski sum of the triangle and a square, whose edges are those of both, by direction.
-    """
+    reads. Each outline is the Minkowski sum of a triangle and a square: the edges of both, sorted by direction."""
     flip = _signed_area(corner) < 0
     ring = np.where(flip[:, None, None], corner[:, ::-1], corner)
     square = _REACH * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -294,7 +286,7 @@ def _dilated(corner: np.ndarray) -> np.ndarray:
 
 
 def _signed_area(corner: np.ndarray) -> np.ndarray:
-    """Computes twice the areas of triangles [N, 3, 2], positive where they turn from x to y."""
+    """Returns twice the areas of triangles [N, 3, 2], positive if the corners run from the x axis to the y axis."""
     ab, ac = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     return ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
 

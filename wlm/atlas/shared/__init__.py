@@ -1,1 +1,1 @@
-"""The method "shared": the lightmaps of many sheets and states share tiles as sums of components."""
+"""The method "shared": each tile is a sum of a few components, which the states of a sheet share."""

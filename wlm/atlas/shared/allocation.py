@@ -1,4 +1,4 @@
-"""Allocation: the number of components of each tile, their size, and their places on the pages of T_p."""
+"""Chooses the number of components of each tile and their size, and places them on pages of the colour texture T_p."""
 
 import math
 from dataclasses import dataclass
@@ -22,20 +22,21 @@ NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: ex
 
 @dataclass(frozen=True, eq=False)
 class Allocated:
-    """Components, sizes and places of all tiles.
+    """Components, sizes and places chosen for all T tiles.
 
     Attributes:
-        rank: int [T], the number in the list of `Candidate`.
-        count: int [T], components.
-        component: int [T], the constant of the mixture in `factors`.
-        factors: float64 [C, M, 3], for each mixture a constant and then its components.
-        coarse: int [T], coarse components.
-        size: int [T, 2], texels of one of the other components.
-        second: bool [T], whether they are in the second texture.
+        rank: int [T], index in the list of `Candidate` that was chosen for each tile.
+        count: int [T], number of components.
+        component: int [T], row in `factors` of the tile's constant, which its components' factors follow.
+        factors: float64 [C, M, 3], for each mixture (factors that a group of tiles shares) a constant and then a factor
+            of each component, in M states.
+        coarse: int [T], number of coarse components, which have a single block each.
+        size: int [T, 2], width and height in texels of each component that isn't coarse.
+        second: bool [T], whether the tile is in the second texture.
         first: int64 [T, 2], place of the first component on the page.
         page: int64 [T], the page.
-        shapes: Pages, rows and columns of both textures.
-        error: float64 [T], weighted, mean over the states.
+        shapes: Numbers of pages, rows and columns of both textures.
+        error: float64 [T], weighted squared error of each tile, mean over the states.
     """
 
     rank: np.ndarray
@@ -52,8 +53,7 @@ class Allocated:
 
 
 def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocated:
-    """Allocates components and sizes to the tiles of all sheets, and places them. `bits` are those of all tiles and
-    factors.
+    """Chooses the number and size of all tiles' components, and places them; `bits` is the budget of tiles and factors.
 
     Raises:
         WlmError: The budget is less than the smallest tiles take, or all pages together are too small.
@@ -114,8 +114,8 @@ def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocate
 def _worth(
     error: np.ndarray, cost: np.ndarray, of: np.ndarray, number: np.ndarray, factors: np.ndarray, bits: float
 ) -> np.ndarray:
-    """Removes mixtures, the least useful first, until each saves more error than its factors' bits would elsewhere.
-    Returns `error`, with a value above all others where a tile's mixture is left out."""
+    """Removes mixtures (factors shared by a group of tiles), the least useful first, until each saves more error than
+    its bits would save elsewhere. Returns `error`, with a very large value where a tile's mixture was removed."""
     tiles = np.arange(error.shape[1])
     both = [allocate(error, cost, share * bits, 0.0) for share in (1.0, _LESS)]
     ends = [(error[chosen, tiles].sum(), cost[chosen].sum()) for chosen in both]
@@ -141,8 +141,8 @@ def _worth(
 
 
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages of one size: first texels,
-    int64 [T, 2]; pages, int64 [T]; rows and columns of a page.
+    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages of equal size. Returns first
+    texels, int64 [T, 2]; pages, int64 [T]; and rows and columns of a page.
 
     Raises:
         WlmError: All pages together are too small.

@@ -1,4 +1,4 @@
-"""Weights of tiles, derived from the error of the views that show them.
+"""Weights tiles by the error of the views that show them.
 
 A mean of PSNRs is highest where sum_v log E_v is least, with E_v the mean squared error of view v. Its bound
 sum_v E_v / E'_v, where E'_v is the error under the last allocation, has the same slope there and is a sum over tiles.
@@ -29,19 +29,20 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class ViewShares:
-    """The tiles that views show: `share`, float64 [V, T], the fraction of each view's pixels that shows each tile, 0
-    for tiles of smaller levels; and `lost`, float64 [V], the error of each view that the current tile weights assume.
-    """
+    """The tiles that V views show. `share`, float64 [V, T], is the fraction of a view's pixels that shows each tile, 0
+    for tiles of smaller mip levels; `lost`, float64 [V], is each view's error for which the weights were made."""
 
     share: csr_array
     lost: np.ndarray
 
     def by_state(self, states: int) -> "ViewShares":
-        """Repeats the shares for separate tiles, state by state; a view's error is the mean over its states."""
+        """Returns the shares for separate tiles, repeated for each state: a view's error is the mean over its
+        states."""
         return replace(self, share=hstack([self.share] * states, "csr") / states)
 
     def psnr(self, error: np.ndarray) -> float:
-        """PSNR in dB, the mean over the views, for errors of tiles over their weights [T]; the peak value is 1."""
+        """Returns the PSNR in dB, peak 1, as the mean over the views; `error` [T] is each tile's error over its
+        weight."""
         if not len(self.lost):
             return -10.0 * math.log10(float(error.mean()) + FLOOR)
         return float(-10.0 * np.log10(self.share @ error + FLOOR).mean())
@@ -56,8 +57,8 @@ def tile_shares(
     seed: int,
     device: str,
 ) -> ViewShares:
-    """Renders the views of `scene_weights` again and counts the pixels of each tile. `grids` are the rows and columns
-    of tiles of each sheet."""
+    """Renders the views of `scene_weights` again and counts the pixels that show each tile. `grids` has the rows and
+    columns of tiles of each sheet."""
     first = np.cumsum([0, *(rows * columns for rows, columns in grids)])
     row = np.full(first[-1], -1)
     of = np.flatnonzero(tiles.plane < len(scene.sheets))
@@ -90,8 +91,8 @@ def tile_shares(
 
 
 def balance(tried: list[Candidate], weight: np.ndarray, shown: ViewShares, bits: float) -> np.ndarray:
-    """Computes factors on the tiles' weights, float64 [T]; the sum of all weights [T] is unchanged. `bits` are those of
-    all tiles."""
+    """Returns factors for the tiles' weights, float64 [T], that favour tiles in views with little error; the sum of all
+    weights is unchanged. `bits` is the budget of all tiles."""
     error, cost, tiles = np.concatenate([each.error for each in tried]), costs(tried), np.arange(len(weight))
     visible = np.asarray(shown.share.sum(0)).ravel() > 0
     if not visible.any():

@@ -1,6 +1,7 @@
-"""The error of each tile of a scene with one, two and more components at each size.
+"""Computes the error of each tile of a scene with one, two and more components, at each size.
 
-For a tile, a mixture and a size the squared error of all states is that of the mixture plus
+A mixture is a matrix F of factors by which a group of tiles sums its components. For a tile, a mixture and a size, the
+squared error over all states is the error of exact components plus
 
     sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
 
@@ -44,14 +45,14 @@ _AT_ONCE = 1024  # tiles
 
 @dataclass(frozen=True, eq=False)
 class SceneTiles:
-    """The tiles of all sheets and levels that have a weight.
+    """All tiles of sheets and mip levels that have a weight above 0.
 
     Attributes:
-        texels: float32 [T, B + 1, B + 1, M, 3], light over the states' units.
+        texels: float32 [T, B + 1, B + 1, M, 3], light divided by a unit for each state, in M states.
         weight: float32 [T, P], weights of the tiles' points; all add up to 1.
         plane: int [T], the sheet or level of each tile, ascending.
-        index: int64 [T], its number there, row by row.
-        size: B.
+        index: int64 [T], the tile's number in its sheet or level, row by row.
+        size: B, texels along a tile.
         device: The device on which tiles are fitted.
     """
 
@@ -63,22 +64,22 @@ class SceneTiles:
     device: str
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies the texels of some tiles and the weights of their points to the device."""
+        """Copies the texels of some tiles and the weights of their points to the device and returns them."""
         return self.texels[at].to(self.device), self.weight[at].to(self.device)
 
     def points(self, texels: torch.Tensor) -> torch.Tensor:
-        """Computes light at the points of tiles, [T, N, 3, P], from texels [T, B + 1, B + 1, N, 3]."""
+        """Returns light at the points of each tile, [T, N, 3, P], interpolated from texels [T, B + 1, B + 1, N, 3]."""
         return tile_light(texels.flatten(3)).unflatten(1, (-1, 3))
 
     def components(self, texels: torch.Tensor, mixtures: Mixtures, number: torch.Tensor) -> torch.Tensor:
-        """Computes the texels of components, [T, B + 1, B + 1, K, 3], from those of the states."""
+        """Returns the texels of K components, [T, B + 1, B + 1, K, 3], computed from the texels of all states."""
         parts = torch.einsum("tmkc,tyxmc->tyxkc", mixtures.factor[number], texels)
         return (parts + mixtures.offset[number][:, None, None]).clamp(min=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A size and a number of components that a tile may have; the last `coarse` components have one block each."""
+    """A size and a number of components that a tile may have; the last `coarse` of them have a single block each."""
 
     size: Size
     count: int
@@ -86,24 +87,24 @@ class Choice:
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Texels along x and y of all components."""
+        """The texels along x and y that all components take together."""
         return tuple(extent(np.array([self.size.nx, self.size.ny]), np.array(self.count), self.coarse).tolist())
 
     @property
     def bits(self) -> float:
-        """Bits of all components."""
+        """The number of bits of all components."""
         return float(math.prod(self.extent) * COLOUR_BITS[self.size.format])
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The errors of all tiles with one number of components.
+    """The errors of all T tiles with a certain number of components.
 
     Attributes:
-        mixtures, number: The mixtures, and that of each tile, int [T].
+        mixtures, number: The mixtures (sets of factors that tiles share), and each tile's mixture, int [T].
         choices: The sizes of the components.
-        error: float64 [choices, T], mean over the states.
-        left: An estimate of the whole error if tiles may have up to this number of components.
+        error: float64 [choices, T], squared error of each tile for each choice, mean over the states.
+        left: Estimated error of the whole scene if tiles may have up to this number of components.
     """
 
     mixtures: Mixtures
@@ -114,12 +115,12 @@ class Candidate:
 
     @property
     def rank(self) -> int:
-        """Number of components."""
+        """The number of components."""
         return self.mixtures.factor.shape[2]
 
 
 def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
-    """Lists the choices for a number of components: all of one size, or of blocks with the last ones coarse."""
+    """Lists the choices for `count` components: all of one size, or in blocks with the last ones coarse (one block)."""
     few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
     return [
         Choice(size, count, coarse)
@@ -131,11 +132,9 @@ def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
 def candidates(
     tiles: SceneTiles, sizes: list[Size], bits: float, seed: int, stages: Stages, batch: int
 ) -> list[Candidate]:
-    """Computes the error of every tile with one component, two and so on, up to the number that pays.
-
-    The checkpoint of `stages` keeps each number of components as one finished batch, from number `batch` on; `bits` are
-    those of all tiles and factors.
-    """
+    """Computes the error of every tile with one component, with two and so on, until more components gain nothing. The
+    checkpoint of `stages` keeps each number of components as one finished batch, numbered from `batch`. `bits` is the
+    budget of all tiles and factors."""
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(states, _RANKS[-1])
     ranks = [*(rank for rank in _RANKS if rank < most), most]
@@ -187,7 +186,7 @@ def _curves(
     meter: Meter,
     done: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes `number` and `error` of a `Candidate` for some tiles."""
+    """Returns each tile's mixture and errors, as `number` and `error` of `Candidate`, for the tiles `members`."""
     device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
     factor, offset = mixtures.factor, mixtures.offset
@@ -224,12 +223,12 @@ def _curves(
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:
-    """Lists the bits of each choice of each candidate."""
+    """Returns the bits of each choice, one array per candidate."""
     return np.array([choice.bits for each in tried for choice in each.choices])
 
 
 def _left(tried: list[Candidate], bits: float) -> tuple[float, np.ndarray]:
-    """Estimates the whole error, and returns the number of the candidate that each tile uses, int [T]."""
+    """Estimates the error of the whole scene; also returns the index of each tile's candidate, int [T]."""
     error = np.concatenate([each.error for each in tried])
     chosen = allocate(error, costs(tried), bits, 0.0)
     of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])

@@ -1,14 +1,14 @@
-"""From the lightmaps of several sheets and states to one model: mixtures of the states, tiles of all sheets, and one
-allocation.
+"""Compresses the lightmaps of several sheets and states to one model, whose tiles are sums of components.
 
-The states' light is divided by how much it varies, so that each counts by its PSNR (`weights`). Tiles are assigned
-to mixtures of one, two and more components (`mixture`). Each tile has an error curve for each number of components
-(`curves`) and is weighted by the error of the views that show it (`balance`). Numbers of components and sizes are
-allocated to the tiles of all sheets at once (`allocation`), so that one more bit gains as much in every object.
+Each state's light is divided by its variation, so that errors count as in PSNR (`weights`). Tiles are grouped, and each
+group shares a mixture: the factors by which one, two or more components are summed in each state (`mixture`). Each tile
+has an error curve for each number of components (`curves`) and is weighted by the error of the views that show it
+(`balance`). Numbers of components and sizes are allocated to the tiles of all sheets at once (`allocation`), so that
+one more bit gains as much in every object.
 
 States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. Therefore
-separate tiles for each state are tried as well, and the better result is kept (`sharing`), so that a scene is coded no
-worse than its states would be one by one.
+separate tiles for each state are tried as well, and the better result is kept (`sharing`), so that a scene is no worse
+than with each state compressed alone.
 """
 
 import numpy as np
@@ -101,13 +101,13 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
 
 
 def _of_texels(weight: np.ndarray) -> np.ndarray:
-    """Sums the weights of quarters [2 H, 2 W] to those of texels [H, W]."""
+    """Sums weights of quarters of texels [2 H, 2 W] to weights of texels [H, W]."""
     return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Solves for the samples of all components and composes the colour textures. Returns arrays of the model by name,
-    and the factor by which each component was multiplied, float64 [C, 3]."""
+    """Solves for the samples of all components and writes them to the colour textures. Returns arrays of the model by
+    name, and the factor by which each component was multiplied, float64 [C, 3]."""
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)
@@ -147,7 +147,7 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
 
 
 def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
-    """Composes T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
+    """Makes the lookup texture T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
     places = np.array([(each.row, each.column, each.columns) for each in layout.places])
     first, left, columns = places[tiles.plane].T
     row, column = first + tiles.index // columns, left + tiles.index % columns

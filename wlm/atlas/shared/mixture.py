@@ -28,13 +28,14 @@ _MARGIN, _MARGIN_FIRST = 0.1, 0.02  # margin of o_k over the component's range; 
 
 @dataclass(frozen=True, eq=False)
 class Mixtures:
-    """All mixtures with the same number of components.
+    """All G mixtures with the same number of components: the factors by which a group of tiles sums its components.
 
     Attributes:
-        factor: float32 [G, M, K, 3], the directions. Components are these times the states, plus `offset`, at least 0.
-        offset: float32 [G, K, 3]: the states are `factor` times the components less this.
-        kept: float32 [G, 3 M M], flattened projections onto the subspaces: their product with a tile's moments is the
-            energy that they keep.
+        factor: float32 [G, M, K, 3], the directions. A component is the sum of direction times light over the states,
+            plus `offset`; it is at least 0.
+        offset: float32 [G, K, 3]: light in the states is `factor` times (the components minus `offset`).
+        kept: float32 [G, 3 M M], flattened projections onto the subspaces. The product with a tile's moments is the
+            energy of the tile's light that remains after projection.
     """
 
     factor: torch.Tensor
@@ -42,24 +43,24 @@ class Mixtures:
     kept: torch.Tensor
 
     def to(self, device: str) -> "Mixtures":
-        """Copies the mixtures to a device."""
+        """Returns a copy of the mixtures on a device."""
         return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
 
     def factors(self, number: int) -> np.ndarray:
-        """Returns one mixture's constant, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
+        """Returns the constant of a mixture, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
         factor, offset = (each[number].cpu().numpy().astype(np.float64) for each in (self.factor, self.offset))
         constant = -np.einsum("mkc,kc->mc", factor, offset)
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
-        """Finds the mixture that keeps most of each tile's energy, int64 [T], by `moments`; the first of equal ones."""
+        """Finds for each tile the mixture that keeps most of its energy, int64 [T], from `moments`."""
         energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
         return _first_best(moment.flatten(1) @ self.kept.T, energy)
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Sums the products of the states' light [T, M, 3, P], weighted [T, P], over the points of each tile, float32 [T,
-    3, M, M]."""
+    """Sums the products of light in pairs of states over the points of each tile: from light [T, M, 3, P] and weights
+    [T, P] to float32 [T, 3, M, M]."""
     part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
     return part @ part.transpose(2, 3)
 
@@ -67,14 +68,15 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 def find_mixtures(
     moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
 ) -> Mixtures:
-    """Finds the mixtures of some tiles, at most `count`; fewer where some would have no tile.
+    """Finds at most `count` mixtures for some tiles: each is a set of K components' factors in M states that a group of
+    the tiles shares. There are fewer if a group would have no tile.
 
     Args:
-        moment: float [T, 3, M, M], `moments`.
-        texels: float [T, N, M, 3], texels of the same tiles, not negative.
-        rank: K, 1 to M.
+        moment: float [T, 3, M, M], result of `moments` for T tiles.
+        texels: float [T, N, M, 3], N texels of each of the tiles, not negative.
+        rank: K, the number of components, 1 to M.
         count: Largest number of mixtures, at least 1.
-        seed: Seed of the tiles from which they start.
+        seed: Seed for choosing the tiles from which the mixtures start.
         like: Number of components by which tiles are assigned to mixtures; None: K.
     """
     random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
@@ -106,16 +108,14 @@ def find_mixtures(
 
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
-    """Finds the first mixture that keeps about the most energy, int64 [T], of kept energies [T, G] and tiles' energies
-    [T].
-
-    Rounding must not assign a tile to a mixture whose offsets were not computed for it.
-    """
+    """Finds for each tile the first mixture that keeps about the most energy, int64 [T]. `kept` [T, G] is the energy
+    that each mixture keeps, `energy` [T] the whole energy of each tile. Rounding must not assign a tile to a mixture
+    whose offsets were not computed for it."""
     return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 
 
 def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
-    """Computes the directions [3, M, K] of most energy; the first has no negative numbers."""
+    """Returns the K = `rank` directions with most energy, [3, M, K]; the first has no negative numbers."""
     space = np.linalg.eigh(moment)[1][:, :, ::-1][:, :, :rank].copy()
     space[:, :, 0] *= np.where(space[:, :, 0].sum(1) < 0.0, -1.0, 1.0)[:, None]
     return space
@@ -126,12 +126,12 @@ def _projection(space: np.ndarray) -> np.ndarray:
 
 
 def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
-    """Computes the energy of each tile that each subspace keeps, [T, G]."""
+    """Returns the energy of each tile that each of G subspaces keeps, [T, G]."""
     return flat @ np.stack([_projection(each) for each in spaces]).T
 
 
 def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:
-    """Computes the offsets [K, 3] that make the components positive."""
+    """Returns the offsets [K, 3] that make a mixture's components positive."""
     # With one state the only direction is the light itself, and black stays black.
     if not len(texels) or space.shape[1] == 1:
         return np.zeros((space.shape[2], len(space)))

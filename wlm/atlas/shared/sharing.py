@@ -1,11 +1,11 @@
-"""The choice between shared tiles, which are sums of components, and separate tiles for each state.
+"""Decides whether tiles are shared by the states, as sums of components, or separate for each state.
 
-Hours of light have much in common, which components store once. A shadow mask and the light of a sky have little in
-common, and with shared tiles each is stored at resolutions that the other needs. So both variants are allocated within
-the same bits, and the one with the smaller mean over views of the logarithm of the error is kept.
+Lightmaps of several hours have much in common, which components store once. A shadow mask and the light of a sky have
+little in common, and shared tiles would store one at the resolution that the other needs. So tiles of both kinds are
+allocated with the same number of bits, and the kind with the smaller mean logarithm of the views' errors is kept.
 
-Separate tiles multiply the count by the number of states; a random sample first decides whether their rate-distortion
-curves are worth computing.
+Separate tiles are as many times more as there are states, so a random sample of them first decides whether computing
+all their rate-distortion curves is worthwhile.
 """
 
 import math
@@ -47,9 +47,9 @@ _HOPELESS = 1.25  # ratio of sampled separate to shared error above which the re
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A sheet or a mip level of a sheet, to be cut into tiles. `frames` are float32 [M, H, W, 3] without gaps, `weight`
-    float64 [2 H, 2 W] has the weights of quarters of texels, and `smaller` is the number of the next smaller level; 0:
-    there is none."""
+    """A sheet, or a mip level of a sheet, to be cut into tiles. `frames`, float32 [M, H, W, 3], are its lightmaps
+    without gaps; `weight`, float64 [2 H, 2 W], the weights of quarters of texels; `smaller` the index of the next
+    smaller level, 0 for none."""
 
     name: str
     frames: np.ndarray
@@ -58,11 +58,9 @@ class Plane:
 
 
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
-    """Lists the sheets and then, with mips, their levels: a quarter of a sheet's sides, rounded up, and halves of that.
-
-    A level's texel is the mean of the chart texels that it covers, and has the weight of one of them, from
-    `scene_weights`.
-    """
+    """Returns all sheets and then, if `mips`, their mip levels: the first has a quarter of a sheet's sides, rounded up,
+    each next one half of that. A level's texel is the mean of the chart texels that it covers. Its weight is that of
+    one such texel, from `scene_weights`."""
     pairs = zip(scene.sheets, weights, strict=True)
     planes = [Plane(sheet.name, sheet.lightmaps, weight) for sheet, weight in pairs]
     if not mips:
@@ -97,24 +95,24 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """The places of sheets and levels in T_c, and its rows and columns."""
+    """The places of sheets and mip levels in the lookup texture T_c, and the rows and columns of T_c."""
 
     places: list[SheetPlace]
     shape: tuple[int, int]
 
     @property
     def grids(self) -> list[tuple[int, int]]:
-        """Rows and columns of tiles of each."""
+        """The rows and columns of tiles of each sheet and level."""
         return [(place.rows, place.columns) for place in self.places]
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The allocation of all tiles.
+    """The components, sizes and places chosen for all tiles.
 
     Attributes:
         planes, layout, tiles: Sheets and levels, their places and tiles; separate tiles are listed state by state.
-        tried: The tiles with each number of components, weighted by `balance`.
+        tried: The errors of all tiles for each number of components, weighted by `balance`.
         given: Components, sizes and places of the tiles.
         numbers: Number of integers per entry of T_c.
         states: Number of states with separate tiles; 1: all share tiles.
@@ -140,15 +138,15 @@ def fitted(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Allocates components and sizes to the tiles of all planes, shared by the states or separate.
+    """Chooses components and sizes for the tiles of all planes, shared by the states or separate for each.
 
     Args:
         scene: The scene.
-        planes: `planes_of`.
+        planes: Sheets and levels, from `planes_of`.
         unit: float64 [M], the divisor of each state's light.
-        varies: `variation`.
+        varies: Variation of each sheet's light, from `variation`.
         profile: The settings.
-        seed: Seed of views and mixtures.
+        seed: Seed of all random choices.
         stages: Reports and times the stages.
 
     Raises:
@@ -188,7 +186,7 @@ def _choose_sharing(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Chooses shared tiles, or separate tiles per state if views score them better."""
+    """Returns shared tiles, or separate tiles for each state if these have less error in views."""
     states, count = len(unit), len(together.planes)
     planes = [
         replace(plane, frames=plane.frames[m : m + 1], smaller=plane.smaller and plane.smaller + m * count)
@@ -227,7 +225,7 @@ def _hopeless(
     seed: int,
     stages: Stages,
 ) -> bool:
-    """Tests whether sampled separate tiles have far more error than shared tiles of as many bits."""
+    """Tests on a sample whether separate tiles have far more error than shared tiles of as many bits."""
     given, count = together.given, len(factor)
     few = np.sort(np.random.default_rng(seed).choice(count, max(count // _SAMPLE, _SAMPLES), replace=False))
     cost = costs(together.tried)
@@ -252,7 +250,7 @@ def _hopeless(
 
 
 def _room(bits: float, layout: Layout, planes: int, numbers: int) -> float:
-    """Computes the bits that remain for tiles and factors after T_c and the table of sheets."""
+    """Returns the bits that remain for tiles and factors after the lookup texture and the table of sheets."""
     return bits - planes * SHEET_BITS - math.prod(layout.shape) * numbers // 2 * LUT_BITS
 
 
@@ -278,7 +276,7 @@ def _allocated(
 
 
 def _laid_out(planes: list[Plane], tile: int) -> Layout:
-    """Places the entries of all sheets and levels in T_c, on shelves."""
+    """Places the entries of all sheets and levels in the lookup texture T_c, on shelves."""
     grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
     across = np.array([(columns, rows) for rows, columns in grid])
     best = None
@@ -296,7 +294,7 @@ def _laid_out(planes: list[Plane], tile: int) -> Layout:
 
 
 def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str) -> SceneTiles:
-    """Cuts light, divided by the units of each plane's states, into tiles."""
+    """Cuts the light of all planes into tiles, after division by the unit of each state."""
     total = sum(float(plane.weight.sum()) for plane in planes)
     texels, weights, numbers, owner = [], [], [], []
     for number, (plane, unit) in enumerate(zip(planes, units, strict=True)):

@@ -1,9 +1,9 @@
-"""Weights of the errors of a scene's sheets and states.
+"""Computes the weights of errors in a scene's sheets and states.
 
-A part of a sheet counts by the pixels of views of the whole scene that show it. Views and states are scored by PSNR, so
-a mean over them is a mean of logarithms: an error counts by its share of the whole error of its view or state. At equal
-bits the whole error is proportional to how much light varies from texel to texel, so views and states are weighted by
-the inverse of the variation of their light.
+The weight of a place in a sheet depends on the number of pixels that show it in views of the whole scene. Quality is
+the mean PSNR of views and states, a mean of logarithms, so an error counts by its share of the whole error of its view
+or state. At equal bits the whole error is proportional to how much light varies from texel to texel, so views and
+states are weighted by the inverse of the variation of their light.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _PERCENTILE = 99.9  # percentile of a state's light that is its peak
 
 
 def peaks_of(scene: LightmappedScene) -> np.ndarray:
-    """Takes a high percentile of each state's light in charts, float64 [M], above 0."""
+    """Returns a high percentile of each state's light in charts, float64 [M], above 0."""
     light = [sheet.lightmaps[:, sheet.mask].max(axis=2) for sheet in scene.sheets]
     peak = np.percentile(np.concatenate(light, axis=1), _PERCENTILE, axis=1)
     # A black state is stored exactly whatever its peak is.
@@ -36,8 +36,8 @@ def peaks_of(scene: LightmappedScene) -> np.ndarray:
 
 
 def variation(scene: LightmappedScene, peak: np.ndarray, device: str) -> list[np.ndarray]:
-    """Computes squared second differences of light, along both axes and within charts, mean of the channels: for each
-    sheet float32 [M, H, W]. Light is divided by the peaks, float64 [M]."""
+    """Returns for each sheet how much light varies, float32 [M, H, W]: the squared second differences along both axes
+    within charts, averaged over the channels. Light is first divided by `peak`, float64 [M]."""
     result = []
     for sheet in scene.sheets:
         mask = torch.from_numpy(sheet.mask).to(device)
@@ -55,8 +55,8 @@ def _variation(light: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 
 def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.ndarray:
-    """Computes the divisor of each state's normalised light that makes all states vary equally, float64 [M], of
-    geometric mean 1, from `variation` and the weights [H, W] of each sheet's texels."""
+    """Returns divisors of the M states' light, float64 [M] with geometric mean 1, that make all states vary equally;
+    from `variation` and the weights [H, W] of each sheet's texels."""
     sums = sum((each * weight).sum((1, 2), dtype=np.float64) for each, weight in zip(varies, weights, strict=True))
     total = sum(float(weight.sum()) for weight in weights)
     root = np.sqrt(sums / max(total, 1e-30) + FLOOR)
@@ -66,12 +66,10 @@ def scales(varies: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> np.nd
 def scene_weights(
     scene: LightmappedScene, varies: Sequence[np.ndarray], profile: Profile, seed: int, device: str
 ) -> list[np.ndarray]:
-    """Counts for each quarter of a texel the pixels of random views of the scene that show it: for each sheet float64
-    [2 H, 2 W], 0 where there is no triangle.
-
-    An object that is large in the views thus gets more weight than one that is small, far away or hidden. The weight of
-    a view is the inverse of the variation of the light that it shows; it does not grow with its number of pixels.
-    """
+    """Returns for each sheet the weights of quarters of texels, float64 [2 H, 2 W]: how many pixels of random views of
+    the scene show each, 0 where there is no triangle. An object that is large in the views thus gets more weight than
+    one that is small, far away or hidden. The weight of a view is the inverse of the variation of the light that it
+    shows; it does not grow with its number of pixels."""
     grids = [FineGrid(sheet, device) for sheet in scene.sheets]
     visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
     # The cells that `spread` uses.
@@ -89,7 +87,7 @@ def _counts(
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
-    """Sums the fractions of views that show each cell of each sheet, divided by how much light varies in the view."""
+    """Sums over the views the fraction of pixels that show each cell, divided by how much light varies in the view."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
@@ -107,7 +105,7 @@ def _counts(
 
 
 class Detail:
-    """The variation of a scene's light, on a device."""
+    """The variation of a scene's light, stored on a device."""
 
     def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
         masks = [sheet.mask for sheet in scene.sheets]
@@ -118,12 +116,12 @@ class Detail:
         self._even, self._place = torch.from_numpy(np.concatenate(even)).to(device), torch.from_numpy(place).to(device)
 
     def sizes(self, points: Points) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rows and columns of texels of the sheet at each point, int64 [N]."""
+        """Returns the rows and columns of texels of the sheet at each point, int64 [N] each."""
         return tuple(self._place[points.sheet.long()].T[:2])
 
     def lost(self, points: Points) -> float:
-        """Estimates the error of a view that shows the points, above 0: the mean over the states, which are scaled to
-        vary equally."""
+        """Estimates the error of a view that shows the points, above 0: the mean variation of light over the states,
+        which are scaled to vary equally."""
         height, width, start = self._place[points.sheet.long()].T
         column, row = (
             (points.uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)

@@ -1,1 +1,1 @@
-"""The method "tiles": each tile of a lightmap at its own resolution."""
+"""The method "tiles": each tile of a lightmap is stored at its own resolution."""

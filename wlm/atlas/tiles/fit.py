@@ -1,12 +1,13 @@
 """The method "tiles": each tile of the lightmap at its own resolution, with the samples of least squared error.
 
 The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
-B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 it is the lightmap itself.
-Tiles share no sample, so each is a small weighted least-squares problem, which is solved for every size. The error of a
-tile is measured with its samples as stored. The sizes are then allocated within a budget, `wlm.atlas.tiles.layout`.
+B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 samples per axis it is the
+lightmap itself. Tiles share no sample, so each is a small weighted least-squares problem, which is solved for every
+size. The error of a tile is measured with its samples as stored. The sizes are then allocated within a budget,
+`wlm.atlas.tiles.layout`.
 
 This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get many samples and evenly lit walls
-few, even within one triangle, which that paper names as its limit (section 5.1).
+few, even within one triangle, which the paper's method can't do (section 5.1).
 """
 
 import functools
@@ -53,7 +54,7 @@ _LEAST_GAIN = 2.0**-24 / 48
 
 @dataclass(frozen=True)
 class Tiles:
-    """The light of the tiles that have a weight.
+    """The light of the T tiles that have a weight above 0.
 
     Attributes:
         index: int64 [T], number of the tile in the grid, row by row.
@@ -71,8 +72,7 @@ class Tiles:
 def fit_tiles(
     scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
 ) -> AtlasModel | None:
-    """Compresses a scene of one sheet and one state to tiles; None where not even the smallest tiles and their table
-    fit the budget.
+    """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget.
 
     Raises:
         WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
@@ -108,8 +108,8 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model from the solved samples of its tiles, their sizes and places, and the tiles' numbers in the grid,
-    int64 [T]."""
+    """Makes the model from the tiles' solved samples, their sizes and places, and their numbers in the grid, int64
+    [T]."""
     size = scene.sheets[0].mask.shape
     counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
@@ -134,13 +134,13 @@ def composed_model(
 
 
 def least_gain(sheet: Sheet) -> float:
-    """Computes the error that a bit must save to be allocated."""
+    """Returns the squared error that each bit must save to be worth storing."""
     return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
 
 
 def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device: str) -> Tiles:
-    """Cuts a lightmap, float [H, W, 3] without gaps, into the tiles in which some weight, float64 [2 H, 2 W] of each
-    quarter of a texel, is above 0; at least one is."""
+    """Cuts a lightmap, float [H, W, 3] without gaps, into tiles. Only tiles with a weight above 0 are returned;
+    `weight`, float64 [2 H, 2 W], has the weights of quarters of texels, at least one above 0."""
     index, share = weighted(torch.as_tensor(weight, device=device), size)
     columns = tile_counts(*image.shape[:2], size)[1]
     light = torch.from_numpy(np.ascontiguousarray(image, np.float32)).to(device)
@@ -149,8 +149,8 @@ def cut(image: np.ndarray, weight: torch.Tensor | np.ndarray, size: int, device:
 
 
 def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Selects the tiles that have a weight, and returns `index` and `weight` of `Tiles`. The weights of quarters of
-    texels are float64 [2 H, 2 W], at least one above 0."""
+    """Selects the tiles with a weight above 0 and returns their `index` and `weight`, as in `Tiles`. The argument has
+    the weights of quarters of texels, float64 [2 H, 2 W], at least one above 0."""
     rows, columns = tile_counts(*(side // 2 for side in weight.shape), size)
     m = SUPERSAMPLING * size
     folded = _folded(_folded(weight, rows * m).T, columns * m).T
@@ -160,7 +160,7 @@ def weighted(weight: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tenso
 
 
 def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -> torch.Tensor:
-    """Cuts the texels [T, B + 1, B + 1, ...] of tiles out of an image [H, W, ...]; beyond it its last texels repeat."""
+    """Cuts the texels of tiles, [T, B + 1, B + 1, ...], out of an image [H, W, ...], whose last texels are repeated."""
     step = torch.arange(size + 1, device=image.device)
     row = ((index // columns)[:, None] * size + step).clamp(max=image.shape[0] - 1)
     column = ((index % columns)[:, None] * size + step).clamp(max=image.shape[1] - 1)
@@ -168,7 +168,7 @@ def patches(image: torch.Tensor, index: torch.Tensor, columns: int, size: int) -
 
 
 def tile_light(patch: torch.Tensor) -> torch.Tensor:
-    """Computes the light at the points of tiles, `Tiles.light`, from their texels [T, B + 1, B + 1, 3]."""
+    """Returns light at the points of tiles, as `Tiles.light`, from the tiles' texels [T, B + 1, B + 1, 3]."""
     near, far = patch[:, :-1], patch[:, 1:]
     down = torch.stack([near + share * (far - near) for share in _SHARES], 2).flatten(1, 2)
     near, far = down[:, :, :-1], down[:, :, 1:]
@@ -177,8 +177,8 @@ def tile_light(patch: torch.Tensor) -> torch.Tensor:
 
 
 def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
-    """Folds weights [2 H, N] to the points of tiles along the first axis; weights beyond the outermost texel centres
-    are added to those of the centres."""
+    """Sums weights [2 H, N] to one weight per point of tiles along the first axis; weights beyond the outermost texel
+    centres are added to the nearest point."""
     padded = weight.new_zeros((points, weight.shape[1]))
     inner = weight[1:-1]
     padded[: len(inner)] = inner
@@ -188,7 +188,7 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
 
 
 def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
-    """Computes weights of linear interpolation from samples to points along a tile's axis, float [points, samples]."""
+    """Returns the weights of linear interpolation from samples to points along an axis, float [points, samples]."""
     place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0)).long()
     result = torch.zeros((points, samples), device=device)
@@ -200,11 +200,9 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 
 
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
-    """Solves for the samples of least weighted squared error, float [T, ny, nx, 3], at one size for all tiles, in at
-    most `rounds` rounds.
-
-    Conjugate gradients solve the normal equations of each channel of a tile from the solution with equal weights.
-    """
+    """Returns the samples of least weighted squared error, float [T, ny, nx, 3], for tiles that all have nx x ny
+    samples, after at most `rounds` rounds. Conjugate gradients solve the normal equations of each tile and channel,
+    starting from the solution for equal weights."""
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
         light, weight = (interop.to_warp(_laid_out(values)) for values in (tiles.light, tiles.weight))
@@ -229,7 +227,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
 
 
 def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
-    """Describes nx x ny samples of tiles for kernels."""
+    """Describes a grid of nx x ny samples per tile for the kernels."""
     grid = kernels.Grid()
     grid.points, grid.nx, grid.ny = SUPERSAMPLING * tiles.size, nx, ny
     axes = [_axis(samples, grid.points, str(tiles.light.device)) for samples in (nx, ny)]
@@ -240,14 +238,14 @@ def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
 
 
 def _laid_out(values: torch.Tensor) -> torch.Tensor:
-    """Lays out values [T, ...]; on a GPU the tiles' axis is contiguous, since threads read many tiles at once."""
+    """Arranges values [T, ...] in memory; on a GPU the axis of tiles is contiguous, since threads read many at once."""
     if values.device.type == "cpu":
         return values.contiguous()
     return values.movedim(0, -1).contiguous().movedim(-1, 0)
 
 
 def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
-    """Allocates float [T, ...] in the layout of `_laid_out`."""
+    """Allocates an array float [T, ...] that is arranged as by `_laid_out`."""
     count, device = len(tiles.index), tiles.light.device
     if device.type == "cpu":
         return torch.empty((count, *shape))
@@ -256,8 +254,8 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Computes interpolation along an axis: the sample before each point, the weight of the next one, and the inverse
-    Gram matrix of the interpolation matrix, which is cached since computing it on a GPU would dominate the time."""
+    """Returns the linear interpolation along an axis: the sample before each point, the weight of the next sample, and
+    the inverse Gram matrix of the interpolation, which is cached since computing it on a GPU is slow."""
     matrix = linear(samples, points)
     place = (torch.arange(points) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0))
@@ -267,8 +265,8 @@ def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.T
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
-    """Computes the weighted squared error of samples [T, ny, nx, 3], averaged over the channels, float64 [T]; the sum
-    is the MSE."""
+    """Returns the weighted squared error of samples [T, ny, nx, 3] for each tile, averaged over the channels, float64
+    [T]. The sum over all tiles is the MSE."""
     result = torch.empty((len(samples), 3), dtype=torch.float64, device=samples.device)
     flat = samples.permute(0, 3, 1, 2).flatten(2)
     with on_stream(samples.device):
@@ -279,7 +277,7 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
 
 
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
-    """Computes the weight of each sample's squared error, float [T, ny, nx]."""
+    """Returns the weight of each sample's squared error, float [T, ny, nx]."""
     points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
     down, across = (linear(count, points, device).square() for count in (ny, nx))
     return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
@@ -291,8 +289,8 @@ def curves(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
-    """Computes the error of every tile at every size, float64 [sizes, T], after the samples are stored in the size's
-    format. The checkpoint keeps the errors of the sizes done as batch 0."""
+    """Returns the error of every tile at every size, float64 [sizes, T], with samples rounded as the size's format
+    stores them. The checkpoint keeps the errors of finished sizes as batch 0."""
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
 
@@ -324,11 +322,9 @@ def curves(
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:
-    """Solves for the samples of every tile at its own size, int [T].
-
-    Returns all tiles in groups of one size: their numbers, int [n], and on the tiles' device samples, float32 [n, ny,
-    nx, 3], not negative, and the weights of the samples' squared errors [n, ny, nx].
-    """
+    """Solves for the samples of every tile at its own size; `chosen`, int [T], has indices of sizes. Returns groups of
+    tiles of one size: the tiles' numbers, int [n]; their samples, float32 [n, ny, nx, 3], not negative; and the weights
+    of the samples' squared errors [n, ny, nx]. Samples and weights are on the tiles' device."""
     result = []
     for number in np.unique(chosen).tolist():
         size, members = sizes[number], np.flatnonzero(chosen == number)

@@ -1,8 +1,8 @@
-"""Sizes of tiles: the candidates, the allocation within a budget of bits, and the places in the texture.
+"""Chooses the sizes of tiles within a budget of bits, and their places in the texture.
 
-Each tile has a curve of error against bits. At the optimum one more bit gains as much in every tile. That gain, a
-Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each with its own
-texture: blocks for light that they follow well, single texels for other light and for tiles of few samples.
+Each tile has a curve of error against bits. At the optimum one more bit reduces the error by the same amount in every
+tile. That gain, a Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each
+with its own texture: blocks where the block format is accurate, RGB9E5 for other light and for small tiles.
 """
 
 import math
@@ -34,8 +34,8 @@ _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14)  # texels, beside the largest side: a
 
 @dataclass(frozen=True)
 class Size:
-    """A size that a tile may have: samples along x and y, their format, a key of `COLOUR_BITS`, and whether they are in
-    the second texture of "mixed"."""
+    """A size that a tile may have: samples along x and y, their format (a key of `COLOUR_BITS`), and whether the tile
+    is in the second texture of "mixed"."""
 
     nx: int
     ny: int
@@ -44,19 +44,19 @@ class Size:
 
     @property
     def bits(self) -> int:
-        """Bits on a GPU."""
+        """The number of bits of a tile on a GPU."""
         return self.nx * self.ny * COLOUR_BITS[self.format]
 
     @property
     def step(self) -> int:
-        """The sides are multiples of this number of texels."""
+        """The number of texels of which the tile's width and height are multiples: 4 for blocks, else 1."""
         return BLOCK_SIDE if self.format in ("bc6h", "astc") else 1
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of all tiles, int [T]; x and y of each tile's first texel, int64 [T, 2]; and rows and columns of T_p,
-    and of the second texture of "mixed"."""
+    """The chosen size of each tile, an index, int [T]; x and y of each tile's first texel, int64 [T, 2]; and the rows
+    and columns of T_p and of the second texture of "mixed"."""
 
     chosen: np.ndarray
     first: np.ndarray
@@ -64,7 +64,7 @@ class Layout:
 
 
 def sizes_of(profile: Profile) -> list[Size]:
-    """Lists the sizes that a tile may have; tiles consist of whole blocks, so that no block is shared."""
+    """Returns the sizes that a tile may have; in block formats tiles consist of whole blocks and share none."""
     most, colour = profile.tile + 1, profile.colour
     code = first_block_code(colour)
     most_texels = min(most, code)
@@ -76,8 +76,8 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
-    """Allocates sizes whose rectangles fit in textures of `room` bits, and places them; None where not even the
-    smallest sizes fit. `error` is float64 [sizes, T], on any device; `least` is the error that a bit must save.
+    """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
+    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the error that a bit must save.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -113,7 +113,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves with the smallest texture, and returns it with the texture's rows and columns."""
+    """Finds the width of shelves for the smallest texture; returns this width and the texture's rows and columns."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -136,18 +136,19 @@ def composed(
     counts: tuple[int, int],
     device: str,
 ) -> tuple[list[tuple[torch.Tensor, torch.Tensor]], np.ndarray]:
-    """Composes T_p and T_c.
+    """Makes the colour textures T_p and the lookup texture T_c.
 
     Args:
-        samples: Groups of tiles of one size, `solved`.
-        sizes: The sizes.
+        samples: Groups of tiles of one size, from `solved`.
+        sizes: The sizes that tiles may have.
         layout: Sizes and places of the tiles.
         index: int64 [T], the tiles' numbers in the grid; other tiles show the first texel.
         counts: Rows and columns of the grid.
         device: "cpu" or "cuda:N": copying a large texture through the host takes seconds.
 
     Returns:
-        For each texture the texels, float32 [H, W, 3], and their weights [H, W], on the device; and T_c.
+        For each colour texture its texels, float32 [H, W, 3], and their weights [H, W], on the device; and the lookup
+        texture T_c.
     """
     textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
     for members, values, weight in samples:
@@ -170,14 +171,15 @@ def composed(
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """Computes rows [n, ny, 1] and columns [n, 1, nx] of rectangles of texels from their first texels (x, y) [n, 2]."""
+    """Returns the rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n,
+    2]."""
     row = first[:, 1, None, None] + np.arange(ny)[:, None]
     return row, first[:, 0, None, None] + np.arange(nx)
 
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
-    """Chooses the size of each tile, int [T], for the least total error, float64 [sizes, T], within a budget of bits;
-    each bit must save at least `least`. All tiles have the cheapest size where even that is over the budget."""
+    """Chooses the size of each tile, int [T], for the least sum of errors, float64 [sizes, T], within a budget of bits;
+    each bit must save an error of at least `least`. If even the cheapest exceed the budget, all tiles get them."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
@@ -202,9 +204,9 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 
 @dataclass(frozen=True)
 class _Run:
-    """The places of the rectangles of one size: the first `beside`, from (x, y) on, share a shelf with another size;
-    the rest have separate shelves of `each` rectangles from y = `below` on. `widest` is the right end of all of them.
-    """
+    """The places of the rectangles of one size. The first `beside` rectangles start at (x, y) on a shelf shared with
+    another size; all others fill separate shelves of `each` rectangles from y = `below` on. `widest` is the right end
+    of all of them."""
 
     beside: int
     x: int
@@ -216,19 +218,20 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Kinds:
-    """The sizes of rectangles, the highest first and then the widest, and the number of rectangles of each."""
+    """The different sizes of rectangles, by falling height and then width, and the number of rectangles of each."""
 
     size: np.ndarray
     count: np.ndarray
 
     @classmethod
     def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
-        """Sorts sizes, int [K, 2], all different, with their counts."""
+        """Returns the sizes, int [K, 2], all different, and their counts in sorted order."""
         order = np.lexsort((-size[:, 0], -size[:, 1]))
         return cls(size[order], count[order])
 
     def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Places each size on shelves of a width; returns the places and the height of all shelves."""
+        """Places the rectangles of each size on shelves of a width; returns the places and the shelves' total
+        height."""
         runs, x, y, height = [], 0, 0, 0
         for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
             each = width // w
@@ -245,8 +248,8 @@ class _Kinds:
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles, int [R, 2] widths and heights, on shelves of one width, the highest first; each shelf is as
-    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the height of all shelves."""
+    """Packs rectangles, int [R, 2] widths and heights, on shelves of one width, in order of height; each shelf is as
+    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the total height of the shelves."""
     first = np.zeros((len(sizes), 2), np.int64)
     if not len(sizes):
         return first, 0

@@ -104,12 +104,12 @@ class Shader:
 
     @property
     def functions(self) -> dict[str, Function]:
-        """The functions by name."""
+        """Returns the shader's functions by name."""
         return {item.name: item for item, _ in self.items if isinstance(item, Function)}
 
     @property
     def bound(self) -> dict[str, Variable]:
-        """Textures, uniforms and buffers by name."""
+        """Returns the shader's textures, uniforms and buffers by name."""
         found = [item for item, _ in self.items if isinstance(item, Variable) and item.way in ("uniform", "buffer")]
         return {item.name: item for item in found}
 

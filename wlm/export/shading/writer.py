@@ -15,7 +15,7 @@ _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
 def nodes_of(body: tuple[Statement, ...]) -> Iterator[Node]:
-    """Iterates over all nodes of all expressions."""
+    """Iterates over all nodes of all expressions in a function body."""
 
     def within(node: Node) -> Iterator[Node]:
         yield node
@@ -218,11 +218,11 @@ class Writer(ABC):
 
     @property
     def textures(self) -> list[Variable]:
-        """The textures that the shader declares."""
+        """Returns the variables of all textures that the shader declares."""
         return [each for each in self.bound.values() if each.type in SAMPLERS]
 
     @property
     def filters(self) -> list[str]:
-        """Names of the textures that are read through the filter, one for each read."""
+        """Returns the names of the textures that are read with filtering, one name for each read."""
         nodes = (node for function in self.functions.values() for node in nodes_of(function.body))
         return [node.parts[0].text for node in nodes if node.kind == "call" and node.text in FILTERS]

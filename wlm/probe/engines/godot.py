@@ -1,11 +1,11 @@
-"""Light for Godot 4: a bake of a lattice of probes, or the original bake with its light replaced.
+"""Exports light to Godot 4: as a bake with a lattice of probes, or as the original bake with its light replaced.
 
 Godot finds the tetrahedron of probes around a moving object with a tree of planes, and mixes the light of its four
-corners by barycentric weights (`lightmap_tap_sh_light`, servers/rendering). On a lattice both are simple: planes
-between the cells down to one cell, and within it the planes x = y, y = z and x = z, which cut it into six tetrahedra
-(Kuhn 1960). Those of neighbouring cells meet face to face, so that the light is continuous. Planes through the faces of
-Delaunay tetrahedra between scattered probes would cut many others: the tree has 20 nodes for each tetrahedron, and
-Godot's own takes minutes for 2,000 probes.
+corners by barycentric weights (`lightmap_tap_sh_light`, servers/rendering). On a lattice the tree and the tetrahedra
+are simple: planes between the cells down to one cell, and within a cell the planes x = y, y = z and x = z, which cut it
+into six tetrahedra (Kuhn 1960). Tetrahedra of neighbouring cells meet face to face, so that the light is continuous.
+Planes through the faces of Delaunay tetrahedra between scattered probes would cut many others: the tree has 20 nodes
+for each tetrahedron, and Godot's own takes minutes for 2,000 probes.
 """
 
 import math
@@ -49,15 +49,15 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 in RGB as a bake of Godot 4, `light.lmbake`.
+    """Writes a model of L2 spherical harmonics in RGB as a bake of Godot 4, `light.lmbake`.
 
     If `original` is the `.lmbake` that was compressed, its light is replaced. Otherwise the bake has probes at the
-    corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24), and another
-    `original` gives the positions, if the method needs them and the model stores none.
+    corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24). If the method
+    needs positions and the model stores none, they are read from `original`.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range or given with a bake, the bake has
-            other probes, the light exceeds floats, or the device does not exist.
+            other probes, the light exceeds float32, or the device does not exist.
     """
     model = bundle.model
     bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
@@ -89,7 +89,7 @@ def write_kit(
 
 
 def tetrahedra_of(count: np.ndarray) -> np.ndarray:
-    """Returns six tetrahedra for each cell, int32 [6 C, 4] corners, for cells [3] along x, y and z, x fastest."""
+    """Returns six tetrahedra for each of C cells, as corners int32 [6 C, 4]; `count` has the cells along x, y and z."""
     nx, ny, _ = (int(n) + 1 for n in count)
     step = np.array([1, nx, nx * ny])
     z, y, x = (axis.ravel() for axis in np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij"))
@@ -105,7 +105,7 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
         low, size, count: Attributes of the `Lattice`.
 
     Returns:
-        Planes, float64 [M, 4], and children, int32 [M, 2], as `wlm.formats.godot` takes them.
+        The planes, float64 [M, 4], and the children of each node, int32 [M, 2], as in `wlm.formats.godot`.
     """
     cells = int(np.prod(count))
     inner = cells - 1  # nodes above the cells; the cells' own nodes, five each, follow in the order of the cells
@@ -114,7 +114,7 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
     made = 0
 
     def place(begin: tuple[int, ...], end: tuple[int, ...]) -> int:
-        """Builds the nodes above a block of cells and returns the root."""
+        """Builds the nodes of the tree for a block of cells and returns the block's root."""
         nonlocal made
         sides = [last - first for first, last in zip(begin, end, strict=True)]
         axis = sides.index(max(sides))

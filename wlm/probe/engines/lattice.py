@@ -1,4 +1,4 @@
-"""The light of a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
+"""Decodes a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
 
 from dataclasses import dataclass
 
@@ -34,11 +34,11 @@ class Lattice:
     count: np.ndarray
 
     def centres(self) -> np.ndarray:
-        """Returns the centres of the cells, float64 [nz ny nx, 3], x fastest."""
+        """Returns the centres of the cells, float64 [nz ny nx, 3], with x varying fastest."""
         return self._places(self.count, 0.5)
 
     def corners(self) -> np.ndarray:
-        """Returns the corners of the cells, float64 [(nz + 1) (ny + 1) (nx + 1), 3], x fastest."""
+        """Returns the corners of the cells, float64 [(nz + 1) (ny + 1) (nx + 1), 3], with x varying fastest."""
         return self._places(self.count + 1, 0.0)
 
     def light(self, place: np.ndarray) -> np.ndarray:
@@ -52,13 +52,13 @@ class Lattice:
 
 
 def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | None, device: str) -> Lattice:
-    """Fills the box of a model's probes with cells, centred where they do not fit it exactly.
+    """Makes a lattice of cubic cells that covers the box of a model's probes and has the same centre.
 
     Args:
-        model: A model of L2 in RGB.
+        model: A model of L2 spherical harmonics in RGB.
         cells: Cells along the longest side of the box, 1 to `most`.
-        most: Limit of the engine's format.
-        position: [N, 3], of the model's own probes, if the method needs them and the file stores none.
+        most: Largest number of cells along a side in the engine's format.
+        position: [N, 3], positions of the model's own probes, if the method needs them and the file stores none.
         device: Where the light is decoded.
 
     Raises:

@@ -1,11 +1,11 @@
-"""Light for three.js: a `LightProbeGrid`, a texture of spherical harmonics over a box.
+"""Exports light to three.js: a `LightProbeGrid`, a texture of spherical harmonics over a box.
 
 The layout follows examples/jsm/lighting/LightProbeGridWebGL.js of r187: one 3D texture in RGBA of nx x ny x 7 (nz + 2)
 texels. A probe's 27 numbers (coefficient after coefficient, each red, green and blue) and one 0 are split into 7
-texels; volume t of them has slices t (nz + 2) to (t + 1) (nz + 2) - 1, of which the first and the last are copies of
-their neighbours. The coefficients are those of this package: radiance on the orthonormal real basis, all signs plus.
-Since r187 a probe is at the centre of its cell of the box; up to r186 the outermost probes were on its faces. The
-export has both boxes, and its loader takes the one of the three.js that it runs in.
+texels; texel t of all probes is in the slices t (nz + 2) to (t + 1) (nz + 2) - 1, of which the first and the last are
+copies of their neighbours. The coefficients are those of this package: radiance on the orthonormal real basis, all
+signs plus. Since r187 a probe is at the centre of its cell of the box; up to r186 the outermost probes were on its
+faces. The export has both boxes, and its loader uses the one that fits the version of three.js in which it runs.
 """
 
 import os
@@ -72,11 +72,11 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 in RGB as a grid for three.js: `grid.ktx2`, `grid.json`, and `grid.js`, which loads them.
+    """Writes a model of L2 spherical harmonics in RGB for three.js: `grid.ktx2`, `grid.json`, and the loader `grid.js`.
 
     The grid's probes are at the centres of cubic cells that fill the probes' box, 1 to 256 `cells` along its longest
-    side, with the light there in half floats. `original` is the file that was compressed, if the method needs
-    positions and the model stores none.
+    side, with light in half floats. `original` is the file that was compressed, if the method needs positions and the
+    model stores none.
 
     Raises:
         WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the
@@ -108,7 +108,8 @@ def write_kit(
 
 
 def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Packs probes [nz * ny * nx, 27] in the order of `Lattice.centres` into float16 [7 (nz + 2), ny, nx, 4]."""
+    """Packs the values of probes, [nz * ny * nx, 27] in the order of `Lattice.centres`, to float16 [7 (nz + 2), ny, nx,
+    4]."""
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
     padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)

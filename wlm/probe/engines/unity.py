@@ -1,8 +1,8 @@
-"""Light for Unity: the numbers of `SphericalHarmonicsL2` in JSON, and a component that applies them to a scene.
+"""Exports light to Unity: the numbers of `SphericalHarmonicsL2` in JSON, and a component that applies them to a scene.
 
-Unity creates `LightProbes` only by baking, but scripts may replace their light, `LightProbes.bakedProbes`. The
-component places a `LightProbeGroup` at the model's positions for that bake, and afterwards gives each of the scene's
-probes the light of the model's probe at its position. `sh[channel, coefficient]` follows the convention "unity".
+Unity creates `LightProbes` only by baking, but scripts may replace the baked light, `LightProbes.bakedProbes`. Before a
+bake, the component places a `LightProbeGroup` at the model's positions; after it, it gives each of the scene's probes
+the light of the model's probe there. `sh[channel, coefficient]` follows the convention "unity".
 """
 
 import os
@@ -176,12 +176,13 @@ def write_kit(
 ) -> dict[str, Any]:
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
-    Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is that axis; a scene that came from
-    Unity needs none. `original` is the file that was compressed, for its positions; None: those stored with the model.
+    Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is this axis, or None for a scene
+    that came from Unity. The positions are those of `original`, the compressed file, or if None those stored with the
+    model.
 
     Raises:
         WlmError: The numbers are not spherical harmonics of up to L2, there are more than 131,072 probes, the axis does
-            not exist, the positions are unknown or of other probes, a number exceeds floats, or the device does not
+            not exist, the positions are unknown or of other probes, a number exceeds float32, or the device does not
             exist.
     """
     model, position = bundle.model, positions_of(bundle.model, original)

@@ -1,10 +1,9 @@
-"""Light for Unreal, packed like the bricks of its volumetric lightmap: 28 bytes per probe of L2.
+"""Exports light to Unreal, packed like the bricks of its volumetric lightmap: 28 bytes per probe of L2 in RGB.
 
 A texel of a brick has the ambient colour, the coefficient L00, as R11G11B10F, and each other coefficient in 8 bits, as
 a ratio to the ambient colour and to the range that light can have: coefficients 1 to 4 and 5 to 8 of red, green and
-blue in six RGBA textures (VolumetricLightmapShared.ush, without sky occlusion and shadowing). Unreal only has bricks in
-maps that it builds itself, so light is written as seven volume textures over a lattice, with functions for materials
-that read them.
+blue in six RGBA textures (VolumetricLightmapShared.ush, without sky occlusion and shadowing). Only Unreal itself can
+build such bricks, so the export has seven volume textures over a lattice, and functions for materials that read them.
 """
 
 import os
@@ -116,7 +115,7 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 in RGB as volume textures in Unreal's packing, and `WlmProbes.usf`, which reads them.
+    """Writes a model of L2 in RGB as volume textures in Unreal's packing, and their reader `WlmProbes.usf`.
 
     Probes are at the centres of cubic cells that fill the probes' box, 1 to 128 `cells` along its longest side. A
     coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0. `original`
@@ -158,7 +157,7 @@ def write_kit(
 
 
 def packed(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Packs coefficients float64 [N, C, 3]: ambient colours, uint32 [N], and ratios, uint8 [N, 3, C - 1]."""
+    """Packs coefficients, float64 [N, C, 3], to ambient colours, uint32 [N], and ratios, uint8 [N, 3, C - 1]."""
     colour = np.clip(sh[:, 0], 0.0, _PACKED_MAX)
     step = np.exp2(np.maximum(np.frexp(colour)[1] - 1, -14) - 10.0 + _DROPPED)
     code = (np.rint(colour / step) * step).astype(np.float16).view(np.uint16).astype(np.uint32) >> _DROPPED
@@ -171,6 +170,6 @@ def packed(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ambient_colour(code: np.ndarray) -> np.ndarray:
-    """Converts R11G11B10F to float64 [N, 3]."""
+    """Converts packed R11G11B10F colours to float64 [N, 3]."""
     part = (code[:, None] >> _SHIFT) & ((1 << (15 - _DROPPED)) - 1)
     return (part << _DROPPED).astype(np.uint16).view(np.float16).astype(np.float64)

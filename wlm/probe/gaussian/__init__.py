@@ -1,1 +1,1 @@
-"""Light as 3D Gaussians with short latents and one small network (gaussian-probe-compression)."""
+"""Compresses light to 3D Gaussians with short latents and one small network (gaussian-probe-compression)."""

@@ -1,7 +1,7 @@
-"""Gaussians as GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
+"""Packs Gaussians into GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
 
-The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the numbers of the Gaussians are the
-fit's own codes: they take as many bytes and decode to exactly the trained numbers.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the Gaussians are stored as the 16-bit
+codes of the fit, which take as many bytes and decode exactly to the trained numbers.
 """
 
 import numpy as np
@@ -36,10 +36,10 @@ _ABOUT = {
 
 
 def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
-    """Returns the GPU form of a model of Gaussians; `decoder` computes the reference.
+    """Returns the GPU form of a model of Gaussians; `decoder` computes the reference values.
 
     Raises:
-        WlmError: The probes' box does not fit floats.
+        WlmError: The probes' box exceeds float32.
     """
     content = model.content
     position = _reference_positions(model, content)
@@ -94,7 +94,8 @@ def _network_words(content: Gaussians) -> np.ndarray:
 
 
 def _reference_positions(model: ProbeModel, content: Gaussians) -> np.ndarray:
-    """Returns centres of Gaussians, evenly spaced by index, and a point outside the box; float64 [M, 3]."""
+    """Returns points for the reference, float64 [M, 3]: some Gaussians' centres, evenly spaced by index, and one
+    outside."""
     chosen = np.unique(np.linspace(0, content.count - 1, min(content.count, _REFERENCES)).astype(int))
     inside = content.rows()[chosen, CENTRE].astype(np.float64)
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])

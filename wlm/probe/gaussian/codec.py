@@ -1,4 +1,4 @@
-"""Gaussians in files: the integers of `WholeNumbers`, with the steps as the upper halves of float32."""
+"""Reads and writes Gaussians in files: the integers of `WholeNumbers`, and the steps as the upper halves of float32."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,12 +13,12 @@ _MOST, _MOST_LOG = 1e38, 40.0
 
 
 def settings(content: Gaussians) -> dict[str, Any]:
-    """Returns the counts that the sizes of the parts depend on."""
+    """Returns the settings, by name, on which the sizes of the parts depend."""
     return {"count": content.count, "dropped": content.dropped}
 
 
 def table(profile: Profile, outputs: int, count: int) -> dict[str, Part]:
-    """Returns the table of parts of `count` Gaussians."""
+    """Returns the types and shapes, by name, of the parts that store `count` Gaussians."""
     channels = 9 + profile.latent
     weights = sum(rows * columns for rows, columns in layer_shapes(profile.latent, profile.hidden, outputs))
     return {
@@ -31,7 +31,7 @@ def table(profile: Profile, outputs: int, count: int) -> dict[str, Part]:
 
 
 def parts(content: Gaussians) -> dict[str, np.ndarray]:
-    """Returns the parts; the Gaussians are stored channel by channel, less the lowest number of each channel."""
+    """Returns the parts by name; Gaussians are stored channel by channel, minus the lowest number of each channel."""
     whole = content.whole
     if whole is None:
         raise ValueError("expected quantised Gaussians, as a fit returns them")
@@ -47,10 +47,10 @@ def parts(content: Gaussians) -> dict[str, np.ndarray]:
 
 
 def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Gaussians:
-    """Builds the content from checked parts.
+    """Builds the Gaussians and their network from checked parts.
 
     Raises:
-        ValueError: The numbers do not fit each other, or are beyond what a decoder computes in float32.
+        ValueError: The numbers contradict each other, or exceed what a decoder can compute in float32.
     """
     latent, hidden = profile.latent, profile.hidden
     shapes = layer_shapes(latent, hidden, outputs)
@@ -79,7 +79,7 @@ def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dr
 
 
 def _checked(content: Gaussians) -> Gaussians:
-    """Checks that no number on the way to a probe's values exceeds float32."""
+    """Returns the content after checking that no number in its decoding exceeds float32."""
     bounds = content.bounds
     # The difference of any two bounds must be finite, and so must the squares of scales and of their inverses.
     if not np.abs(bounds).max() <= _MOST:

@@ -1,4 +1,4 @@
-"""Decoding Gaussians on a device (gaussian-probe-compression, eq. 5 to 7 and section 5.3.2)."""
+"""Decodes Gaussians on a device (gaussian-probe-compression, eq. 5 to 7 and section 5.3.2)."""
 
 import numpy as np
 import warp as wp
@@ -37,14 +37,14 @@ class Points:
 
 
 class GaussianDecoder(Decoder):
-    """A model of Gaussians on a device, with lists of Gaussians by cube.
+    """A model of Gaussians on a device, with a list of the Gaussians that reach each cube of a grid.
 
     Attributes:
-        pairs: Number of entries in all lists.
+        pairs: Number of entries in all lists together.
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
-        """Loads a model, whose content is Gaussians; arguments and errors as for `wlm.probe.decode.Decoder`."""
+        """Loads a model of Gaussians; arguments and errors are those of `wlm.probe.decode.Decoder`."""
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Gaussians)
@@ -67,7 +67,7 @@ class GaussianDecoder(Decoder):
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
 
     def points(self, position: np.ndarray) -> Points:
-        """Uploads points that are to be decoded often; arguments and errors as for `decode`."""
+        """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
         return Points(check_points(position), self.model, self.device)
 
     def run(self, points: Points) -> None:
@@ -94,7 +94,7 @@ class GaussianDecoder(Decoder):
 
 
 class GaussianLight:
-    """Light of probes that is decoded where and when a volume asks for it; a `wlm.probe.volume.light.Light`."""
+    """Light of Gaussians at positions that a volume requests, decoded on demand; a `wlm.probe.volume.light.Light`."""
 
     def __init__(self, decoder: GaussianDecoder, position: np.ndarray) -> None:
         self._decoder = decoder

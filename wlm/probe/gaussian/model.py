@@ -1,4 +1,4 @@
-"""Gaussians and a network: the numbers that a file stores, and the codes that a GPU holds.
+"""The model of Gaussians and a network: the integers that a file stores, and the codes that a GPU uses.
 
 The light at a position p follows from the sum of the Gaussians' latents at p and from p itself
 (gaussian-probe-compression, eq. 2 to 7):
@@ -49,13 +49,15 @@ _SAME = 1e-12  # difference of two angles that only rounding separates
 
 @dataclass(frozen=True, eq=False)
 class WholeNumbers:
-    """Gaussians and network as integers; each integer times its step is the number that it stands for.
+    """Gaussians and network as integers; each integer times its step gives the number.
 
     Attributes:
-        gaussians: int64 [K, 9 + L]: centre 3, logarithm of the scale 3, rotation 3, latent L.
-        step: float64 [9 + L].
+        gaussians: int64 [K, 9 + L]: 3 numbers of the centre, 3 of the scale's logarithm, 3 of the rotation, and L of
+            the latent.
+        step: float64 [9 + L], the step of each column of `gaussians`.
         net: The three layers, int64 [I + 1, O] each, as `layer_shapes` describes them.
-        net_step: float64 [L + 6], for each row of the first layer, for the second layer and for the third.
+        net_step: float64 [L + 6], a step for each row of the first layer, one for the second layer and one for the
+            third.
     """
 
     gaussians: np.ndarray
@@ -64,7 +66,7 @@ class WholeNumbers:
     net_step: np.ndarray
 
     def layers(self) -> list[np.ndarray]:
-        """Returns the layers as float16."""
+        """Returns the three layers of the network as float16."""
         most = float(np.finfo(np.float16).max)
         steps = self.net_step[:-2, None], self.net_step[-2], self.net_step[-1]
         return [
@@ -72,7 +74,7 @@ class WholeNumbers:
         ]
 
     def codes(self) -> dict[str, np.ndarray]:
-        """Returns `code`, `levels`, `bounds` and `net` of `Gaussians`.
+        """Returns the arrays `code`, `levels`, `bounds` and `net` of `Gaussians`.
 
         Raises:
             ValueError: A number does not fit 16 bits, or a rotation exceeds half a turn.
@@ -102,9 +104,9 @@ class Gaussians(Content):
     """K Gaussians with latents of length L, and a network of P weights.
 
     Attributes:
-        latent: L.
+        latent: L, length of a latent.
         hidden: Width of both hidden layers.
-        outputs: D.
+        outputs: D, numbers per probe.
         support: Support of a Gaussian, "ellipsoid" or "sphere".
         gain: Factor of the network's outputs.
         code: uint16 [K, 10 + L], codes of centre, logarithm of the scale, quaternion and latent.
@@ -112,7 +114,7 @@ class Gaussians(Content):
         bounds: float32 [2, 10 + L], lowest and highest value of each channel.
         net: float16 [P]: for each layer a row of weights for every input, then the biases.
         dropped: Number of Gaussians that the fit dropped, since no probe needed them.
-        whole: The integers that the arrays follow from; None while a fit has not been quantised for its file.
+        whole: The integers from which the arrays are computed; None until a fit is quantised for its file.
     """
 
     METHOD: ClassVar[str] = "gaussians"
@@ -131,7 +133,7 @@ class Gaussians(Content):
 
     @property
     def count(self) -> int:
-        """Number of Gaussians, K."""
+        """The number of Gaussians, K."""
         return len(self.code)
 
     @property
@@ -140,15 +142,13 @@ class Gaussians(Content):
 
     @property
     def steps(self) -> np.ndarray:
-        """Value of one unit of each channel's code, float32 [10 + L]."""
+        """The difference between successive codes of each channel, float32 [10 + L]."""
         low, high = self.bounds
         return (high - low) / np.maximum(self.levels, 1).astype(np.float32)
 
     def rows(self) -> np.ndarray:
-        """Restores the Gaussians from their codes (eq. 14), float32 [K, 10 + L].
-
-        Scales are logarithms. Quaternions w, x, y, z have any length; a quaternion of length zero is no rotation.
-        """
+        """Returns the Gaussians decoded from their codes (eq. 14), float32 [K, 10 + L]. Scales are logarithms.
+        Quaternions w, x, y, z have any length; a quaternion of length zero means no rotation."""
         return self.bounds[0] + self.code.astype(np.float32) * self.steps
 
     def layers(self) -> list[np.ndarray]:
@@ -178,15 +178,16 @@ def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:
-    """Returns the layers' shapes: a row of weights for each input, then a row of biases; a column for each output."""
+    """Returns the shapes of the layers: a row of weights for each input and a row of biases; a column for each
+    output."""
     return [(latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, outputs)]
 
 
 def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str) -> None:
-    """Checks that kernels can be built for `outputs` numbers per probe; the CPU has no limit.
+    """Checks that kernels can be compiled for `outputs` numbers per probe; on the CPU there is no limit.
 
     Raises:
-        WlmError: There are too many for CUDA.
+        WlmError: There are too many numbers per probe for CUDA.
     """
     most = most_outputs(latent, hidden)
     if device != "cpu" and outputs > most:
@@ -197,15 +198,15 @@ def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str
 
 
 def gaussian_count(ratio: float, live: int) -> int:
-    """Returns the number of Gaussians that a fit to `live` probes begins with."""
+    """Returns the number of Gaussians with which a fit to `live` probes begins; `ratio` is Gaussians per probe."""
     return max(1, round(ratio * live))
 
 
 def least_turned(rows: np.ndarray) -> np.ndarray:
-    """Expresses each Gaussian with the rotation of the smallest angle.
+    """Returns equivalent Gaussians with the smallest rotation angle, by reordering the axes of each ellipsoid.
 
     Args:
-        rows: [K, 10 + L], as `Gaussians.rows` returns them.
+        rows: [K, 10 + L], as from `Gaussians.rows`.
 
     Returns:
         float64 [K, 9 + L], channels as in `WholeNumbers`.

@@ -1,10 +1,10 @@
-"""Quantising a fit for its file: integers with steps as coarse as an error budget allows.
+"""Quantises a fit for its file: integers with steps as coarse as an error budget allows.
 
-The rounding of one number is compensated by those that are rounded after it. The latents are fitted anew to the rounded
-Gaussians, so that the sums of the latents stay; each layer of the network is fitted to what entered the next layer, the
-last one to the probes. Within a matrix, rows are rounded one by one, and the rest of each row is subtracted from the
-rows that follow (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained Transformers, 2023). The steps
-of the groups of numbers are such that a bit is worth about as much in each group.
+Numbers that are rounded later compensate for the rounding of earlier ones. The latents are fitted again to the rounded
+Gaussians, so that their sums at the probes stay; each layer of the network is fitted to the original inputs of the next
+layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows compensate for the
+rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained Transformers, 2023).
+Steps are chosen so that a bit reduces the error by about the same amount in each group of numbers.
 """
 
 import math
@@ -50,13 +50,13 @@ _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share o
 
 
 def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> ProbeModel:
-    """Quantises a fitted model.
+    """Quantises a fitted model to integers.
 
     Args:
         model: The fit, whose Gaussians have no whole numbers yet.
         position: float64 [N, 3], of the live probes.
         values: float32 [N, D].
-        device: Where results are compared with the fit.
+        device: Device on which results are compared with the fit.
 
     Returns:
         The coarsest model found that loses at most `DROP`, or a model with fine steps if there is none.
@@ -85,14 +85,14 @@ def _error(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: 
 
 
 class _Steps(NamedTuple):
-    """Quantisation steps of each group of numbers.
+    """The quantisation steps of each group of numbers.
 
     Attributes:
-        centre, scale, rotation: Steps of a Gaussian's numbers.
+        centre, scale, rotation: Steps of a Gaussian's centre, logarithm of the scale and rotation.
         latent: Step of the latents, times the norm of their weights in the first layer.
         first: Step of the first layer's weights of latents, times the norm of the latents.
         position: Step of the first layer's weights of positions, and of its biases.
-        second, third: Steps of these layers.
+        second, third: Steps of the second and the third layer.
     """
 
     centre: float
@@ -106,7 +106,8 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Weights of Gaussians [K, 9] at the probes, float64 [N, K]; None with more than `_TOGETHER` Gaussians."""
+    """The weights of Gaussians [K, 9] at the probes, float64 [N, K]; None, to save memory, with more than `_TOGETHER`
+    Gaussians."""
 
     rows: np.ndarray
     weight: torch.Tensor | None = None
@@ -117,7 +118,7 @@ class _Sums(NamedTuple):
 
 
 class _Search:
-    """Finds integers of a model at given steps, and the error that they leave."""
+    """Finds the integers of a model for given steps, and the error that they cause."""
 
     def __init__(self, content: Gaussians, x: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
         self._gain, self._sphere = content.gain, content.support == "sphere"
@@ -142,7 +143,7 @@ class _Search:
         self._of_first = 1.0 / _positive(self._latent.square().mean(0).sqrt().cpu().numpy())
 
     def within(self, growth: float) -> WholeNumbers | None:
-        """Returns the coarsest integers found with which the error grows by at most this share, or None."""
+        """Returns the coarsest integers found with which the error grows by at most the fraction `growth`, or None."""
         best, natural, most = None, self._natural(), (1.0 + growth) * self._base
         least, times, tried = 0.0, 1.0, []
         for _ in range(_TRIES):
@@ -164,7 +165,7 @@ class _Search:
         return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
 
     def _natural(self) -> np.ndarray:
-        """Returns the steps, float64 [8], at which each group of numbers adds about as much error."""
+        """Returns steps, float64 [8], with which all groups of numbers add about the same error."""
         rows, (first, second, third) = self._rows, self._layers
         latents = first[: len(self._of_latent)]
         slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
@@ -174,7 +175,7 @@ class _Search:
         return np.array(units) * _SHARES
 
     def _rounded(self, steps: _Steps) -> tuple[WholeNumbers, float]:
-        """Returns integers and their mean squared error over gain squared."""
+        """Returns the integers for given steps, and their mean squared error divided by the square of the gain."""
         rows, latents, start = self._rows, self._latent.shape[1], STORED_LATENT.start
         step = np.concatenate([np.repeat(steps[:3], 3), steps.latent * self._of_latent])
         least = np.ptp(rows, axis=0) * (1.01 / CODES)
@@ -219,7 +220,7 @@ class _Search:
         return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))
 
     def _weights(self, rows: np.ndarray) -> Iterator[torch.Tensor]:
-        """Yields the weights of Gaussians [K, 9] at the probes, float64 [n, K] piece by piece."""
+        """Yields the weights of Gaussians [K, 9] at the probes, float64 [n, K], for n probes at a time."""
         scale = np.exp(rows[:, STORED_SCALE])
         whiten = (
             Rotation.from_mrp(rows[:, STORED_ROTATION]).as_matrix().transpose(0, 2, 1) / scale[:, :, None]
@@ -233,7 +234,7 @@ class _Search:
             yield square.mul_(-0.5).exp_().mul_(reached)
 
     def _latents(self, sums: _Sums, latent: np.ndarray) -> torch.Tensor:
-        """Returns the sum of latents at the probes, float64 [N, L] on the device."""
+        """Returns the weighted sum of latents at each probe, float64 [N, L] on the device."""
         latents = self._put(latent)
         pieces = self._weights(sums.rows) if sums.weight is None else [sums.weight]
         return torch.cat([weight @ latents for weight in pieces])
@@ -246,25 +247,26 @@ class _Search:
 
 
 def stored_step(step: float) -> float:
-    """Rounds a positive step to what a file stores, the upper half of a float32."""
+    """Rounds a positive step to the upper 16 bits of a float32, as a file stores it."""
     bits = max(int(np.array(step, np.float32).view(np.uint32)) + 0x8000 >> 16, 1)
     return float(np.array(bits << 16, np.uint32).view(np.float32))
 
 
 def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: float) -> np.ndarray:
-    """Solves normal equations with a ridge that pulls the solution towards `before`."""
+    """Solves normal equations with ridge regularisation towards the solution `before`."""
     ridge = _ridge(square, share)
     return linalg.solve(square + ridge * np.eye(len(square)), right + ridge * before, assume_a="pos")
 
 
 def _feed(square: np.ndarray, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a matrix with a ridge."""
+    """Returns the upper Cholesky factor of the inverse of a matrix, to whose diagonal a ridge was added."""
     inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
     return linalg.cholesky(0.5 * (inverse + inverse.T))
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
-    """Rounds numbers [I, O] row by row to integers of at most `most`, each row compensating for the rows before it."""
+    """Rounds numbers [I, O] row by row to integers of at most `most`; each row compensates for the rounding of earlier
+    rows."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
         whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
@@ -283,7 +285,7 @@ def _with_one(inputs: torch.Tensor) -> torch.Tensor:
 
 
 def _positive(numbers: np.ndarray) -> np.ndarray:
-    """Replaces numbers below a thousandth of the largest one by that one."""
+    """Replaces numbers below a thousandth of the largest number by that thousandth."""
     most = float(numbers.max()) or 1.0
     return np.where(numbers > 1e-3 * most, numbers, most)
 

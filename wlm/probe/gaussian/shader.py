@@ -1,4 +1,4 @@
-"""The GLSL that decodes Gaussians from the buffers of `wlm.probe.gaussian.bundle`."""
+"""Generates the GLSL that decodes Gaussians from the buffers of `wlm.probe.gaussian.bundle`."""
 
 from wlm.probe.gaussian.model import LATENT, Gaussians
 from wlm.probe.glsl import buffer_glsl
@@ -8,7 +8,8 @@ HEAD_WORDS = 10  # words of the buffer `gaussians` before the bounds: see _TEMPL
 
 
 def gaussian_words(latent: int) -> int:
-    """Returns the 32-bit words of a Gaussian: a 16-bit code for each of 10 + L numbers, two in a word."""
+    """Returns the number of 32-bit words of a Gaussian with a latent of length L: 10 + L codes of 16 bits, two per
+    word."""
     return (LATENT.start + latent + 1) // 2
 
 
@@ -211,13 +212,13 @@ _LONGEST = """
 
 
 def probe_glsl(content: Gaussians) -> str:
-    """Returns the shader of models of one shape: functions to be included below `#version`.
+    """Returns the GLSL for models with the sizes of `content`: functions to be included below `#version`.
 
     Args:
-        content: Its latents, units, outputs and support determine the text; its numbers are not in it.
+        content: Gaussians, of which only the latent, the hidden units, the outputs and the support matter.
 
     Returns:
-        GLSL 4.30, which Vulkan's dialect takes too.
+        GLSL 4.30, which is also valid Vulkan GLSL.
     """
     latent, hidden = content.latent, content.hidden
     channels = LATENT.start + latent

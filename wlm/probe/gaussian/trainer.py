@@ -1,4 +1,4 @@
-"""Training Gaussians and network on a device (gaussian-probe-compression, sections 3.2 and 3.3)."""
+"""Trains Gaussians and a network on a device (gaussian-probe-compression, sections 3.2 and 3.3)."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -40,17 +40,18 @@ _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe a
 
 
 class Trainer:
-    """A running fit.
+    """A running fit of Gaussians and a network.
 
-    A step runs over all probes (eq. 8). There are three stages: the Gaussians are free; then their numbers are rounded
-    to codes in each step (section 3.3); then they are fixed, and only the network is trained.
+    A step runs over all probes (eq. 8). There are three stages: first the Gaussians are trained freely; then their
+    numbers are rounded to codes in each step (section 3.3); then the Gaussians are fixed, and only the network is
+    trained.
 
     Attributes:
         device: "cpu" or "cuda:N".
         steps: Number of steps of the whole fit.
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
-        dropped_change: Largest change of a probe's number that dropping causes.
+        dropped_change: Largest change of any probe's number that dropping Gaussians causes.
     """
 
     def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str) -> None:
@@ -60,7 +61,7 @@ class Trainer:
             x: float32 [N, 3], normalised positions of the live probes.
             values: float32 [N, D].
             profile: The settings.
-            seed: One seed gives one result on one device.
+            seed: Seed of the fit; the same seed gives the same result on one device.
             device: "cpu" or "cuda:N".
         """
         self.device, self._cuda = device, device != "cpu"
@@ -153,11 +154,11 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        """Number of finished steps."""
+        """The number of finished steps."""
         return int(self._tensors["control"].item())
 
     def stage(self, step: int) -> int:
-        """Stage of a step: 0 with free Gaussians, 1 with rounded ones, 2 with fixed ones."""
+        """Returns the stage of a step: 0 with free Gaussians, 1 with rounded ones, 2 with fixed ones."""
         return int(step >= round(_QUANTISE_FROM * self.steps)) + int(step >= round(_FREEZE_FROM * self.steps))
 
     def run(self, steps: int) -> None:
@@ -181,7 +182,7 @@ class Trainer:
         self._entered = stage
 
     def finish(self) -> None:
-        """Enters the stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
+        """Runs the starts of stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
         with interop.stream(self.device):
             while self._entered < 2:
                 self._enter(self._entered + 1)
@@ -236,7 +237,7 @@ class Trainer:
         self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
 
     def _share(self, total: int, work) -> None:
-        """Runs `work` over all rows: at once on CUDA, in two halves on two threads on the CPU."""
+        """Calls `work` for all rows: in one call on CUDA, in two halves on two threads on the CPU."""
         if self._cuda:
             work()
             return
@@ -245,11 +246,9 @@ class Trainer:
         list(self._pool.map(lambda lane: work(*lane), lanes))
 
     def _prune(self) -> None:
-        """Drops the Gaussians whose absence changes no decoded number by more than the limit.
-
-        Gaussians are dropped in the order of an upper bound of their influence on the probes, as many as stay within
-        the limit together. One Gaussian always stays.
-        """
+        """Drops Gaussians without which no decoded number changes by more than the limit. Gaussians are dropped in the
+        order of an upper bound of their influence on the probes, as many as together stay within the limit. One
+        Gaussian is always kept."""
         t, latent = self._tensors, self._tensors["used"][:, LATENT]
         # With a gradient of one in one channel, the first sum of the latent is the sum of the Gaussian's weights.
         t["grad_f"].zero_()
@@ -284,7 +283,7 @@ class Trainer:
         self.needed[order[:low].cpu().numpy()] = False
 
     def _decoded(self) -> torch.Tensor:
-        """Returns the network's normalised output for the features, float32 [N, D]."""
+        """Returns the network's normalised output for the probes' sums of latents, float32 [N, D]."""
         parts = self._tensors["net"].split([rows * columns for rows, columns in self._layers])
         first, second, third = (part.view(shape) for part, shape in zip(parts, self._layers, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
@@ -298,10 +297,8 @@ class Trainer:
         return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
 
     def quantised(self) -> Gaussians:
-        """Returns the fit as codes, without whole numbers.
-
-        The network's last layer yields the probes' numbers over `gain`, the largest weight of that layer.
-        """
+        """Returns the fit with 16-bit codes, but without integers for a file. The network's last layer yields the
+        probes' numbers divided by `gain`, the largest weight of this layer."""
         d = self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
         low, high = t["bounds"]
@@ -328,7 +325,7 @@ class Trainer:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that later steps depend on.
+        """Returns the arrays on which later steps depend, by name.
 
         Raises:
             WlmError: The fit diverged: a number is not finite.
@@ -339,7 +336,7 @@ class Trainer:
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def table(self, step: int) -> dict[str, Part]:
-        """Returns the table of parts of a `state` after `step` steps."""
+        """Returns the types and shapes of the arrays of `state` after `step` steps."""
         entered = self.stage(step - 1) if step else 0
         table = {key: Part(np.float32, tuple(self._tensors[key].shape)) for key in _STATE}
         return table | {
@@ -349,7 +346,7 @@ class Trainer:
         }
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores a `state`.
+        """Restores the arrays that `state` returned.
 
         Raises:
             ValueError: A part is missing, has another shape or is out of its range; the trainer is unchanged.
@@ -377,7 +374,7 @@ class Trainer:
 def _first_numbers(
     x: np.ndarray, values: np.ndarray, profile: Profile, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first Gaussians, float32 [K, 10 + L], and the first weights of the network, float32 [P]."""
+    """Returns the initial Gaussians, float32 [K, 10 + L], and the initial weights of the network, float32 [P]."""
     latent, hidden, outputs = profile.latent, profile.hidden, values.shape[1]
     count = gaussian_count(profile.ratio, len(x))
     centre, scale = first_gaussians(x, values, count, profile.detail, profile.first_scale, random)
@@ -401,7 +398,7 @@ def _first_numbers(
 
 
 def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Measures how much the light varies around each probe.
+    """Returns how much the light varies around each probe.
 
     Args:
         x: [N, 3].
@@ -421,14 +418,15 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
 def first_gaussians(
     x: np.ndarray, values: np.ndarray, count: int, detail: float, first_scale: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places centres by k-means that starts where the light varies (gaussian-probe-compression, section 3.2).
+    """Places the initial Gaussians by k-means, with more centres where the light varies (gaussian-probe-compression,
+    section 3.2).
 
     Args:
         x: float32 [N, 3], normalised positions.
         values: float32 [N, D].
-        count: Number of Gaussians; there are never more than distinct positions.
+        count: Number of Gaussians; reduced to the number of distinct positions.
         detail, first_scale: See `wlm.probe.model.Profile`.
-        random: Source of the draw.
+        random: Source of random numbers.
 
     Returns:
         Centres, float64 [K, 3], and scales, float64 [K], which follow from the distance to the nearest other centre.

@@ -1,4 +1,4 @@
-"""Principal components as a GPU buffer, and the shader that decodes a probe from it."""
+"""Packs principal components into a GPU buffer, and generates the shader that decodes a probe from it."""
 
 import numpy as np
 
@@ -87,7 +87,7 @@ void wlm_probe_sh(int probe, out vec3 sh[{coefficients}])
 
 
 def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
-    """Returns the GPU form of a model of principal components; `decoder` computes the reference."""
+    """Returns the GPU form of a model of principal components; `decoder` computes the reference values."""
     content = model.content
     values = decoder.decode_probes()[model.live]
     chosen = np.unique(np.linspace(0, len(values) - 1, min(len(values), _REFERENCES)).astype(int))
@@ -112,15 +112,15 @@ def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
 
 
 def component_glsl(count: int, outputs: int, basis: bool) -> str:
-    """Returns the shader of models of one shape: functions to be included below `#version`.
+    """Returns the GLSL for models with the given sizes: functions to be included below `#version`.
 
     Args:
         count: Number of components.
         outputs: Numbers per probe.
-        basis: Whether the model has a basis; else its directions are the unit vectors.
+        basis: Whether the model stores a basis; if not, its directions are the unit vectors.
 
     Returns:
-        GLSL 4.30, which Vulkan's dialect takes too.
+        GLSL 4.30, which is also valid Vulkan GLSL.
     """
     columns, words = 1 + count, -(-outputs // 2)
     first = 1 + columns

@@ -1,4 +1,4 @@
-"""Decoding principal components on a device: probe by probe, and between probes through a volume."""
+"""Decodes principal components on a device: at the probes, and between probes through a volume."""
 
 import numpy as np
 import warp as wp
@@ -16,11 +16,11 @@ _BUDGET = 1024  # blocks that the volume decodes per frame; it is awaited
 
 
 class ComponentDecoder(Decoder):
-    """A model of principal components on a device, where it stays packed; it is a `wlm.probe.volume.light.Light` too.
+    """A model of principal components on a device, where it stays packed; also a `wlm.probe.volume.light.Light`.
 
     Attributes:
-        count: N.
-        channels: D.
+        count: Number of probes, N.
+        channels: Numbers per probe, D.
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
@@ -29,7 +29,7 @@ class ComponentDecoder(Decoder):
         Args:
             model: The model, whose content is principal components.
             device: "cpu" or "cuda:N".
-            position: As for `wlm.probe.decode.Decoder`.
+            position: Positions of the probes, see `wlm.probe.decode.Decoder`.
 
         Raises:
             WlmError: The device does not exist, or the positions are not those of the model's probes.
@@ -52,10 +52,8 @@ class ComponentDecoder(Decoder):
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
 
     def decode(self, position: np.ndarray) -> np.ndarray:
-        """Reads the light at any points as a renderer would, from the cascaded volume around a viewer who is near.
-
-        Points that no block of the volume covers take the light of the nearest live probe.
-        """
+        """Returns the light at any points as a renderer reads it: from the cascaded volume around a nearby viewer.
+        Points that no block of the volume covers take the light of the nearest live probe."""
         points, model = check_points(position), self.model
         own = self.own_positions()
         if self._volume is None:

@@ -1,4 +1,5 @@
-"""Principal components: every live probe is a magnitude times a sum of a few directions with 8-bit coefficients.
+"""The model of principal components: each live probe is a magnitude times a sum of a few directions with 8-bit
+coefficients.
 
     sh_i = m_i sum_k c_ik b_k,   m_i = exp(low_0 + step_0 q_i0),   c_ik = low_k + step_k q_ik,   q in 0 ... 255
 
@@ -25,10 +26,10 @@ _LEVELS = 255
 
 @dataclass(frozen=True, eq=False)
 class Components(Content):
-    """V live probes of D numbers in K components.
+    """V live probes of D numbers, each a sum of K components.
 
     Attributes:
-        outputs: D.
+        outputs: Numbers per probe, D.
         code: uint8 [V, 1 + K], codes of the logarithm of the magnitude and of the coefficients.
         bounds: float16 [2, 1 + K], lowest value and step of each column of `code`.
         basis: float16 [K, D]; empty where the directions are the unit vectors, K = D.
@@ -43,7 +44,7 @@ class Components(Content):
 
     @property
     def count(self) -> int:
-        """Number of components, K."""
+        """The number of components, K."""
         return self.code.shape[1] - 1
 
     @property
@@ -70,11 +71,12 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[C
     """Compresses live probes in as few components as reach the error `ENOUGH`.
 
     Args:
-        values: float32 [V, D], of live probes: no row is zero.
-        most_bytes: Most GPU bytes; None: any number. One component is fitted in any case.
+        values: float32 [V, D], numbers of live probes; no row is zero.
+        most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
 
     Returns:
-        The components, and their error as `ENOUGH` measures it; it is larger than that only for want of bytes.
+        The components and their relative error, which exceeds `ENOUGH` only if `most_bytes` does not allow more
+        components.
     """
     values = values.astype(np.float64)
     live, outputs = values.shape
@@ -98,7 +100,7 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[C
 
 
 def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Components, float]:
-    """Codes probes [V, D] of some norms in a basis; returns the components and their relative error."""
+    """Codes probes [V, D] in a basis, given their norms; returns the components and their relative error."""
     logarithm, code, bounds = _quantised(np.log(norm)[:, None])
     magnitude = np.exp(logarithm)
     # Coefficients for the basis as it is stored: its rounding causes no error of its own.
@@ -116,7 +118,8 @@ def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Com
 
 
 def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quantises columns [V, C] over their ranges: float64 numbers, uint8 codes, float16 [2, C] lowest and step."""
+    """Quantises columns [V, C] over their ranges. Returns the rounded numbers, float64; the codes, uint8; and the
+    lowest value and step of each column, float16 [2, C]."""
     low = -_half_above(-numbers.min(0))
     step = _half_above((numbers.max(0) - low) / _LEVELS)
     code = np.divide(numbers - low, step, out=np.zeros_like(numbers), where=step > 0)
@@ -125,13 +128,14 @@ def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _half_above(numbers: np.ndarray) -> np.ndarray:
-    """Rounds numbers up to half floats, as float64."""
+    """Rounds numbers up to the next half floats, returned as float64."""
     near = numbers.astype(np.float16)
     return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
 
 
 def _norm(values: np.ndarray) -> np.ndarray:
-    """Returns the norms of rows; squares of the smallest and the largest floats would not fit."""
+    """Returns the norms of rows; rows are scaled first, since squares of the smallest and largest floats would not
+    fit."""
     largest = np.abs(values).max(1)
     scaled = values / np.where(largest > 0, largest, 1.0)[:, None]
     return largest * np.linalg.norm(scaled, axis=1)

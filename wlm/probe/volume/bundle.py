@@ -1,4 +1,4 @@
-"""A cascaded volume as GPU buffers: its blocks, its page table and the origins of its windows."""
+"""Packs a cascaded volume into GPU buffers: its blocks, its page table and the origins of its windows."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _ABOUT = {
 
 
 def volume_bundle(volume: Volume) -> Bundle:
-    """Returns what a GPU holds of a volume around the viewer of its last update.
+    """Returns the GPU buffers and shader of a volume, as filled around the viewer of its last update.
 
     Raises:
         WlmError: The volume has no block yet.
@@ -65,7 +65,7 @@ def volume_bundle(volume: Volume) -> Bundle:
 
 
 def _reference(volume: Volume) -> dict[str, np.ndarray]:
-    """Returns points around the viewer at all distances, and the light that is read there."""
+    """Returns points at all distances around the viewer, and the light that the volume has at them."""
     random = np.random.default_rng(0)
     reach = np.repeat(np.array(volume.sizes) * volume.side / 2, _REFERENCES // len(volume.sizes))
     near = volume.viewpoint + random.uniform(-1.1, 1.1, (len(reach), 3)) * reach[:, None]

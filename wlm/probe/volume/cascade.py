@@ -1,11 +1,13 @@
 """The cascaded lighting volume: nested grids of blocks around the viewer, filled from the probes as the viewer moves.
 
-It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are rows of a pool,
-which is also the cache: a block that left its window stays until its row is needed. A block without a probe near it is
-never queued, takes no memory and is missing for a read. The finest level that has a point answers, as
-`wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
+It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
+of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
+without a probe near it is never queued, takes no memory and is missing when light is read. Light is read from the
+finest level that has a block there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights`
+describes the light of a block.
 
-Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is a graph.
+Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
+graph.
 """
 
 import itertools
@@ -45,7 +47,7 @@ _FARTHEST = 2**30  # largest coordinate of a block: int32 on the device, with ro
 
 @dataclass(frozen=True)
 class FrameStats:
-    """The work of one frame.
+    """The work that one frame did, in numbers of blocks and probes.
 
     Attributes:
         entered: Blocks that entered a window, empty ones included.
@@ -55,7 +57,7 @@ class FrameStats:
         cached: Blocks that entered a window and were still in the pool.
         left: Blocks that still wait.
         probes: Probes decoded; a probe counts once for each block that it contributes to.
-        seconds: Duration of the frame, until the device has finished it.
+        seconds: Duration of the frame in seconds, until the device has finished.
     """
 
     entered: int
@@ -70,12 +72,12 @@ class FrameStats:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The light at M points.
+    """The light that a volume returns at M points.
 
     Attributes:
-        values: float32 [M, D]; 0 where nothing covers the point.
-        level: int32 [M], level with the largest share in the value; -1 where nothing covers the point.
-        weight: float32 [M], share of the trilinear weights that blocks of any level cover; 1 if no block is missing.
+        values: float32 [M, D], the light; 0 where no block covers the point.
+        level: int32 [M], level with the largest weight in the value; -1 where no block covers the point.
+        weight: float32 [M], fraction of the trilinear weights that blocks of any level cover; 1 if no block is missing.
     """
 
     values: np.ndarray
@@ -84,7 +86,8 @@ class Reading:
 
 
 class State(NamedTuple):
-    """Copies of the device's arrays, which `wlm_kernels.probe.volume` describes; bases are relative to the index."""
+    """Copies of the device's arrays that `wlm_kernels.probe.volume` describes; bases are block coordinates from the
+    index's `start`."""
 
     pool: np.ndarray
     pages: np.ndarray
@@ -98,13 +101,13 @@ class Volume:
     Attributes:
         index: The live probes sorted by cell, and the blocks near them.
         light: Source of the probes' light.
-        position: float64 [N, 3], of all probes.
+        position: float64 [N, 3], positions of all probes.
         numbers: int64 [V], indices of the live probes.
         normal: float32 [N, 3], unit surface normals of all probes, 0 for a probe on no surface; None if unknown.
-        sizes: Side of a block at each level.
+        sizes: Side of a block at each level, in the unit of the positions.
         side: Blocks along an axis of a window.
         budget: Blocks decoded per frame.
-        channels: D.
+        channels: Numbers per probe, D.
         device: "cpu" or "cuda:N".
     """
 
@@ -124,17 +127,18 @@ class Volume:
         """Builds an empty volume on the device of the light.
 
         Args:
-            position: [N, 3], of all probes.
+            position: [N, 3], positions of all probes.
             light: Light of the N probes.
             live: bool [N], false for probes to leave out; None: all are live.
             normal: [N, 3], normal of each probe's surface, of any length; 0 for a probe on no surface. Blocks behind a
                 probe's surface then take less of its light. None: no normal is known.
             block: Side of the finest blocks, in the unit of the positions; None: derived from the probes' spacing.
-            ratios: Sides of the levels' blocks over the finest, rising powers of two from 1, at most 8.
+            ratios: Side of each level's blocks divided by the finest side: rising powers of two from 1, at most 8
+                levels.
             side: Blocks along an axis of a window, even, 2 to 64.
-            budget: Most blocks decoded per frame, 1 to 1024.
-            rows: Blocks that the pool holds, at least the budget. If the windows have more blocks near probes, the
-                farthest ones are never decoded.
+            budget: Largest number of blocks decoded per frame, 1 to 1024.
+            rows: Number of blocks that memory is allocated for, at least the budget. If the windows have more blocks
+                near probes, the farthest ones are never decoded.
 
         Raises:
             WlmError: A setting is out of its range.
@@ -168,7 +172,7 @@ class Volume:
         self._step = interop.StepGraph(self._work, self.device)
 
     def _make(self, rows: int, normal: np.ndarray) -> None:
-        """Allocates everything on the device."""
+        """Allocates all arrays on the device."""
         device, levels, budget = self.device, len(self.sizes), self.budget
         slots = levels * self.side**3
 
@@ -216,12 +220,12 @@ class Volume:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of device memory of the volume and its index, without the light; constant."""
+        """The bytes of device memory of the volume and its index, without the light; constant."""
         return sum(array.capacity for array in self._arrays)
 
     @property
     def viewpoint(self) -> np.ndarray:
-        """Viewpoint of the last update, float64 [3].
+        """The viewpoint of the last update, float64 [3].
 
         Raises:
             ValueError: There was no update.
@@ -232,11 +236,13 @@ class Volume:
 
     @property
     def base(self) -> np.ndarray:
-        """Coordinates of the first block of each window, int64 [L, 3]; block b spans [b, b + 1) times its side."""
+        """The coordinates of the first block of each level's window, int64 [L, 3]; block b spans [b, b + 1) times its
+        side."""
         return self._base + self.index.start.astype(np.int64)
 
     def update(self, viewpoint: np.ndarray) -> FrameStats:
-        """Moves the windows to a viewpoint, fills up to `budget` of the blocks that are missing, and waits for it.
+        """Moves the windows to a viewpoint, fills up to `budget` of the missing blocks, and waits until the device is
+        done.
 
         Args:
             viewpoint: [3], in the unit of the positions.
@@ -283,10 +289,10 @@ class Volume:
         frame_kernels.combine(work, self._read_light, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
-        """Reads the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
+        """Returns the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
 
         Args:
-            points: [M, 3], in the unit of the positions. Nothing covers a point that is NaN or infinite.
+            points: [M, 3], in the unit of the positions. No block covers a point that is NaN or infinite.
             normals: [M, 3], normals of the points' surfaces, of any length: the light is read half a block in front of
                 the surface. None: the light is read at the points.
 
@@ -316,17 +322,17 @@ class Volume:
             return Reading(values.numpy(), level.numpy(), weight.numpy())
 
     def state(self) -> State:
-        """Copies the arrays that a shader reads to the host."""
+        """Copies the arrays that a shader reads from the device to the host."""
         windows = self._windows
         with interop.stream(self.device):
             return State(*(part.numpy() for part in (self._pool, windows.pages, windows.bases, windows.views)))
 
     def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the windows in spatial order, as a texture for each level (the last step of section 3.4).
+        """Returns the windows' blocks in spatial order, as one texture for each level (the last step of section 3.4).
 
         Returns:
-            float32 [L, side, side, side, D], by level, x, y and z, 0 where a block is missing; and bool
-            [L, side, side, side], true where it is present. The first block of each level is that of `base`.
+            The light, float32 [L, side, side, side, D], by level, x, y and z, 0 for missing blocks; and bool [L, side,
+            side, side], true for blocks that are present. The first block of each level is that of `base`.
         """
         state, side = self.state(), self.side
         pages = state.pages.reshape(-1, side, side, side)
@@ -337,7 +343,7 @@ class Volume:
 
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Normalises vectors to float32; vectors of length 0 stay 0.
+    """Normalises vectors and returns them in float32; vectors of length 0 stay 0.
 
     Raises:
         ValueError: The shape is different, or a number is not finite.
@@ -352,7 +358,7 @@ def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:
-    """Checks the ranges of settings."""
+    """Checks that the settings are in their ranges."""
     if block is not None and not _SMALLEST <= block <= 1.0 / _SMALLEST:
         raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
     rising = list(ratios[:1]) == [1] and all(a < b for a, b in itertools.pairwise(ratios))

@@ -1,12 +1,12 @@
-"""An index of probes for a device: sorted cells, and the blocks near a probe.
+"""An index of probes for a device: the probes sorted by cell, and the blocks near a probe.
 
 Positions are put on a grid of cubic cells and sorted by the Morton key of their cell, so that every cell of the octree
 above the grid is one range of the list, and two binary searches find it (the octree of gaussian-probe-compression,
-section 3.4). A cell is half a side of the finest block. A block of a coarser level is wider by a power of two, so that
-its halves are cells of the octree themselves.
+section 3.4). A cell is half a side of the finest block. A block of a coarser level is larger by a power of two, so that
+its octants are cells of the octree.
 
-A point reads the eight blocks whose centres surround it. Only blocks that have a tenth of the weight at some probe take
-memory, and the index lists them for each level.
+A point reads the eight blocks whose centres surround it. Only blocks with at least a tenth of the weight at one of the
+probes take memory; the index lists these for each level.
 """
 
 import math
@@ -29,13 +29,13 @@ _SHRINKS = 8
 class BlockIndex:
     """The probes sorted by cell, and the blocks of each level that are read at a probe.
 
-    Block b of a level spans [b, b + 1) times its side, in the positions' own frame. Blocks are numbered from `start`,
+    Block b of a level spans [b, b + 1) times its side, in the unit of the positions. Blocks are numbered from `start`,
     and cells from `2 * start` of the finest level.
 
     Attributes:
-        count: N.
+        count: Number of probes, N.
         sizes: Side of a block at each level, rising.
-        ratios: Each level's side over the finest, powers of two.
+        ratios: Side of each level divided by the finest side, powers of two.
         start: float64 [L, 3], coordinates of the first block of each level, whole numbers.
         key: int64 [N], Morton keys of the cells, rising.
         number: int32 [N], index of each probe in the input.
@@ -52,7 +52,7 @@ class BlockIndex:
             position: [N, 3], in any unit; N may be 0.
             side: Side of a block of the finest level. It is doubled until the keys hold all cells and float64
                 separates neighbouring cells.
-            ratios: Sides of the levels over the finest, rising powers of two from 1.
+            ratios: Side of each level divided by the finest side: rising powers of two from 1.
 
         Raises:
             ValueError: The shape is different, a position is NaN or above 1e100, or the side is not a positive
@@ -96,17 +96,18 @@ class BlockIndex:
 
 
 def finest_side(position: np.ndarray) -> float:
-    """Returns a side for the finest blocks: 1.25 times the median distance to the nearest neighbour, or less.
+    """Returns a side for the finest blocks: at most 1.25 times the median distance of probes to their nearest
+    neighbours.
 
     The light is linear between blocks, so that reproducing the probes takes more blocks than probes. Probes scattered
-    over surfaces have at least two blocks each at this side. Probes on a lattice have fewer; there the side shrinks by
-    a fifth at a time until they have two.
+    over surfaces have at least two blocks each at this side. Probes on a lattice have fewer; for them the side is
+    reduced in steps of a fifth until there are two blocks per probe.
 
     Args:
         position: [N, 3].
 
     Returns:
-        The side, in the unit of the positions; 1 where there are fewer than two distinct positions.
+        The side, in the unit of the positions; 1 if there are fewer than two distinct positions.
 
     Raises:
         WlmError: The positions are so far apart, or so close, that float64 does not hold their distances.
@@ -127,7 +128,7 @@ def finest_side(position: np.ndarray) -> float:
 
 
 def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> np.ndarray:
-    """Returns the keys of a level's blocks that are read at a probe with at least the smallest weight."""
+    """Returns the Morton keys of a level's blocks that have at least the smallest weight at a probe."""
     # Distances in sides from the centre of block 0, as integer and fraction; the index of a cell is exact.
     half = cell // ratio - 1
     whole = half >> 1

@@ -1,4 +1,4 @@
-"""Sources of light for a volume: an array, or a model that is decoded on demand."""
+"""Sources of probes' light for a volume: an array, or a model that is decoded on demand."""
 
 from typing import Protocol
 
@@ -11,12 +11,12 @@ from wlm_kernels.probe import volume_frame as kernels
 
 
 class Light(Protocol):
-    """The light of N probes.
+    """A source of the light of N probes.
 
     Attributes:
         device: "cpu" or "cuda:N".
-        count: N.
-        channels: D.
+        count: Number of probes, N.
+        channels: Numbers per probe, D.
     """
 
     device: str
@@ -24,9 +24,9 @@ class Light(Protocol):
     channels: int
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
-        """Reads probes; on CUDA the work is queued, not awaited.
+        """Writes the light of some probes; on CUDA the work is queued, not awaited.
 
-        The first reading of M probes may allocate memory, so that a CUDA graph may only capture a later one.
+        The first call for M probes may allocate memory, so only later calls can be captured in a CUDA graph.
 
         Args:
             numbers: int [M], indices of probes.

@@ -1,4 +1,4 @@
-"""The GLSL that reads a volume from the buffers of `wlm.probe.volume.bundle`."""
+"""Generates the GLSL that reads a volume from the buffers of `wlm.probe.volume.bundle`."""
 
 from wlm.probe.glsl import buffer_glsl
 from wlm.probe.sphere import sh_count
@@ -121,13 +121,14 @@ _BUFFERS = (("HEAD", "uint"), ("PAGE", "int"), ("POOL", "float"))
 
 
 def volume_glsl(outputs: int) -> str:
-    """Returns the shader that reads a volume: functions to be included below `#version`.
+    """Returns the GLSL that reads a volume: functions to be included below `#version`.
 
     Args:
-        outputs: D; for spherical harmonics of L0 to L2 in RGB there is also a function for a diffuse surface.
+        outputs: Numbers per probe, D; for spherical harmonics of L0 to L2 in RGB there is also a function for a diffuse
+            surface.
 
     Returns:
-        GLSL 4.30, which Vulkan's dialect takes too.
+        GLSL 4.30, which is also valid Vulkan GLSL.
     """
     buffers = [buffer_glsl("volume", name, number, kind) for number, (name, kind) in enumerate(_BUFFERS)]
     text = _TEMPLATE.format(head=_HEAD_WORDS, level_words=_LEVEL_WORDS, buffers="".join(buffers), outputs=outputs)

@@ -1,4 +1,4 @@
-"""Walking through a scene with a cascaded lighting volume: cost, coverage and error of its frames."""
+"""Walks through a scene with a cascaded lighting volume, and measures the cost, coverage and error of its frames."""
 
 import math
 from collections.abc import Sequence
@@ -30,17 +30,17 @@ def walk(
     samples: int = _SAMPLES,
     progress: OnProgress | None = None,
 ) -> dict[str, object]:
-    """Moves a volume along a path, one update per frame, and reads it at probes.
+    """Moves a volume along a path, one update per frame, and compares its light at probes with the original.
 
-    The samples are drawn at random from the live probes, which are on surfaces in most sets, as a renderer's points
-    are. They have the probes' normals if the volume has them. A probe is near if the finest window around the viewer
-    contains it.
+    The light is read at random live probes, the samples, since probes lie on surfaces in most sets, as a renderer's
+    points do. Samples have the probes' normals if the volume has normals. A probe is near if the finest window around
+    the viewer contains it.
 
     Args:
         volume: A volume in any state; the walk continues from there.
         path: [F, 3], viewpoints, in the unit of the probes' positions.
         original: [N, D], original light of all probes.
-        samples: Most probes to read per frame near the viewer, and as many farther away.
+        samples: Largest number of probes to read per frame near the viewer, and of as many farther away.
         progress: Called about twice a second, with the number of finished frames.
 
     Returns:
@@ -50,8 +50,8 @@ def walk(
         - `mean`, `p95` and `max` over the frames: of `updated`, blocks decoded; `probes`, probes decoded; `left`,
           blocks that still wait; and `update_ms`, the duration of a frame.
         - The same over the frames that have near samples, None without any: of `rmse`, RMS difference between the
-          reading and the light that fills the volume, where a point that nothing covers counts as 0; and `rms`, RMS of
-          that light. `mean` and `min` of `coverage`, share of the near samples that some level answers.
+          reading and the light that fills the volume, where a point that no block covers counts as 0; and `rms`, RMS of
+          that light. `mean` and `min` of `coverage`, the fraction of near samples that blocks of any level cover.
         - In dB over all frames' samples, None without any; the peak is the range of the original: `psnr` of the near
           readings against the original, `light_psnr` of the light that fills the volume at the same samples, and
           `far_psnr` of the readings farther away.
@@ -100,7 +100,7 @@ def walk(
 
 
 def settle(volume: Volume, viewpoint: np.ndarray) -> int:
-    """Updates a volume at one viewpoint until no block waits, or waiting blocks find no free row.
+    """Updates a volume at one viewpoint until no block waits, or no memory is free for the waiting blocks.
 
     Args:
         volume: A volume in any state.
@@ -122,17 +122,17 @@ def settle(volume: Volume, viewpoint: np.ndarray) -> int:
 def score_volume(
     probes: ProbeSet, light: Light, *, frames: int | None = None, progress: OnProgress | None = None
 ) -> dict[str, object]:
-    """Walks around a scene with a volume that starts empty, and scores the readings against the original probes.
+    """Walks around a scene with a volume that starts empty, and compares its light with the original probes.
 
     Args:
         probes: The original probes.
-        light: Light of all of them, original or decoded.
-        frames: Frames of the loop; None: each frame moves the viewer by a tenth of a block.
+        light: Light of all probes, original or decoded.
+        frames: Number of frames of the loop; None: each frame moves the viewer by a tenth of a block.
         progress: As for `walk`.
 
     Returns:
         The result of `walk`, with `block`, the side of the finest blocks; `first_ms`, the duration of the first frame;
-        `first_frames`, the frames until no block waits; and `memory_bytes`.
+        `first_frames`, the number of frames until no block waits; and `memory_bytes`.
     """
     volume = Volume(probes.position, light, live=probes.live, normal=probes.normal)
     lit = probes.position[probes.live]
@@ -166,7 +166,8 @@ def _statistics(values: Sequence[float]) -> dict[str, float] | None:
 
 
 def loop_frames(position: np.ndarray, step: float) -> int:
-    """Returns the number of frames in which `camera_path` closes with a step in the unit of positions, y up."""
+    """Returns the number of frames in which the loop of `camera_path`, y up, closes with a step in the unit of
+    positions."""
     # Ramanujan's circumference of an ellipse, within 0.1% up to an aspect ratio of 3.
     a, b = _LOOP * np.ptp(np.asarray(position, np.float64), axis=0)[[0, 2]]
     around = math.pi * (3 * (a + b) - math.sqrt((3 * a + b) * (a + 3 * b)))
@@ -181,7 +182,7 @@ def camera_path(position: np.ndarray, frames: int, *, up: int = 1) -> np.ndarray
 
     Args:
         position: [N, 3], of the live probes.
-        frames: F.
+        frames: Number of frames, F.
         up: Index of the axis that points up, 0 to 2.
 
     Returns:

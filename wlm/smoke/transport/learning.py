@@ -94,7 +94,7 @@ def _seen(
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """One light of a view: inputs of the prediction, and path-traced light at each of `ALBEDOS`, [A, H, W]."""
+    """One light of a view: inputs of the prediction, and path-traced light at each of the A `ALBEDOS`, [A, H, W]."""
 
     inputs: Inputs
     light: torch.Tensor
