@@ -166,9 +166,6 @@ def test_settings_out_of_range_are_one_line(name, settings, words, path):
     refused(kept, path, words)
 
 
-# Files that were once accepted, or took the machine.
-
-
 def test_tables_in_place_of_lists(path):
     kept = written(path, "lightmap")
     rewrite(path, tensors={"times": lambda v: v.reshape(2, 2)})

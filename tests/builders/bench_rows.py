@@ -42,11 +42,7 @@ def check_outputs(rows, folder: Path, panels, plotted=None) -> None:
 
 
 def check_command(monkeypatch, rows, words: list, folder: Path) -> tuple[str, dict]:
-    """Runs `python -m benchmarks` with a `run` that gives these rows; checks what it writes and prints.
-
-    Returns:
-        The command line in the result file, and the arguments that `run` was called with.
-    """
+    """Runs `python -m benchmarks` with a `run` that gives these rows; checks what it writes and prints."""
     calls = []
 
     def run(**options):

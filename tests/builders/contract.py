@@ -18,17 +18,7 @@ FILES = Path(__file__).resolve().parents[1] / "files"
 
 @dataclass(frozen=True)
 class Subject:
-    """A system under the tests of the contract.
-
-    Attributes:
-        name: Name of its package.
-        kind: Name of its stored file.
-        decode: Turns a loaded model into arrays, by the names in `stored`.
-        data: Makes a small input; None where nothing is fitted.
-        profile: The profile of the fit, or its name.
-        scores: Keywords of `evaluate`.
-        options: Keywords of `compress`.
-    """
+    """A system under the tests of the contract."""
 
     name: str
     kind: str

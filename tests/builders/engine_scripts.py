@@ -12,13 +12,7 @@ from wlm.formats.exr import read_exr
 
 
 class Script:
-    """A script of a folder, run with a stand-in that imports pictures of their size.
-
-    Attributes:
-        names: What the script defines.
-        settings: Of the textures, by file.
-        slots: Materials that were put on meshes.
-    """
+    """A script of a folder, run with a stand-in that imports pictures of their size."""
 
     def __init__(self, path, monkeypatch, actors=()):
         self.nodes, self.links, self.settings, self.slots = [], [], {}, []
@@ -93,17 +87,7 @@ def pixels_of(file):
 
 
 def node_gives(code, inputs, size, place, bound, folder, numbers=None, channels=3):
-    """Computes the output of a Custom node, float32 [*size, channels].
-
-    Args:
-        code, inputs: Of `Script.customs`.
-        size: Height and width.
-        place: The UVs, HLSL of the `pixel`.
-        bound: Textures by name; `points` is for the place alone.
-        folder: For what the compiler reads and writes.
-        numbers: The other inputs by name, declarations in HLSL.
-        channels: 3 or 4.
-    """
+    """Computes the output of a Custom node, float32 [*size, channels]."""
     numbers = numbers or {}
     structure, _, body = code.partition("WlmNode wlm;")
     textures = [name for name in inputs if name in bound]

@@ -34,15 +34,7 @@ from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
 @dataclass(frozen=True)
 class Kept:
-    """A file.
-
-    Attributes:
-        content: Its bytes.
-        read: Reads a file of that kind; raises WlmError where it is wrong.
-        free: What parts may be, by name: "missing", "nan", or of another "size" along their first axis, "sizes" along
-            two.
-        ranges: A number out of range for parts that have one: the place and the value.
-    """
+    """A file, how it is read, and which missing, resized or out-of-range parts its reader accepts or refuses."""
 
     content: bytes
     read: Callable[[Path], Any]

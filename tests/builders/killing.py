@@ -21,16 +21,7 @@ LONGEST = 600.0  # seconds that a process may take
 
 @dataclass(frozen=True)
 class Command:
-    """A command whose output has to outlast kills.
-
-    Attributes:
-        words: All but the output.
-        output: The output's name.
-        earlier: Writes an output of an earlier run to a path.
-        content: What an output holds, by name, without what differs from run to run.
-        state: Checks, of a path after a kill, what may be there: (path, earlier content, whole content).
-        partial: The checkpoint's path, of the output's; None: the command starts anew.
-    """
+    """A command whose output has to outlast kills."""
 
     words: tuple[Any, ...]
     output: str
@@ -42,14 +33,7 @@ class Command:
 
 @dataclass
 class Counts:
-    """Counts of the kills of one command.
-
-    Attributes:
-        kills: By the signal's name.
-        runs: Outputs that came out the same as without kills.
-        saved: Kills after a checkpoint had been written, in this process or an earlier one.
-        lost: Largest number of seconds of work since the last checkpoint when SIGKILL came.
-    """
+    """Counts of the kills of one command."""
 
     kills: dict[str, int] = field(default_factory=lambda: {"SIGKILL": 0, "SIGTERM": 0})
     runs: int = 0
@@ -58,15 +42,7 @@ class Counts:
 
 
 def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tuple[int, ...] = ()) -> Counts:
-    """Runs a command, kills it, runs it again until it ends, and all that until it was killed often enough.
-
-    Args:
-        command: The command.
-        folder: An empty folder.
-        kills: How many.
-        seed: Of the moments and signals.
-        numbers: The signals, in turn; empty: at random.
-    """
+    """Runs a command, kills it, runs it again until it ends, and all that until it was killed often enough."""
     chance, counts = random.Random(seed), Counts()
     (folder / "whole").mkdir()
     whole = folder / "whole" / command.output
@@ -111,12 +87,7 @@ def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tup
 
 
 class _Run:
-    """A process that runs a command.
-
-    Attributes:
-        start: When it was started.
-        number: The signal it was sent, or 0.
-    """
+    """A process that runs a command."""
 
     def __init__(self, command: Command, output: Path, resume: bool) -> None:
         self.command, self.output = command, output

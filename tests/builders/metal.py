@@ -108,15 +108,7 @@ template <class T> const T* load_buffer(const char* path)
 
 
 def run_metal(text, expression, size, bound, folder):
-    """Computes one picture, float32 [height, width, 4].
-
-    Args:
-        text: The structure, with its textures and buffers.
-        expression: A `float4` of a method; `pixel` is the place in the picture, `shader` the structure.
-        size: Height and width.
-        bound: Textures and buffers by name, as of `run_wgsl`.
-        folder: Where it is compiled.
-    """
+    """Computes one picture, float32 [height, width, 4]."""
     if shutil.which("g++") is None:
         pytest.skip("no C++ compiler: install g++")
     name = re.search(r"^struct (\w+)", text, re.MULTILINE)[1]

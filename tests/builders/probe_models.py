@@ -14,10 +14,7 @@ ORIGIN, EXTENT, SIZE = np.array([-3.0, 1.0, 20.0]), 8.0, np.array([1.0, 0.375, 0
 def random_model(
     count=40, probes=200, outputs=27, dead=3, positions=False, seed=0, origin=ORIGIN, turn=1.0, bits=10, **settings
 ) -> ProbeModel:
-    """Makes a model of a box of 8 x 3 x 6, as a fit is before it is quantised for its file.
-
-    `settings` are those of the profile; with `turn=0` all quaternions are zero.
-    """
+    """Makes a model of a box of 8 x 3 x 6, as a fit is before it is quantised for its file."""
     rng = np.random.default_rng(seed)
     profile = Profile(name="random", method="gaussians", **{"hidden": 16} | settings)
     latent, hidden = profile.latent, profile.hidden

@@ -30,17 +30,7 @@ def surface_points(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def synthetic(count: int, seed: int = 0, coefficients: int = 9, dead: int = 0) -> ProbeSet:
-    """Makes a set with soft light from a window, a lamp with hard shadows behind the blocks, and coloured walls.
-
-    Args:
-        count: N, probes.
-        seed: Of their places.
-        coefficients: C, 1, 4, 9, 16 ...
-        dead: How many of them, spread over the set, are all zero.
-
-    Returns:
-        A checked set of N probes of 3 C numbers, the same for the same arguments.
-    """
+    """Makes a set with soft light from a window, a lamp with hard shadows behind the blocks, and coloured walls."""
     rng = np.random.default_rng(seed)
     position = surface_points(count, rng)
 

@@ -35,13 +35,7 @@ def rewrite(
     settings: Mapping[str, Any] | None = None,
     tensors: Mapping[str, np.ndarray | Callable[[np.ndarray], np.ndarray] | object] | None = None,
 ) -> None:
-    """Replaces settings and parts of a file by the real writer.
-
-    Args:
-        path: The file, written over.
-        settings: Values by name, or `GONE`.
-        tensors: Arrays by name, functions of those that are there, or `GONE`.
-    """
+    """Replaces settings and parts of a file by the real writer."""
     artifact = read_artifact(path)
     contents = []
     for values, changes in ((artifact.settings, settings or {}), (artifact.tensors, tensors or {})):

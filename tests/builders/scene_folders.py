@@ -23,10 +23,7 @@ _SQUARES = {
 
 
 def scene_folder(folder, uv_set=1, states=STATES, **settings):
-    """Writes the scene, compresses it, saves the model as `made.wlm` and returns it.
-
-    Where states share tiles, as they do in few bits, the model's first page is black and nothing reads it.
-    """
+    """Writes the scene, compresses it, saves the model as `made.wlm` and returns it."""
     folder.mkdir()
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
     things = []

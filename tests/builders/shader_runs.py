@@ -50,17 +50,7 @@ def gl():
 
 
 def run_glsl(text, main, size, textures, language="glsl", uniforms=None, version=330):
-    """Draws one picture, float32 [height, width, 4].
-
-    Args:
-        text: The functions.
-        main: What is below them, which writes `light`; `ivec2 pixel` is the place in the picture.
-        size: Height and width.
-        textures: By name: [h, w, c], uint8 for levels from 0 to 1, other integers as they are; [n, h, w, c]: an array.
-        language: A key of `HEADS`.
-        uniforms: By name.
-        version: Of "glsl".
-    """
+    """Draws one picture, float32 [height, width, 4]."""
     # That of wgpu may be the thread's own by now.
     with gl() as context:
         head = HEADS[language].replace("330", str(version))
@@ -132,14 +122,7 @@ _WGPU_FORMS = {
 
 
 def run_wgsl(text, expression, size, bound):
-    """Computes one picture, float32 [height, width, 4], with WGSL.
-
-    Args:
-        text: The functions, with their bindings.
-        expression: WGSL of a `vec4f`; `pixel` is the place in the picture.
-        size: Height and width.
-        bound: Textures as of `run_glsl`, and 1D arrays of buffers and uniforms, by name.
-    """
+    """Computes one picture, float32 [height, width, 4], with WGSL."""
     code = f"""{text}
 @group(1) @binding(0) var<storage, read_write> wlm_out: array<vec4f>;
 @compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)

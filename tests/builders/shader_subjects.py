@@ -7,19 +7,7 @@ import numpy as np
 
 @dataclass
 class Subject:
-    """A shader, and what it should show.
-
-    Attributes:
-        text: The functions, in GLSL.
-        main: `vec4 shown(ivec2 pixel)`, which calls them.
-        expected: [rows, columns, 1 to 4].
-        bound: Textures and buffers by name.
-        exact: The macro that fetches rather than filters; "": there is none.
-        tolerance: Of what is fetched; None of the other: it is what the filters allow.
-        filtered: Tolerance where the sampler filters; llvmpipe's has 8 bits of a place between two texels.
-        as_textures: In GLSL, macros that read buffers from textures.
-        version: Of GLSL.
-    """
+    """A shader, and what it should show."""
 
     text: str
     main: str

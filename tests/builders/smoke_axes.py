@@ -10,11 +10,7 @@ _LEAST_SHIFT = 1e-3  # share of the image between the centres of brightness of o
 
 
 def axis_faults(lightmaps: np.ndarray) -> tuple[str, ...]:
-    """Checks that each of the lightmaps [..., 6, H, W] is bright on the side of its name, and returns the faults.
-
-    The centre of "right" must be to the right of that of "left", "top" above "bottom", and "front" brighter than
-    "back". Exchanged opposites are always found; "right" exchanged with "top" may not be.
-    """
+    """Checks that each of the lightmaps [..., 6, H, W] is bright on the side of its name, and returns the faults."""
     lightmaps = np.asarray(lightmaps, np.float64)
     height, width = lightmaps.shape[-2:]
     sums = lightmaps.reshape(-1, 6, height, width).sum(0)

@@ -20,10 +20,7 @@ def random_model(*args, **options) -> LightmapModel:
 def random_sheet(
     kinds=(3, 2, 1, 0), columns=2, times=(0.0, 7.5, 13.0, 19.0), period=24.0, seed=0, mask=None, **settings
 ) -> SheetModel:
-    """Makes a sheet with tiles of these kinds, `columns` in a row; without a `mask` it has no gaps.
-
-    `settings` are the profile's.
-    """
+    """Makes a sheet with tiles of these kinds, `columns` in a row; without a `mask` it has no gaps."""
     rng = np.random.default_rng(seed)
     profile = Profile(name="random", **{"hidden": 8, "uvt_resolution": 8, "uvt_slices": 3} | settings)
     kind = np.array(kinds, np.uint8)

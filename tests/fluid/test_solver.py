@@ -51,9 +51,6 @@ def _assert_same(first: Solver, second: Solver) -> None:
         np.testing.assert_array_equal(getattr(first, name).numpy(), getattr(second, name).numpy())
 
 
-# Smoke in air.
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_jet_carries_smoke_past_a_sphere(scheme: str, device: str):
     """It comes as far as the air does, none lies in the sphere, and no value exceeds the nozzle's."""
@@ -123,9 +120,6 @@ def test_hot_smoke_rises_and_heavy_smoke_falls(bricks: bool, device: str):
     assert heights[0] > 6.3 and heights[1] < 5.7
 
 
-# Obstacles.
-
-
 def test_an_obstacle_too_fast(device: str):
     fast = Sphere(Trajectory.of([[9, 5, 5], [19, 5, 5]], [10, 20]), 2.0)
     solver = _jet(device, obstacles=[fast])
@@ -162,9 +156,6 @@ def test_paths():
     ):
         with pytest.raises(ValueError, match="expected"):
             wrong()
-
-
-# Checkpoints.
 
 
 @pytest.mark.parametrize(
@@ -272,9 +263,6 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):
     again.step(1)
     with pytest.raises(WlmError, match="blew up"):
         solver.step(1)
-
-
-# Hard cases.
 
 
 def test_no_smoke(device: str):

@@ -79,9 +79,6 @@ def write(path: Path, content: object) -> Path:
     return path
 
 
-# What is no file.
-
-
 @pytest.mark.parametrize(
     ("read", "suffix"),
     [
@@ -217,9 +214,6 @@ def test_scenes(tmp_path, changes, expected):
     assert expected in refused(load_scene, write(tmp_path / "a.yaml", text))
 
 
-# glTF.
-
-
 def tree(**changes: object) -> dict:
     """Makes a triangle with UVs in a data URI, with changes to the lists of the document."""
     uri = "data:;base64," + base64.b64encode(TRIANGLE).decode()
@@ -328,9 +322,6 @@ def test_images_outside_the_folder_and_what_is_no_image_are_not_copied(tmp_path,
     # Half characters come back as they were.
     again = read_gltf(tmp_path / "out.glb")[0].content
     assert again["extras"] == "\udfff" and again["images"][3] == {"uri": "\ud800.png"}
-
-
-# Lightmap sets, pictures and masks.
 
 
 def lightmap_set(folder: Path, entries: list | None = None, **changes: object) -> Path:
@@ -451,9 +442,6 @@ def test_alpha_that_is_no_number_is_told_and_not_valid(tmp_path):
     assert loaded.warnings == ("a.exr: 3 texels with an alpha NaN or infinite: not valid",)
 
 
-# Terminals.
-
-
 def test_what_a_terminal_obeys_is_escaped(capsys):
     text = "\x1b]0;title\x07\x1b[2J \x9b31m \x7f \u202egnp.exe \u2066 \ud800 é 漢"
     shown = "\\x1b]0;title\\x07\\x1b[2J \\x9b31m \\x7f \\u202egnp.exe \\u2066 \\ud800 é 漢"
@@ -465,9 +453,6 @@ def test_what_a_terminal_obeys_is_escaped(capsys):
     note(text)
     out, err = capsys.readouterr()
     assert out.count(shown) == 3 and out.endswith("\nsecond\n") and err == f"{shown}\n"
-
-
-# Folders that others can write to.
 
 
 def test_a_link_planted_in_an_export_is_replaced_and_not_followed(tmp_path):
@@ -483,9 +468,6 @@ def test_a_link_planted_in_an_export_is_replaced_and_not_followed(tmp_path):
     with staged(folder, "index.json", "test") as temporary:
         write_index(temporary / "index.json", {"format": "test"})
     assert sorted(path.name for path in folder.iterdir()) == ["index.json"] and victim.read_bytes() == b"precious"
-
-
-# NanoVDB; other volumes and probes are in `test_npz`.
 
 
 def test_a_grid_whose_box_is_far_larger_than_what_it_stores(tmp_path):

@@ -21,17 +21,8 @@ RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
 FORMAT, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, PAIRS_BYTES = 12, 20, 24, 28, 32, 36, 44, 48, 60
 LEVEL, LEVEL_BYTES, LEVEL_SIZE = 80, 88, 96
-DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2, DXGI, DIMENSION, MISC, ARRAY = (
-    4,
-    12,
-    80,
-    84,
-    112,
-    128,
-    132,
-    136,
-    140,
-)
+DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
+DXGI, DIMENSION, MISC, ARRAY = 128, 132, 136, 140
 
 
 def _read(path, content):

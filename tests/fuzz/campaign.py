@@ -50,11 +50,7 @@ class Worker:
             self._folder = None
 
     def run(self, reader: str, first: int, count: int) -> Iterator[Outcome]:
-        """Runs the cases `first` to `first + count - 1` of a reader.
-
-        Raises:
-            RuntimeError: The reader does not accept its own good files.
-        """
+        """Runs the cases `first` to `first + count - 1` of a reader."""
         end = first + count
         while first < end:
             for outcome in self._job({"reader": reader, "first": first, "count": end - first}, first, end):
@@ -130,12 +126,7 @@ class Worker:
 
 @dataclass
 class Tally:
-    """The outcomes of a reader's cases.
-
-    Attributes:
-        counts: By outcome.
-        failures: The first few of each kind and place.
-    """
+    """The outcomes of a reader's cases."""
 
     counts: Counter[str] = field(default_factory=Counter)
     failures: list[Outcome] = field(default_factory=list)
@@ -170,17 +161,7 @@ def campaign(
     limits: Limits | None = None,
     done: Callable[[str, Tally], None] | None = None,
 ) -> dict[str, Tally]:
-    """Runs cases of several readers.
-
-    Args:
-        counts: Cases by reader.
-        workers: Processes.
-        limits: Of a case.
-        done: Called with each reader whose cases are all run.
-
-    Returns:
-        What came of them, by reader.
-    """
+    """Runs cases of several readers."""
     own, all_workers, numbers = local(), [], count()
 
     def job(reader: str, begin: int, size: int) -> Sequence[Outcome]:

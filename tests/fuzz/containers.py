@@ -106,9 +106,6 @@ def _pack_artifact(words: str, settings: Any, parts: dict[str, np.ndarray]) -> b
     return _sign(header, body)
 
 
-# Compact artifacts.
-
-
 def vary_compact(draw: Random, data: bytes) -> bytes:
     """Changes a probe file's bytes, header or unpacked parts, and packs and signs them again."""
     body, draws = data[8:], draw.random()
@@ -212,9 +209,6 @@ def _zip_fields(data: bytes) -> list[tuple[int, int]]:
     return places
 
 
-# glTF.
-
-
 def vary_gltf(draw: Random, data: bytes) -> bytes:
     """Changes the JSON of a `.gltf`, or what a buffer inside it holds."""
     content = json.loads(data)
@@ -248,13 +242,7 @@ _KINDS = ("box2i", "chlist", "compression", "float", "int", "lineOrder", "string
 
 
 def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
-    """Changes attributes of an EXR's header; their lengths and the offsets of the pixels fit.
-
-    Args:
-        draw: The source of all choices.
-        data: A file of one part.
-        note: Name of an attribute of JSON, which is what is changed most often.
-    """
+    """Changes attributes of an EXR's header; their lengths and the offsets of the pixels fit."""
     attributes, at = [], 8
     while data[at]:
         name, kind, rest = data[at:].split(b"\0", 2)
@@ -289,9 +277,6 @@ def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
     for place in range(0, struct.unpack_from("<Q", data, table)[0] - table, 8):
         struct.pack_into("<Q", body, place, struct.unpack_from("<Q", body, place)[0] + moved)
     return data[:8] + header + b"\0" + bytes(body)
-
-
-# PNG.
 
 
 def vary_png(draw: Random, data: bytes) -> bytes:

@@ -10,14 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a case.
-
-    Attributes:
-        seconds: Of the processor; the process is killed by SIGPROF when they are over. Other programs don't shorten
-            them, as they would seconds of the clock.
-        wait: Seconds of the clock, for a case that waits without computing; held by whoever started the process.
-        memory: Bytes of address space on top of what the process has; beyond them allocation fails.
-    """
+    """The limits of a case."""
 
     seconds: float = 5.0
     wait: float = 60.0

@@ -105,9 +105,6 @@ def _velocity(path: Path) -> None:
     assert velocity.ndim == 4 and velocity.shape[3] == 3, f"accepted {velocity.shape}"
 
 
-# Checkpoints: a fit goes on from each, to its end.
-
-
 def _bytes_of(make: Any) -> bytes:
     """The content of the file `x.partial` that `make` writes for the output `x` in an empty folder."""
     with tempfile.TemporaryDirectory() as folder:

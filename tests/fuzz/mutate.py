@@ -66,13 +66,7 @@ def _number(draw: Random, width: int, old: bytes) -> bytes:
 
 
 def corrupt(draw: Random, data: bytes, others: Sequence[bytes] = ()) -> bytes:
-    """Changes bytes blindly.
-
-    Args:
-        draw: The source of all choices.
-        data: What to change.
-        others: Files of the same kind, pieces of which are spliced in.
-    """
+    """Changes bytes blindly."""
     result = bytearray(data)
     for _ in range(_some(draw)):
         size = len(result)

@@ -19,18 +19,7 @@ _FILES = Path(__file__).resolve().parents[1] / "files"
 
 @dataclass(frozen=True)
 class Reader:
-    """A function of the package that reads a file.
-
-    Attributes:
-        name: Of the reader; with a case's index it determines the case.
-        file: Name of the case's file; readers go by suffixes.
-        seeds: Makes the good files that are changed, the same at every call.
-        vary: Changes one of them, with some knowledge of the format.
-        read: Reads a file at a path as users do. An `AssertionError` says what an accepted one must not be.
-        beside: Makes the files that lie beside the case's, by name.
-        cost: Cases in `make test` are divided by this.
-        blind: Share of the cases that are changed without knowledge of the format.
-    """
+    """A function of the package that reads a file."""
 
     name: str
     file: str

@@ -56,9 +56,6 @@ def _json(draw: Random, data: bytes) -> bytes:
     return text[:at] + draw.choice((b"[", b'{"a":')) * 100_000 + text[at:]
 
 
-# Pictures and textures.
-
-
 def _exr(path: Path) -> None:
     pixels, names = read_exr(path)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
@@ -115,9 +112,6 @@ def _tga(draw: Random, data: bytes) -> bytes:
     return vary_numbers(draw, data, head)
 
 
-# Meshes.
-
-
 def _mesh(path: Path) -> None:
     document, primitives = read_gltf(path)
     again = path.with_name("again.glb")
@@ -151,9 +145,6 @@ def _beside(names: Mapping[str, str]) -> Callable[[], Mapping[str, bytes]]:
 
 
 _light = _beside({"light.exr": "light.exr", "image.png": "mask-grey.png"})
-
-
-# Probes and volumes.
 
 
 def _probes(path: Path) -> None:

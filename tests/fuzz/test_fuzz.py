@@ -34,9 +34,6 @@ def test_a_case_depends_on_its_reader_and_index_alone():
         assert cases == [READERS[name].case(index) for index in range(20)] and len(set(cases)) > 15, name
 
 
-# The faults of `faulty.py`.
-
-
 @pytest.fixture(scope="module")
 def faulty():
     with Worker(Limits(seconds=0.5, memory=1 << 30), "tests.fuzz.faulty") as worker:

@@ -34,13 +34,7 @@ _MOST_MESSAGE = 2000  # characters
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a case.
-
-    Attributes:
-        index: Of the case.
-        kind: "accepted", "refused", or one of `FAILURES`.
-        detail: The message, or the place in the code.
-    """
+    """The outcome of a case."""
 
     index: int
     kind: str
@@ -107,11 +101,7 @@ class _Bench:
         return self.root / name
 
     def prepare(self, name: str) -> None:
-        """Checks that a reader accepts its good files; imports and compiles what it needs.
-
-        Raises:
-            AssertionError: It doesn't.
-        """
+        """Checks that a reader accepts its good files; imports and compiles what it needs."""
         if name in self.ready:
             return
         reader = self.readers[name]

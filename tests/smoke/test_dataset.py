@@ -62,9 +62,6 @@ def _counts(reports) -> dict[str, float]:
     return reports[-1].figures
 
 
-# Scenes.
-
-
 def test_scenes_are_repeatable():
     first = draw_scene(SMALL, 3, 7)
     assert draw_scene(SMALL, 3, 7) == first
@@ -121,9 +118,6 @@ def test_tilted_bodies(axis: tuple):
     np.testing.assert_allclose([np.abs(along).max(), across.max()], [0.4, 0.1], atol=1e-12)
     a, b, c = (points[triangles[:, k]] for k in range(3))
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(np.pi * 0.1**2 * 0.8, rel=0.01)
-
-
-# Pools.
 
 
 def test_pools_share_no_sequence(few, validation):
@@ -258,9 +252,6 @@ def test_a_moving_obstacle():
     assert len(samples) == 2 and samples.motion.abs().max() > 0
 
 
-# Hard cases.
-
-
 def _unstable(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False):
     """Makes the first scene of each sequence unstable: no turbulence model, no viscosity, too fast."""
     scene = draw_scene(settings, seed, index, validation=validation)
@@ -334,9 +325,6 @@ def test_look():
 def test_wrong_settings(wrong: dict):
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         DatasetSettings(**wrong)
-
-
-# Volumes from elsewhere, parts of pools, and files.
 
 
 def test_pool_of_a_volume(tmp_path, device: str):

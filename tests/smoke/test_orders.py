@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.orders import input_alone
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke import make_cloud
@@ -41,6 +40,14 @@ def lessons() -> list[Lesson]:
 def diffused(inputs: Inputs, albedo: float) -> torch.Tensor:
     """Returns the input of the prediction, [H, W]: single scattering and diffusion."""
     return inputs.by_diffusion(albedo)[0]
+
+
+def input_alone() -> OrdersModel:
+    """Makes a mix that returns its input: single scattering and diffusion, the feature 18."""
+    model = load_orders()
+    weights = torch.zeros(model.weights.shape)
+    weights[:, 0, 18] = 1.0
+    return OrdersModel(weights, model.known)
 
 
 def mixed(model: OrdersModel, inputs: Inputs, albedo: float) -> torch.Tensor:

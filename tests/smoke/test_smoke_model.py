@@ -162,9 +162,6 @@ def test_settings_that_do_not_fit_are_refused(wrong):
         NetworkSettings(**wrong)
 
 
-# The file.
-
-
 def test_a_file_holds_the_network(tmp_path):
     path = tmp_path / "a.network"
     model = random_model(stem=2)
@@ -225,9 +222,6 @@ def test_weights_beyond_half_floats_are_refused(tmp_path):
     assert not path.exists()
 
 
-# The network that ships.
-
-
 def test_a_network_comes_with_the_package(monkeypatch, tmp_path):
     path = shipped()
     assert path.stat().st_size <= 10_000_000
@@ -282,9 +276,6 @@ def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
         error, before = (float((planes[low:high] - target[low:high]).square().mean()) for planes in (made, coarse))
         assert error < 1.02 * before + 1e-9
     assert float(predictor.share) < 0.3
-
-
-# ONNX.
 
 
 def test_onnx_of_no_pixels_is_refused(tmp_path):

@@ -74,9 +74,6 @@ def test_it_learns_a_small_pool_by_heart(tmp_path, device):
     assert model.dataset == profile.dataset
 
 
-# Stopping and resuming.
-
-
 @pytest.mark.parametrize("temporal", [0.0, 0.1])
 def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, temporal):
     monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
@@ -180,9 +177,6 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path):
     assert _train(path, _profile()).finished
 
 
-# What is kept, and what is refused.
-
-
 def test_curves_and_progress(tmp_path, monkeypatch):
     monkeypatch.setattr("wlm.smoke.fit._CHUNK", 3)
     reports = []
@@ -267,9 +261,6 @@ def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
         assert _train(path, _profile(steps=40), minutes=0.0, resume=True).skipped == steps
     with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0"):
         _train(path, _profile(steps=40), minutes=0.0, resume=True)
-
-
-# The order of samples, crops and mirrors.
 
 
 def test_a_plan_takes_each_sample_once_before_any_twice():
@@ -377,9 +368,6 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_smoke(kind):
     assert torch.equal(motion[0, 0], -pool.motion[1, 0].float().flip(-1))
     assert torch.equal(motion[0, 1], pool.motion[1, 1].float().flip(-1))
     assert torch.equal(guides[1], pool.guides[0].float()) and torch.equal(targets[1], pool.targets[0].float())
-
-
-# Profiles.
 
 
 def test_profiles_load():

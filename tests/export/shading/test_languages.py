@@ -74,11 +74,7 @@ def rgba(texels: np.ndarray) -> np.ndarray:
 
 
 def random_scene(short: bool, mixed: bool, apart: bool) -> AtlasModel:
-    """Two sheets, the first with two smaller levels.
-
-    On two pages with tiles of none to three components; short: one page and one component; mixed: some are in blocks;
-    apart: each state has tiles of its own, which lie elsewhere in the table.
-    """
+    """Two sheets, the first with two smaller levels."""
     random = np.random.default_rng(1)
     texels = quantise(random.random((2 * 20, 24, 3)), "rgb9e5")["texels"].reshape(2, 20, 24, 3)
     size = random.integers(1, 8, (13, 11, 2))
