@@ -340,7 +340,7 @@ def test_pool_of_a_volume(tmp_path, device: str):
     thin = pool_of_volume(tmp_path / "a.npz", FEW, device=device, extinction=1e-3)
     assert thin.targets[:, 0, OPACITY_PLANE].max() < 0.3
     np.savez(tmp_path / "none.npz", density=np.zeros((4, 4, 4)))
-    with pytest.raises(WlmError, match=r"none.npz: density: expected smoke"):
+    with pytest.raises(WlmError, match=r"none.npz: density: is zero everywhere"):
         pool_of_volume(tmp_path / "none.npz", FEW, device=device)
     with pytest.raises(WlmError, match="No such file"):
         pool_of_volume(tmp_path / "missing.npz", FEW, device=device)

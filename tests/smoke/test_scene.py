@@ -336,7 +336,7 @@ def test_files_that_are_no_lightmaps(tmp_path):
         with pytest.raises(WlmError, match=said):
             read_six_way(path)
 
-    refused({k: v for k, v in planes.items() if k != "top"}, note, "channel top: expected it")
+    refused({k: v for k, v in planes.items() if k != "top"}, note, "channel top: missing beside")
     refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
     refused(planes, None, "camera: expected that of bake")
     refused(planes, {"camera": {"extent": 1}}, "camera: expected that of bake")
