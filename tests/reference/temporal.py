@@ -91,27 +91,3 @@ def emphasised(
 def losses(answer: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Weighted mean squared error of each tile: [N, B, 3] each -> [N]."""
     return (weight * (answer - target) ** 2).mean((1, 2))
-
-
-def decode(
-    features: torch.Tensor,
-    hidden: torch.Tensor,
-    output: torch.Tensor,
-    kind: str,
-    affine: torch.Tensor,
-    scale: torch.Tensor,
-) -> torch.Tensor:
-    """Colour in gamma space, >= 0, of one tile.
-
-    Args:
-        features: [M, I] of `features_of`.
-        hidden, output: The tile's network, [I + H + 2, H] and [H + 1, 3].
-        kind: The GELU.
-        affine: Shift and spread, [2, 3].
-        scale: [3].
-
-    Returns:
-        [M, 3].
-    """
-    y = plain.mlp(centre(features), hidden, output, gelu=kind)
-    return ((affine[0] + affine[1] * y) * scale).clamp(min=0.0)
