@@ -608,9 +608,9 @@ def trace(
         settings: Settings of the paths.
         first: Index of the first part to trace.
         parts: Number of parts in total.
-        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], light in R, G, B, added to: for each of the P parts to trace,
-            for each of the L lights, the sky and the emission, first the light of orders 0 to `settings.kept`, then the
-            light of all higher orders. The sum over all parts is the mean over all samples.
+        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], light in R, G, B, added to: for each of the P parts to
+            trace, for each of the L lights, the sky and the emission, the light of each order from 0 to `settings.kept`
+            and the light of all higher orders. The sum over all parts is the mean over all samples.
     """
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.
