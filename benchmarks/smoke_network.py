@@ -219,7 +219,7 @@ class NetworkBench(Bench):
         return make_camera(view, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
-        """Computes the reference image planes [8, H, W] by the finest ray march, for a camera; None: the bench's camera."""
+        """Computes the reference image planes [8, H, W] by the finest ray march; by default from `self.camera`."""
         return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:

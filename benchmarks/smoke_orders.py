@@ -164,7 +164,7 @@ class Shot:
         camera: Orthographic camera.
         lights: Directional lights with their irradiance.
         seed: Seed of the random paths.
-        motion: Motion from the previous shot to this one, float32 tensor [2, H, W]; None if the previous one is not the frame before.
+        motion: Motion of the smoke since the previous shot in pixels, float32 [2, H, W]; None: that shows other smoke.
     """
 
     volume: DensityVolume

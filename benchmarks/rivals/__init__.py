@@ -2,7 +2,7 @@
 
 Each module has the methods by name in `RIVALS`. A method compresses an input and returns a `Rival`, whose error
 `evaluate_rivals` then measures as for our own methods. The rivals of smoke have no file: `wlm.smoke.evaluation.compare`
-takes each of them beside a network. The package `wlm` itself imports no rival.
+compares them with a network. The package `wlm` itself imports no rival.
 """
 
 from benchmarks.rivals.rival import Rival
