@@ -112,8 +112,6 @@ def run_rows(
 
 
 class _SceneBench(Bench):
-    """The benchmark of one scene, with the views in which errors are measured."""
-
     def __init__(
         self, title: str, scene: LightmappedScene, device: str, views: tuple[int, int], progress: Note | None
     ) -> None:

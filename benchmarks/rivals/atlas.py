@@ -128,7 +128,7 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
         else:
             high = middle - 1
     if low == 0:
-        raise ValueError(f"share: {share} of the bits of {sheet.mask.shape} texels is less than the {bits} bits of a block")
+        raise ValueError(f"share: {share} of {sheet.mask.shape} texels' bits is less than a block of {bits} bits")
     return size(low), _read_blocks(sheet, size(low), block)
 
 

@@ -76,7 +76,7 @@ class TileRanges:
 
     @classmethod
     def of(cls, codes: np.ndarray, seen: np.ndarray, by_channel: bool = True) -> "TileRanges":
-        """Computes each tile's ranges over the texels that renderers read; minimum and maximum are 0 where none is read.
+        """Computes each tile's ranges over texels that renderers read; minimum and maximum are 0 where none is read.
 
         Args:
             codes: Finite gamma-encoded values, float32 [..., H, W, 3].

@@ -188,7 +188,8 @@ class PlainFit:
         return result
 
     def _maps(self, quantised: bool) -> list[torch.Tensor]:
-        """Returns the texels of N tiles' maps, in the order F_uv, F_uvt, F_ut, F_vt, without maps that do not exist."""
+        """Returns the texels of N tiles' maps: F_uv [N, maps, 128, 128, 4], F_uvt [N, slices, side, side, 4], and F_ut
+        and F_vt [N, channels, rows, columns]. Maps that a tile lacks are left out."""
 
         def levels(values):
             used = values.clamp(0.0, 1.0)

@@ -1,15 +1,14 @@
 """Rivals of a compressed probe set: the PCA family, a moving basis, and the 8-bit packing of an engine.
 
-Each function takes N probes, their positions [N, 3] and D values of each, [N, D] in any unit. It returns a `Rival` whose
-`decoded` is float32 [N, D], decoded from `bytes` bytes (gaussian-probe-compression, sections 2.2 and 5.1). Positions
-cost nothing, as in the paper, because an engine has them anyway. The paper's rivals store weights as half floats, but
-weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so `at_bytes` tries
-them too.
+Each function takes N probes, their positions [N, 3] and D values of each, [N, D] in any unit. It returns a `Rival` with
+the values decoded from `bytes` bytes, float32 [N, D] (gaussian-probe-compression, sections 2.2 and 5.1). Positions cost
+nothing, as in the paper, because an engine has them anyway. The paper's rivals store weights as half floats; weights of
+4 or 5 bits leave room for more components and gain several decibels at the same size, so `at_bytes` tries them too.
 
-The functions share two settings: `components`, the number of basis vectors of a part of the set, 1 to D; and `bits`, the
-bits of a weight, 1 to 16, over the range of each part and component, or None for half floats. Means and bases are half
-floats always. All raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a `ValueError` for
-wrong shapes or a setting out of range.
+The functions share two settings: `components`, the number of basis vectors of a part of the set, 1 to D; and `bits`,
+the bits of a weight, 1 to 16, over the range of each part and component, or None for half floats. Means and bases are
+always half floats. All functions raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a
+`ValueError` for wrong shapes or a setting out of range.
 """
 
 import bisect

@@ -3,9 +3,9 @@
     y_n ~ m(x_n) + sum_j w_nj b_j(x_n)
 
 Probe y_n at position x_n has K weights w_nj. The mean m and the K basis vectors b_j are interpolated trilinearly from
-the corners of a coarse grid. One mean and basis for all probes would be global PCA, and one for each cell PCA by blocks,
-whose seams the interpolation removes. Weights belong to probes and not to a second grid, so probes can be anywhere;
-gaussian-probe-compression, section 2.2, says that the method lacks this.
+the corners of a coarse grid. One mean and basis for all probes would be global PCA, and one for each cell blockwise
+PCA, whose seams the interpolation removes. Weights belong to probes and not to a second grid, so probes can be
+anywhere; gaussian-probe-compression, section 2.2, says that the method lacks this.
 
 What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D numbers per probe, K,
 cells along the box's longest side, scale), means and bases at V corners, float16 [V, K + 1, D] in units of the scale,
@@ -148,7 +148,7 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
     try:
         bits, width, components, grid, scale = _HEADER.unpack_from(payload)
     except struct.error as error:
-        raise WlmError(f"probes: expected the bytes of a moving basis, got {len(payload)} bytes without its header") from error
+        raise WlmError(f"probes: expected a moving basis with a header, got {len(payload)} bytes") from error
     near, share, cell = _interpolation(position, grid)
     size = payload_bytes(probes, width, components, (near.max() + 1, cell.max() + 1), bits or None)
     if size != len(payload):

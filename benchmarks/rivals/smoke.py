@@ -47,6 +47,6 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:
-    """Returns a point's offset from the image centre, to the right and up, in world units."""
+    """Returns the offset of the pivot from the image centre, to the right and up, in world units."""
     right, up, _ = camera.axes @ (np.asarray(pivot, np.float64) - np.asarray(camera.position, np.float64))
     return float(right), float(up)

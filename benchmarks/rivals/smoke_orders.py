@@ -52,7 +52,7 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
 
 
 def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Returns a picture by single scattering plus diffusion, the inputs of our learned model, float32 [H, W, 3]."""
+    """Returns a picture by single scattering plus diffusion, which our learned model mixes, float32 [H, W, 3]."""
     with stream(device_name(volume.device)):
         lit, inputs = make_inputs(volume, camera, lights, [albedo], orders_march(volume))
         return lit.compose(inputs.by_diffusion(albedo)[..., None].expand(-1, -1, -1, 3))
@@ -66,8 +66,8 @@ def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
     Args:
         volume: The smoke.
-        camera: Orthographic.
-        lights: At least one.
+        camera: Orthographic camera.
+        lights: At least one directional light.
     """
     march = orders_march(volume)
     lit = light_smoke(volume, camera, lights, march)
@@ -82,7 +82,7 @@ def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
 
 def _blurred(planes: torch.Tensor, sigma: float) -> torch.Tensor:
-    """Blurs planes [L, P, H, W] by a Gaussian with a standard deviation in pixels; outside is black."""
+    """Blurs planes [L, P, H, W] by a Gaussian of standard deviation `sigma` in pixels, with black outside."""
     reach = max(1, round(_REACH * sigma))
     away = torch.arange(-reach, reach + 1, device=planes.device) / max(sigma, 1e-3)
     weights = torch.exp(-0.5 * away**2)
