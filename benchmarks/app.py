@@ -246,7 +246,7 @@ def compare(
 
     changes = [change for run in read_runs(new) for change in changes_between(run, read_runs(old))]
     if not changes:
-        raise WlmError(f"{old}: expected the method, option and scene of any row of {new}, found none of them")
+        raise WlmError(f"{old}: no row has the method, option and scene of a row of {new}")
     worse = [change for change in changes if change.worse]
     for change in worse:
         row, figure = change.row, FIGURES[change.name]

@@ -1,9 +1,9 @@
-"""The atlas system against smaller lightmaps and block codecs: size, speed and error.
+"""Lightmaps compressed by `wlm.atlas`, against smaller lightmaps and block codecs: size, speed and error.
 
 For each lightmap of each mesh the results table has these kinds of rows:
 
-- method "ours", one row for each profile: the size of the file, the time to compress and write it, the error in views
-  from all around the mesh, and the time to read a million random points of its surface. A full run also measures the
+- method "ours", one row for each profile, a set of options: size of the file, time to compress and write it, error in
+  views from all around the mesh, and time to read a million random points of its surface. A full run also measures the
   first profile at compression ratios (CR) of 92.5% and 95%, and in as many bits as the first profile of method
   "cascade" takes.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
@@ -104,7 +104,7 @@ def run(
     progress: Note | None = None,
     **paths: Any,
 ) -> list[Row]:
-    """Measures the atlas system.
+    """Measures lightmaps compressed by `wlm.atlas` and by rivals.
 
     Args:
         quick: Whether to render 8 small views instead of 50, fit the cascade in a few steps and measure rivals at one
@@ -313,7 +313,7 @@ class _AtlasBench(Bench):
         self.triangle, self.weight = _surface_points(self.lit.sheets[0], points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
-        """Compresses with each profile; if `whole`, with the first also to smaller sizes and to a cascade's size."""
+        """Compresses with each profile and, if `whole`, with the first one to smaller sizes and to a cascade's size."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
         if not whole or profiles[0].method != "tiles":
             return entries
@@ -354,7 +354,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Fits the textures of the first cascade in rendered views and in UV space. Returns an entry for each fit."""
+        """Fits the first cascade's textures in rendered views and in UV space. Returns an entry for each fit."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []
@@ -377,7 +377,7 @@ class _AtlasBench(Bench):
         return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
-        """Makes the entry of the uncompressed lightmap, whose decoder reads the same surface points as a model's."""
+        """Makes the entry of the uncompressed lightmap, whose decoder reads it at the surface points."""
         model = replace(
             model,
             method="plain",

@@ -5,9 +5,9 @@ lightmap, even if that has less error. The rows of method "ablation":
 
 - "whole": the profile without a change.
 - "no repacking": the mesh keeps its UVs, and the cascade begins as the lightmap itself (table 3).
-- "no cascade": the repacked lightmap as it is, without a lookup table and without tuning (table 3).
-- "not tuned": the cascade before it is tuned.
-- "ASTC": the texture T_p in blocks of 4 x 4 texels (table 2).
+- "no cascade": the repacked lightmap as it is, without a lookup table and without a fit (table 3).
+- "not tuned": the cascade before its textures are fitted.
+- "ASTC": the colour texture T_p in ASTC blocks of 4 x 4 texels (table 2).
 
 Rows of method "sweep" (figure 7) change one of the paper's size factors: epsilon ("scale"), epsilon_p ("colour_scale")
 or epsilon_c ("lut_scale").
@@ -143,7 +143,7 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
 
 
 def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
-    """Returns the requested variants of a profile, as `variants` does for all.
+    """Returns the requested variants of a profile, in the form that `variants` returns.
 
     Args:
         base: The profile of which each variant changes one setting.

@@ -19,8 +19,8 @@ class Change:
         row: The new row.
         name: Name of the figure in `benchmarks.figures`.
         old, new: Values of the figure before and after.
-        worse: Whether a figure in dB fell by more than 0.05 dB, or a time grew by more than 5% and by more than its
-            samples scatter.
+        worse: Whether a figure in dB fell by more than 0.05 dB, or a time grew by more than 5% and by more than the
+            scatter of its samples.
     """
 
     row: Row

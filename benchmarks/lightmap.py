@@ -96,7 +96,7 @@ def run(
     rival_names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the lightmap system on one set.
+    """Measures the compression of one set of lightmaps over time.
 
     Args:
         quick: Whether to fit three profiles for few steps, measure a third of the rivals, and measure errors at three
@@ -106,7 +106,7 @@ def run(
         profiles: Names or YAML files of profiles; None: `QUICK_PROFILES` if `quick`, else `PROFILES`.
         rivals: Whether to measure the rivals too.
         rivals_only: Whether to measure only the rivals. They need no GPU, except neural texture compression.
-        rival_names: Measure only these keys of `benchmarks.rivals.lightmap.RIVALS`.
+        rival_names: Keys of `benchmarks.rivals.lightmap.RIVALS`. If given, only these rivals are measured.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -143,7 +143,7 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on a given set. Arguments that are not listed here are as for `run`.
+    """Measures given profiles on a given lightmap set. Arguments that are not listed here are as for `run`.
 
     Args:
         lightmaps: The lightmap set.

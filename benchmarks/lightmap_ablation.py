@@ -115,8 +115,6 @@ def run_rows(
 
 
 class _AblationBench(Bench):
-    """The ablation of one lightmap set, which fits only tiles whose light changes over time."""
-
     def __init__(self, lightmaps: LightmapSet, profile: Profile, device: str, progress: Note | None) -> None:
         super().__init__("lightmap", device, progress, scene=f"{lightmaps.name}, ablation")
         self._set, self._lightmaps, self._profile = lightmaps, lightmaps.light, profile

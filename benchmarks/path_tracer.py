@@ -102,7 +102,7 @@ class PathTracer:
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
     def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
-        """Traces RGBA float32 [H, W, 4] under one light of irradiance 4 pi, at `direction` [3] in camera axes."""
+        """Traces RGBA float32 [H, W, 4] under one light of irradiance 4 pi, from `direction` [3] in camera axes."""
         light = {
             "type": "directional",
             "direction": [float(-w) for w in self._camera.axes.T @ direction],

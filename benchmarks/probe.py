@@ -92,7 +92,7 @@ def run(
     volume_only: bool = False,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the probe system on one file.
+    """Measures the compression of the light probes of one file.
 
     Args:
         quick: Whether to make short fits at one compression ratio, measure rivals at one size and measure the demo's
@@ -149,7 +149,7 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given sets. Arguments that are not listed here are as for `run`.
+    """Measures given profiles on given sets of probes. Arguments that are not listed here are as for `run`.
 
     Args:
         sets: At least one set of probes.
@@ -458,6 +458,6 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
 
 
 def _light(figures: dict[str, Any]) -> dict[str, float | None]:
-    """Returns the mean coverage, RMSE and RMS of light read during a walk; None if no probe was near the viewer."""
+    """Returns the covered share, RMSE and RMS of light read during a walk; None if no probe was near the viewer."""
     names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
     return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}

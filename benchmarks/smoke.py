@@ -1,4 +1,4 @@
-"""Speed and error of the smoke system, against memory copies, exact solutions and finer ray marches, in one run.
+"""Speed and error of smoke simulation and lighting, against memory copies, exact solutions and finer ray marches.
 
 Each method has a table of its own:
 
@@ -719,7 +719,7 @@ _PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
 
 
 def run(*, quick: bool = False, device: str, sizes: Sizes | None = None, progress: Note | None = None) -> list[Row]:
-    """Measures the smoke system.
+    """Measures the simulation and the lighting of smoke.
 
     Args:
         quick: Whether to use the sizes `QUICK`, for a minute on a CPU, instead of the grids of the paper, which need a

@@ -12,14 +12,14 @@ The options of method "all orders"; PSNR and FLIP of a picture are in sRGB, agai
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
 - "fitted filter", a linear filter of planes blurred at four scales;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
-- "diffusion" on a grid of 32^3 and single scattering, which are the inputs of
-- "learned mix", a weighted sum with learned weights, the result of `wlm.smoke.transport.scatter`.
+- "diffusion", the sum of diffusion on a grid of 32^3 cells and single scattering;
+- "learned mix", a sum of these two with learned weights, the result of `wlm.smoke.transport.scatter`.
 
 The gain and the weights of the fitted octaves and of the fitted filter are fitted to the references of the score
 itself: weights fitted to other smoke could not score higher. A reference is the mean of two pictures that are traced
 independently; the row "path tracing" is its noise, estimated from their difference. Flicker is the RMS change from
 one frame to the next where smoke is visible, after the earlier picture is warped by the motion of the smoke, and its
-ratio to the references' change. Noise cancels in this change, the mean product of the changes of the two pictures.
+ratio to the references' change, which is a mean product of the changes of their two pictures, so that noise cancels.
 
 Method "gain by grid" has one row for each grid: plumes and clouds that the mix was not trained on, with extinctions
 inside and outside the range of the training, under single lights, from random sides. The gain is the PSNR of the mix
@@ -164,7 +164,7 @@ class Shot:
         camera: Orthographic camera.
         lights: Directional lights with their irradiance.
         seed: Seed of the random paths.
-        motion: Motion of the smoke since the previous shot in pixels, float32 [2, H, W]; None: that shows other smoke.
+        motion: Motion of the smoke since the previous shot in pixels, float32 [2, H, W]; None: it shows other smoke.
     """
 
     volume: DensityVolume

@@ -45,7 +45,7 @@ def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) 
 
     Args:
         scene: A scene of one lightmap.
-        share: Budget as a share of the lightmap's bits at 48 per texel; from 2/3 on it keeps its full resolution.
+        share: Budget as a share of the lightmap's bits at 48 per texel; from 2/3 on full resolution is kept.
         bilinear: Whether to downsample bilinearly as in the paper, instead of by least squares.
 
     Raises:

@@ -104,7 +104,7 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: s
     for the whole map would.
 
     Args:
-        frame, mask: The lightmap.
+        frame, mask: The lightmap [H, W, 3] and its mask [H, W].
         block: Side of a block in texels: 4, 5, 6, 8, 10 or 12.
         profile: `ldr`, `hdr`, or `best`, the one with the higher PSNR; the `option` of the rival states the choice.
     """

@@ -13,7 +13,7 @@ the colours at all hours are the channels, so that what hours share is stored on
 - The network's parameters are half floats; a map has one network for each 1024 x 1024 texels.
 
 The output levels are colours with a gamma, scaled by a tile's range over the day (`benchmarks.rivals.lightmap_levels`).
-Errors have weights between equal ones and PSNR's, as in our method; texels just outside charts weigh a quarter.
+Errors have weights half-way between equal ones and PSNR's, like ours, and texels just outside charts weigh a quarter.
 `docs/lightmap.md` compares these choices. The fit needs torch alone, and takes minutes on a GPU or hours on a CPU.
 """
 
@@ -300,7 +300,7 @@ def _answer(
     chosen: torch.Tensor,
     random: torch.Generator | None,
 ) -> torch.Tensor:
-    """Computes levels [B, 3 T] at T times for B chosen texels; with `random` latents get the noise of training."""
+    """Computes levels [B, 3 T] at T times for B chosen texels; if `random` is given, training noise is added."""
 
     def read(latents: torch.Tensor, nodes: torch.Tensor, top: int) -> torch.Tensor:
         values = functional.embedding(nodes[chosen], latents)  # [B, 4, count]
@@ -344,7 +344,7 @@ def _nibbles(levels: np.ndarray) -> bytes:
 
 
 def _disk_bytes(ranges: TileRanges, regions: list[_Region]) -> int:
-    """Returns the size in bytes under LZMA, of one byte for each 4-bit latent, which compresses better."""
+    """Returns the size in bytes under LZMA. Each 4-bit latent takes a byte first, as this compresses better."""
     rest = [ranges.tobytes(), *(values.tobytes() for region in regions for values in region.network)]
     planes = [np.moveaxis(grid, -1, 0).tobytes() for region in regions for grid in (region.fine, region.coarse)]
     packed = sum(len(lzma.compress(part)) for part in (*planes, b"".join(rest)))

@@ -145,7 +145,7 @@ class PlainFit:
         return torch.rand(*shape, device=self._device, generator=self._random)
 
     def step(self) -> torch.Tensor:
-        """Does one step. Maps are quantised, and later frozen, from the steps on that the profile's settings state.
+        """Does one step of the fit. The profile states from which steps on maps are quantised and frozen.
 
         Returns:
             The loss of the step, the mean over tiles, samples and channels, a tensor on the device.

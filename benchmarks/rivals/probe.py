@@ -81,7 +81,7 @@ def moving_basis(
     """Compresses probes at any positions by moving basis decomposition (Silvennoinen and Sloan 2021).
 
     Args:
-        position, values, components, bits: As for the module. Basis vectors are at corners of cells, the parts.
+        position, values, components, bits: As the module's docstring states, where a part is a cell of the grid.
         grid: Cells along the longest side of the probes' box, 1 to 2**20.
         iterations: Rounds of alternating least squares, which start from the PCA of all probes; at least 0.
     """
@@ -101,7 +101,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
 
     The ambient colour, coefficient L00, is stored as R11G11B10F; values above 65,024 (64,512 in blue) are clamped.
     Every other coefficient is stored in 8 bits as its ratio to the ambient colour, which is 0 where the ambient is not
-    above 0. Ratios are clamped to the range of light that is nowhere negative; rounding the ambient can exceed it.
+    above 0. Ratios are clamped to the range that light without negative values can have, up to rounding.
     Everything is rounded to nearest. Ratios are taken to the ambient colour as it is decoded, which costs nothing and
     is more exact than the engine's own ratio.
 
@@ -150,7 +150,7 @@ def at_bytes(
     """Searches for the settings with which one method has the least squared error within a size in bytes.
 
     For each number of bits, numbers of components are tried from the largest down, until two in a row are no better.
-    Each is tried with as many parts as fit, at most `MAX_PARTS`, or `MAX_GRID` cells along the longest side.
+    Each is tried with as many parts as fit: at most `MAX_PARTS` clusters, or `MAX_GRID` cells along the longest side.
 
     Args:
         name: A key of `RIVALS`.

@@ -1,11 +1,11 @@
-"""Moving basis decomposition (Silvennoinen and Sloan 2021) for probes at free positions.
+"""Moving basis decomposition (Silvennoinen and Sloan 2021) for probes at any positions.
 
     y_n ~ m(x_n) + sum_j w_nj b_j(x_n)
 
 Probe y_n at position x_n has K weights w_nj. The mean m and the K basis vectors b_j are interpolated trilinearly from
 the corners of a coarse grid. One mean and basis for all probes would be global PCA, and one for each cell blockwise
 PCA, whose seams the interpolation removes. Weights belong to probes and not to a second grid, so probes can be
-anywhere; gaussian-probe-compression, section 2.2, says that the method lacks this.
+anywhere; gaussian-probe-compression, section 2.2, says that the method does not allow this.
 
 What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D numbers per probe, K,
 cells along the box's longest side, scale), means and bases at V corners, float16 [V, K + 1, D] in units of the scale,
@@ -143,7 +143,7 @@ def encode(
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Decodes the probes at positions [N, 3] to float32 [N, D]; raises a `WlmError` if the payload has other probes."""
+    """Decodes the probes at positions [N, 3] to float32 [N, D]; a `WlmError` if the payload doesn't fit them."""
     probes = len(position)
     try:
         bits, width, components, grid, scale = _HEADER.unpack_from(payload)
@@ -162,7 +162,7 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def payload_bytes(probes: int, width: int, components: int, parts: tuple[int, int], bits: int | None) -> int:
-    """Returns the bytes of a payload; `width`: numbers per probe, `parts`: from `grid_parts`, `bits`: of a weight."""
+    """Returns a payload's bytes, for `width` numbers per probe, `parts` from `grid_parts` and `bits` per weight."""
     corners, cells = parts
     return _HEADER.size + corners * (components + 1) * width * 2 + weight_bytes(probes, components, cells, bits)
 

@@ -75,8 +75,8 @@ def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
 
     Args:
         position: float64 [N, 3].
-        clusters: Largest number of parts. There are fewer if fewer positions are distinct, or if a centre, as stored,
-            has no nearest probe.
+        clusters: Largest number of parts. There are fewer if fewer positions are distinct, or if no probe is nearest
+            to a stored centre.
         seed: Seed of the initial centres.
     """
     low, extent = position.min(0), extent_of(position)
@@ -214,7 +214,7 @@ def part_count(payload: bytes) -> int:
 
 
 def payload_bytes(kind: int, probes: int, width: int, components: int, count: int, bits: int | None) -> int:
-    """Returns the bytes that `encode` makes; `width`: numbers per probe, `count`: of parts, `bits`: of a weight."""
+    """Returns how many bytes `encode` makes, for `width` numbers per probe, `count` parts and `bits` per weight."""
     size = HEADER.size + _PARTITION_BYTES[kind](probes, count) + count * (components + 1) * width * 2
     return size + weight_bytes(probes, components, count, bits)
 
@@ -332,7 +332,7 @@ def _members(label: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def compact(label: np.ndarray) -> tuple[np.ndarray, int]:
-    """Renumbers labels from 0 without gaps, in the same order. Returns new labels int64 [N], and how many differ."""
+    """Renumbers labels from 0 without gaps, in the same order. Returns new labels, int64, and their number."""
     used, compact = np.unique(label, return_inverse=True)
     return compact.astype(np.int64), len(used)
 

@@ -32,7 +32,7 @@ _REACH = 3.0  # standard deviations
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Returns a picture with multiple scattering approximated by three octaves, float32 [H, W, 3]."""
+    """Returns a picture with multiple scattering approximated by three octaves of single scattering, [H, W, 3]."""
     march = orders_march(volume)
     picture = light_smoke(volume, camera, lights, march).shade(albedo=(albedo,) * 3)
     for share, shadow in CLASSIC:
@@ -59,7 +59,7 @@ def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], alb
 
 
 def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """Returns P image planes for each of L lights of irradiance 4 pi, float32 [L, P, H, W], which the filter adds up.
+    """Returns P image planes for each of L lights of irradiance 4 pi, float32 [L, P, H, W], for a weighted sum.
 
     The planes are the smoke lit by the light, by the opposite light and from all around, opacity, squared opacity and
     optical depth; each also blurred at several scales, and all of these also multiplied by opacity.
