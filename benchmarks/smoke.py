@@ -383,7 +383,7 @@ def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
-    """Returns a call that does one advection step in sparse bricks and renews the lists of bricks; and the bricks."""
+    """Returns a call that does one advection step in sparse bricks, including their lists, and returns the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
     bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
@@ -468,7 +468,7 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
 
 
 def guide_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Compares guiding maps of each step size with a fine march; pixels share their marches to the lights or not."""
+    """Compares guiding maps with a fine march, at each step size; pixels share light marches or have their own."""
     bench.note("measuring guiding maps")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)

@@ -107,7 +107,7 @@ class TileRanges:
         return self.low.tobytes() + self.high.tobytes()
 
     def levels(self, codes: np.ndarray) -> np.ndarray:
-        """Scales gamma-encoded values [..., H, W, 3] to levels in [0, 1] of their tile's range; 0 where it is 0."""
+        """Scales gamma-encoded values [..., H, W, 3] to levels in [0, 1] of a tile's range; an empty range gives 0."""
         low, _ = self._spread(*codes.shape[-3:-1])
         return np.clip((codes - low) / self.span(*codes.shape[-3:-1]), 0.0, 1.0)
 

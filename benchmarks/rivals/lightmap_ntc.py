@@ -4,12 +4,12 @@
 of a material in two grids of quantised latents and a network of two hidden layers of 64, one for each texture set. Here
 the colours at all hours are the channels, so that what hours share is stored once. A texel is decoded as:
 
-    x = [fine latents at 4 nodes, coarse latents between 4 nodes, place in the coarse cell],     levels = network(x)
+    x = [fine latents at 4 nodes, coarse latents between 4 nodes, position in the coarse cell],   levels = network(x)
 
-- The network gets the latents of all 4 nearest fine nodes; those of the coarse grid are interpolated bilinearly.
+- The network gets the latents of all 4 nearest fine nodes; latents of the coarse grid are interpolated bilinearly.
 - Fine latents have 4 bits, coarse ones 8. In training uniform noise of one step stands for the rounding; for the last
   twentieth of the steps latents are rounded and frozen, and the network is fitted to them.
-- The place is given to the network as sines and cosines with one and two periods per coarse cell, along both axes.
+- The position is given as sines and cosines with one and two periods per coarse cell, along both axes.
 - The network's parameters are half floats; a map has one network for each 1024 x 1024 texels.
 
 The output levels are colours with a gamma, scaled by a tile's range over the day (`benchmarks.rivals.lightmap_levels`).
