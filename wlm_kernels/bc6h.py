@@ -91,7 +91,8 @@ def _in(mask: int, texel: int) -> bool:
 
 @wp.func
 def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
-    """Computes the principal axis of points from their `_moments`, and the sum of weighted squares along it."""
+    """Computes the principal axis of points with the moments m, in `rounds` power iterations, and their scatter along
+    it."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
     yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
@@ -114,7 +115,7 @@ def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
 
 @wp.func
 def _spread(m: _Moments) -> float:
-    """Computes the sum of weighted squared distances from the mean, from `_moments`."""
+    """Computes the scatter of points with the moments m: the weighted sum of squared distances from the mean."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     return wp.max(m[4] + m[7] + m[9] - (m[1] * m[1] + m[2] * m[2] + m[3] * m[3]) * inverse, 0.0)
 
@@ -264,12 +265,8 @@ def _share(index: int, steps: int) -> int:
 
 @wp.func
 def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> int:
-    """Finds the most precise of the modes `first` to `last` - 1 that can store the ends; -1 if none can. Most modes
-    store all ends but the first as differences to the first, which have fewer bits.
-
-    Args:
-        ends: The endpoints, of which `count` are used.
-    """
+    """Finds the most precise of the modes `first` to `last` - 1 that can store the first `count` ends; -1 if none can.
+    Most modes store all ends but the first as differences to it, which have fewer bits."""
     best = int(-1)
     for mode in range(first, last):
         bits = tables.modes[mode, 3]
@@ -391,7 +388,7 @@ def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int
 @wp.func
 def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
     """Finds the partition, among those not in the bit mask `tried`, whose two lines fit best. Returns its number and
-    the expected sum of weighted squared errors."""
+    the expected weighted sum of squared errors."""
     least = float(_HUGE)
     partition = int(0)
     for p in range(32):

@@ -17,8 +17,7 @@ _CLAMP, _WRAP = (wp.constant(BOUNDARIES.index(name)) for name in ("clamp", "wrap
 
 @wp.func
 def cell(coordinate: float, size: int) -> int:
-    """Returns the index of the last cell centre at or before a coordinate in [0, 1] on an axis of `size` cells, or
-    -1."""
+    """Returns the index of the last cell centre at or before a coordinate in [0, 1] among `size` cells; -1 for none."""
     return int(wp.floor(coordinate * float(size) - 0.5))
 
 

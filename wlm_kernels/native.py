@@ -19,10 +19,6 @@ def native_source(package: str, name: str, **constants: int) -> str:
 
 
 def on_cuda(code: str, otherwise: str) -> str:
-    """Returns the body of a native function that is `code` on CUDA, and another statement on the CPU.
-
-    Args:
-        code: Result of `native_source`.
-        otherwise: The statement for the CPU.
-    """
+    """Returns the body of a native function: `code`, which `native_source` has returned, on CUDA, and the statement
+    `otherwise` on the CPU."""
     return f"#if defined(__CUDA_ARCH__)\n{code}#else\n{otherwise}\n#endif\n"

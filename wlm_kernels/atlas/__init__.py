@@ -1,1 +1,1 @@
-"""Kernels for lightmap atlases: they read tiles and cascades, compute steps of tuning, and group similar triangles."""
+"""Kernels for lightmap atlases: they read tiles and cascades, fit their textures, and group similar triangles."""

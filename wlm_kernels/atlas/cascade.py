@@ -1,5 +1,5 @@
-"""Kernels of a cascade of two textures: its colours and their gradients, and the points and losses of a tuning step
-(lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
+"""Kernels of a cascade of two textures: its colours and their gradients, and the points and losses of a step
+that tunes them (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
 C(u) = T_p(F(T_c(u))) (eq. 7): the lookup texture T_c gives a coordinate, the triangle wave F folds it into [0, 1], and
 the colour texture T_p gives the colour. Both textures are read bilinearly and clamped at their borders, see
@@ -228,7 +228,7 @@ def sample(colour, lut, uv, out) -> None:
 
     Args:
         colour: float [Hp, Wp, 3], the colour texture T_p.
-        lut: float [Hc, Wc, 2], the lookup texture T_c of coordinates (x, y), any numbers; [0, 0, 2] if there is none.
+        lut: float [Hc, Wc, 2], the lookup texture T_c: any coordinates (x, y) in T_p; [0, 0, 2] if there is none.
         uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The colour at NaN is NaN.
         out: float [N, 3], written.
     """
@@ -245,9 +245,9 @@ def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
 
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
-    """Writes the coordinates of N points to `uv`, vec2 [N]. Each lies in a triangle, int [N], with `barycentric`
-    weights of the corners 0 and 1, vec2 [N]; `corner`, vec2 [F, 3], has the coordinates of all triangles' corners.
-    Points of triangle -1 are NaN."""
+    """Writes the coordinates of N points to `uv`, vec2 [N]. `triangle`, int [N], is the triangle of each point, and
+    `barycentric`, vec2 [N], its weights of the corners 0 and 1; `corner`, vec2 [F, 3], has the coordinates of all F
+    triangles' corners. Points of triangle -1 are NaN."""
     wp.launch(
         _corner_points, triangle.shape, inputs=[triangle, barycentric, corner], outputs=[uv], device=triangle.device
     )

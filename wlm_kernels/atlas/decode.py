@@ -104,14 +104,13 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
         uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The light at NaN is NaN.
         height, width: Size of the lightmap in texels.
         size: B, number of texels along a tile.
-        lut: uint16 [ty, tx, 2], for each tile an entry for x and one for y: the number of the rectangle's first texel
-            << 4, plus the rectangle's number of texels - 1.
+        lut: uint16 [ty, tx, 2], for each tile an entry for x and one for y: (first texel of the rectangle) << 4 |
+            (number of its texels - 1).
         texels: vec3h [Hp, Wp], the colour texture.
         out: vec3 [N], written.
         blocks: vec3h [Hb, Wb], the second colour texture, with sides that are multiples of 4; None if there is none.
         first_block_code: An entry whose low 4 bits are at least this number refers to the second texture and counts
-            blocks of 4 texels: the number of the first block << 4, plus `first_block_code`, plus the number of blocks -
-            1. 16: no entry does.
+            blocks of 4 texels: (first block) << 4 | (`first_block_code` + number of blocks - 1). With 16 no entry does.
     """
     inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
     wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
@@ -208,11 +207,11 @@ def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, fir
         sheets: int [S, 7], for each lightmap or mip level: height and width in texels; row and column of its first tile
             in the lookup texture; rows and columns of tiles; and one number that is ignored.
         size: B, number of texels along a tile.
-        factor: vec3 [C], the factors of the lighting state. Each group of tiles whose light changes alike has its own:
-            a constant, followed by one factor for each component.
+        factor: vec3 [C], the factors of the lighting state. Each group of tiles whose light changes alike has its own
+            factors: a constant, followed by one factor for each component.
         lut: uint16 [ty, tx, 4], for each tile the entries for x and y of its first component, as for `decode`; the
             index of its constant in `factor`; and page << 12 | number of coarse components << 8 | number of components.
-            A coarse component is a single block. [ty, tx, 2], only the entries, if there is one component and one page.
+            A coarse component is a single block. With one component and one page: [ty, tx, 2], only the entries.
         texels: vec3h [pages, Hp, Wp], the colour texture; the components of a tile follow each other along a row.
         blocks: vec3h [pages, Hb, Wb], the second colour texture, in blocks of 4 x 4 texels.
         first_block_code: As for `decode`.

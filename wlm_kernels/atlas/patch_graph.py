@@ -62,7 +62,7 @@ class Rule:
         level: The mean difference of the samples, summed over the channels, must be below this number of levels.
         whole: `level` rounded up to a whole number.
         same: [len(SIZES)], for two patches of this size: threshold of the sum of all samples' differences, in levels.
-        mixed: [len(SIZES)], the same for two sizes, by the larger size n, in units of 1 / (n - 1) of a level.
+        mixed: [len(SIZES)], the same for patches of two sizes, by the larger size n, in 1 / (n - 1) of a level.
     """
 
     colour: int
@@ -217,8 +217,7 @@ def _spans(
     low: wp.array1d[float],
     high: wp.array1d[float],
 ):
-    """Writes the least and greatest mean colour (sum of the channels) of a patch on its own lattice and all larger
-    ones."""
+    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones."""
     i = wp.tid()
     least = float(wp.inf)
     most = float(-wp.inf)
@@ -336,7 +335,7 @@ class Graph:
         patches, bounds: The M patches, which are the graph's nodes, and their `Bounds`.
         rule: Thresholds below which two patches are alike.
         low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
-            alike, their means on the larger one's lattice differ by less than lambda.
+            alike, their means on the larger one's lattice differ by less than `rule.level`.
         means: float32 [M], copy of `low` in the CPU's memory.
         reach: The largest difference of `high` and `low` in any patch.
     """

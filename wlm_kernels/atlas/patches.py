@@ -48,14 +48,13 @@ _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 
 @wp.struct
 class Patch:
-    """A patch without its samples.
+    """A patch, which stores the colours of a triangle, without its samples.
 
     Attributes:
         start: Index of the patch's first sample in the array of all samples.
         level: Index of the patch's size n in `SIZES`: n = 2 ** level + 1.
-        low: Lowest value of each channel, packed as a colour.
-        high: Highest value of each channel, packed as a colour.
-        colour: Bin of the dominant colour in the histogram, packed as a colour.
+        low, high: Lowest and highest value of each channel, packed as a colour.
+        colour: Histogram bin of the dominant colour, one number per channel, packed as a colour.
     """
 
     start: int
@@ -228,7 +227,7 @@ def _inverse(order: int) -> int:
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
     """Returns the colour of a patch at (i, j) of the lattice of size 2 ** level + 1, times 2 ** level, which makes it
-    whole. If this lattice is larger than the patch's own, the colour is interpolated; it may not be smaller."""
+    whole. The patch's own lattice must not be larger; if it is smaller, the colour is interpolated."""
     # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
@@ -365,8 +364,8 @@ def dominant(samples, patches) -> None:
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
     """Finds for each of N pairs of patches, `member` and `representative`, int [N], the order of vertices with the
-    least distance Dist (eq. 2 and 3); of equal ones the first. Returns the orders o, int8 [N], such that vertex k of
-    the member maps to vertex `ORDERS[o][k]` of the representative; and the distances, float64 [N], in [0, 1]."""
+    least distance Dist (eq. 2 and 3), the first if several are equal. Returns the orders o, int8 [N], such that vertex
+    k of the member maps to vertex `ORDERS[o][k]` of the representative; and the distances, float64 [N], in [0, 1]."""
     device, count = samples.device, member.shape[0]
     order = wp.empty(count, dtype=wp.int8, device=device)
     distance = wp.empty(count, dtype=wp.float64, device=device)

@@ -133,14 +133,8 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
 
 @functools.cache
 def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
-    """Builds (once) the functions that add gradients of feature maps: for F_uv, F_uvt, and the planes F_ut and F_vt.
-
-    Args:
-        device_kind: "cpu" or "cuda".
-
-    Returns:
-        Three `wp.func`s in this order, and the scalar type of the gradient sums.
-    """
+    """Builds (once) for "cpu" or "cuda" the functions that add a sample's gradients to the gradient sums of the feature
+    maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums."""
     add, scalar, add_endpoints, spread = _adders(device_kind)
 
     @wp.func

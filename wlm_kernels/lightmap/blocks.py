@@ -46,7 +46,7 @@ def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
 
 @wp.func
 def endpoint_byte(e: wp.vec4) -> wp.vec4:
-    """Returns the stored bytes of an endpoint as floats 0 to 255, with the shared lowest bit that is more exact."""
+    """Returns the stored bytes of an endpoint as floats 0 to 255, with the shared lowest bit that gives less error."""
     v = wp.vec4(
         wp.clamp(e[0], 0.0, 1.0) * 255.0,
         wp.clamp(e[1], 0.0, 1.0) * 255.0,

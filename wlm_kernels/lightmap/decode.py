@@ -242,12 +242,8 @@ def frame_volume(
 
 @dataclass(frozen=True)
 class StripKernels:
-    """Kernels of the fast decoder for networks of one hidden width; see `decode`.
-
-    Attributes:
-        hidden: H, width of the hidden layers.
-        vec_hidden: Warp's type of a vector of H floats.
-    """
+    """Kernels of the fast decoder for networks with H = `hidden` units in each hidden layer; see `decode`. `vec_hidden`
+    is Warp's type of a vector of H floats."""
 
     hidden: int
     vec_hidden: Any

@@ -1,6 +1,6 @@
 """Decodes tiles that are stored as frames, one for each time: BC7 blocks of any mode.
 
-A channel's value 0 to 1 in a block lies between two colours that are stored for each frame. Blocks are uint64
+A block's values 0 to 1 stand for the range between two colours that are stored for each frame. Blocks are uint64
 `[N T, 32, 32, 2]` for N tiles at T times, the T frames of a tile one after another. The last axis is the low and the
 high half of a block's 16 little-endian bytes. `wlm.formats.bc7_modes` defines and describes the tables of BC7.
 """

@@ -184,7 +184,7 @@ def gather_net(
     """Converts the networks' sums on the CPU into gradients, and advances the schedule of learning rates by one step.
 
     Args:
-        partial, partial_out, loss: Sums for hidden layers, output layers and losses, float [P, ...], P lanes; set to 0.
+        partial, partial_out, loss: Sums of P threads for hidden and output layers and losses, float [P, ...]; set to 0.
         schedule: vec3 [steps], whose first component is the factor on the initial learning rates at each step.
         first_rates: The initial learning rates of the maps and of the networks.
         control: int [1], number of the step; increased by 1.
@@ -251,7 +251,7 @@ def update_net(
     """Converts the networks' sums on a GPU into gradients and updates the networks with Adam: ends a step's update.
 
     Args:
-        partial, partial_out, loss: Sums for hidden layers, output layers and losses, float [P, ...] of P thread blocks.
+        partial, partial_out, loss: Sums of P thread blocks for hidden and output layers and losses, float [P, ...].
         rates: As `update_maps` wrote them.
         adam, adam_out: States of the optimisers of hidden and output layers, updated.
         hidden, output: float, the hidden and output layers, updated.

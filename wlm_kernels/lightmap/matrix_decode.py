@@ -72,15 +72,9 @@ class MatrixKernels:
         """Decodes n of N tiles at one time to 32 bits per texel, on CUDA.
 
         Args:
-            stored: The N tiles, all with temporal maps.
-            hidden: vecH [N, I + H + 2], half floats: hidden layers with H units and I inputs, see `wlm_kernels.mlp`.
-            output: vec3 [N, H + 1], half floats: output layers.
-            time: The time, and the numbers that convert the networks' outputs to colour.
-            volume: vec4 [N, R, R], scratch memory: F_uvt of all N tiles.
+            hidden, output: Hidden and output layers as for `StripKernels.decode`, but of half floats.
             ut, vt: vec2 [N, 128], scratch memory: F_ut and F_vt of all N tiles.
-            places: int [N], index of each tile in `time`.
-            tiles: int [n], the tiles to decode.
-            out: uint32 [n, 128, 128], written: colour as 8-bit RGBA from the lowest byte, or radiance as RGB9E5.
+            stored, time, volume, places, tiles, out: As for `StripKernels.decode`.
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)

@@ -74,7 +74,7 @@ def blend(early, late, early_inverse, late_inverse, share: float, gamma: float, 
 
     Args:
         early, late: uint32 [n, 128 * 128], the tiles at two stored times.
-        early_inverse, late_inverse: float [n], 1 / the bound of each tile at these times; 0 for a black tile.
+        early_inverse, late_inverse: float [n], 1 / the bound (colour of byte 255) of each tile; 0 for a black tile.
         share: Weight of the later time, 0 to 1.
         gamma: Exponent that converts colours to radiance.
         out: uint32 [n, 128 * 128], written; the bound of a tile is the larger of its bounds at the two times.
@@ -84,11 +84,6 @@ def blend(early, late, early_inverse, late_inverse, share: float, gamma: float, 
 
 
 def blend_shared(early, late, share: float, out) -> None:
-    """Interpolates between RGB9E5 texels of two times in linear radiance (neural-dynamic-gi, eq. 2).
-
-    Args:
-        early, late: uint32 [n], texels at two stored times.
-        share: Weight of the later time, 0 to 1.
-        out: uint32 [n], written.
-    """
+    """Interpolates between RGB9E5 texels of two stored times, uint32 [n], in linear radiance (neural-dynamic-gi, eq.
+    2). `share` is the weight of the later time, 0 to 1; the result is written to `out`, uint32 [n]."""
     wp.launch(_blend_shared, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)

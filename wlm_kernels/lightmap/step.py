@@ -92,8 +92,7 @@ class StepKernels:
             output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
-            acc: [lanes, M], gradients of the maps, added to: on CUDA int64 of one lane, on the CPU float, a lane per
-                thread.
+            acc: [lanes, M], gradients of the maps, added to: int64 of one lane on CUDA, float of a lane per CPU thread.
             partial: float [P, N, I + H + 2, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
                 written; on the CPU of P lanes, added to.
             partial_out: float [P, N, H + 1, 3], gradients of the output layers, like `partial`.

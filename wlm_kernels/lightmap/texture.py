@@ -109,11 +109,6 @@ def halve(fine, weight, coarse) -> None:
 
 
 def fill(target, source, texture) -> None:
-    """Copies texels within a texture: fills gaps between charts with the light of other texels.
-
-    Args:
-        target: vec2i [G], row and column of the texels that are filled.
-        source: vec2i [G], row and column of the texels to copy from; none of them is a target.
-        texture: uint32 [H, W], changed.
-    """
+    """Copies G texels within a texture, uint32 [H, W], to fill gaps between charts with the light of other texels.
+    `source` and `target`, vec2i [G], are rows and columns; no source may be a target."""
     wp.launch(_fill, target.shape, inputs=[target, source], outputs=[texture], device=texture.device)

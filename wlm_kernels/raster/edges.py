@@ -1,6 +1,7 @@
 """Edge functions of triangles in homogeneous coordinates, and their exact signs.
 
-`wlm_kernels.raster.rasterize` defines edge functions. Read `tests/reference/raster.py` first; it uses integers.
+`wlm_kernels.raster.rasterize` defines edge functions. Read `tests/reference/raster.py` first, which decides in integers
+which pixels a triangle covers.
 """
 
 import warp as wp
@@ -196,8 +197,7 @@ def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
 
 @wp.func
 def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
-    """Returns whether a pixel's centre lies inside the triangle: exact, with the top-left rule for points on an
-    edge."""
+    """Returns whether a pixel's centre lies inside the triangle: exact, with the top-left rule for points on edges."""
     p = centre(frame, row, column)
     v = k.b
     w = k.c
@@ -217,8 +217,7 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
 
 @wp.func
 def _extent(k: Corners, axis: int):
-    """Returns the least and greatest x / w (axis 0) or y / w (axis 1) of a triangle in front of the viewer, where w >
-    0.
+    """Returns the least and greatest x / w (axis 0) or y / w (axis 1) of a triangle's part before the viewer (w > 0).
 
     An edge that crosses w = 0 extends to plus or minus infinity. If no part has w > 0, the least is above the greatest.
     """

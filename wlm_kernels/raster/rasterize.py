@@ -276,8 +276,7 @@ class Raster:
         depth: float [H, W], z / w.
         derivative: vec4 [H, W], derivatives of the weights (u, v) per pixel: du/dx, du/dy, dv/dx, dv/dy, with x to the
             right and y down; None if they are not computed.
-        coverage: int [H, W], number of triangles, also hidden ones, that cover the pixel's centre; None if not
-            computed.
+        coverage: int [H, W], number of triangles, also hidden ones, over the pixel's centre; None if not computed.
     """
 
     triangle: Any
@@ -298,7 +297,7 @@ class Rasterizer:
         space: Space of the positions, "clip" or "uv"; see the module.
         cull: Whether to leave out clockwise triangles: as seen on the screen in clip space, and with v up in UV space.
         derivative, coverage: Whether to compute these attributes of `Raster`.
-        split: Largest bounding box in pixels of a triangle that one thread draws; None: 64 on CUDA, any on the CPU.
+        split: Most pixels in the bounding box of a triangle that one thread draws; None: 64 on CUDA, any on the CPU.
         empty: Function that allocates a buffer, `empty(shape, dtype=...)`, on the triangles' device; None: Warp's.
 
     Attributes:
@@ -337,7 +336,7 @@ class Rasterizer:
         self._names = (1 << bits) - 1
         self._unit = 1 << (62 - bits)
         if max(1, count) * math.ceil(height / _TILE) * math.ceil(width / _TILE) >= self._unit:
-            raise ValueError(f"triangle: {count} triangles are too many to draw at {height} x {width} pixels")
+            raise ValueError(f"triangle: {count} triangles are too many for {height} x {width} pixels; draw fewer")
         size = (height, width)
         none = empty((0, 0), dtype=int)
         self._keys = empty(size, dtype=wp.int64)

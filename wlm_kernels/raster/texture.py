@@ -54,7 +54,7 @@ def triangle_wave(x: float) -> float:
 
 @wp.func
 def triangle_wave_slope(x: float) -> float:
-    """Returns the slope of `triangle_wave`: 1 where it rises and in valleys, -1 where it falls and on peaks; 0 for
+    """Returns the slope of `triangle_wave`: 1 where it rises or in valleys, -1 where it falls or on peaks; 0 for
     NaN."""
     if not wp.isfinite(x):
         return 0.0
