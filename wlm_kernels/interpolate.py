@@ -162,7 +162,8 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
 def sample_backward(
     values, times: int, layers, points, grad_out, grad_values, grad_points, periodic: bool = False
 ) -> None:
-    """Computes gradients from the gradient of a result of `sample`; a clamped coordinate has gradient 0.
+    """Computes gradients from the gradient of a result of `sample`. A coordinate's gradient is the slope between two
+    cell centres, 0 where it is clamped.
 
     On CUDA points are added to `grad_values` in any order, so that the last bits change from run to run.
 

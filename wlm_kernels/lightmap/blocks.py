@@ -196,12 +196,12 @@ def _quantise(
 
 
 def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
-    """Writes a whole map from its endpoints and weights (eq. 8).
+    """Writes all texels of a map, S slices of H x W texels, from its endpoints and weights (eq. 8).
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
         weights: float [S, H, W], in [0, 1].
-        out: vec4 [S, H, W].
+        out: vec4 [S, H, W], written.
         quantised: Whether endpoints and weights are rounded to the levels of BC7 mode 6.
     """
     inputs = [endpoints, weights, int(quantised)]
@@ -210,6 +210,8 @@ def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
 
 def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False) -> None:
     """Computes gradients from the gradient of a result of `reconstruct`; clamping and rounding count as the identity.
+
+    The gradients are the same in every run.
 
     Args:
         endpoints, weights, quantised: As for `reconstruct`.
@@ -223,13 +225,13 @@ def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weig
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:
-    """Writes the integers that the file stores for endpoints and weights.
+    """Writes the integers that the file stores for the endpoints and weights of S slices of H x W texels.
 
     Args:
-        endpoints: vec4 [S, H/4, W/4, 2].
-        weights: float [S, H, W].
-        bytes_out: vec4ub [S, H/4, W/4, 2], each endpoint's bytes with their shared lowest bit.
-        index_out: uint8 [S, H, W], 0 to 15.
+        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
+        weights: float [S, H, W], in [0, 1].
+        bytes_out: vec4ub [S, H/4, W/4, 2], written: each endpoint's bytes with their shared lowest bit.
+        index_out: uint8 [S, H, W], written: each weight's index, 0 to 15.
     """
     wp.launch(
         _quantise,

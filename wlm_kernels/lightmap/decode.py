@@ -23,8 +23,8 @@ from wlm_kernels.shared_exponent import pack_rgb9e5
 
 @wp.struct
 class Stored:
-    """Feature maps of N tiles as stored, with S slices in F_uvt. Static tiles have only `uv`; other arrays are
-    empty."""
+    """The stored feature maps of N tiles (see `features`), with S slices in F_uvt. In static tiles all arrays but `uv`
+    are empty."""
 
     uv: wp.array4d[wp.uint64]  # [N, 32, 32, 2]
     uvt: wp.array4d[wp.uint64]  # [N * S, R/4, R/4, 2]

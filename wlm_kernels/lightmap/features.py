@@ -23,7 +23,8 @@ CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles, with S slices in F_uvt. In static tiles all arrays but the first two are empty."""
+    """The feature maps of N tiles (see the module), with S slices in F_uvt. In static tiles all arrays but the first
+    two are empty."""
 
     uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
     uv_weights: wp.array3d[float]  # [N, 128, 128]
