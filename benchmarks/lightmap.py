@@ -357,7 +357,7 @@ class _LightmapBench(Bench):
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
             return []
-        self.note(f"{fit.option}: the fit in plain torch")
+        self.note(f"{fit.option}: fitting in plain torch")
         axis = TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis)
         peer = PlainFit(profile, axis, targets, device=self.device)
         peer.step().item()

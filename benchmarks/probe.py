@@ -309,7 +309,7 @@ class ProbeBench(Bench):
         ours = self.row(
             "fit", option, "with the first places", encode_seconds=fit.fit_seconds, step_ms=step_ms, **counts
         )
-        self.note(f"{fit.option}: the fit in plain torch")
+        self.note(f"{fit.option}: fitting in plain torch")
         peer = DenseFit(
             model.normalise(self.position),
             self.values,

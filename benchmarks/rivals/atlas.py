@@ -128,12 +128,12 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
         else:
             high = middle - 1
     if low == 0:
-        raise ValueError(f"share: {share} of {sheet.mask.shape} texels' bits is less than a block of {bits} bits")
+        raise ValueError(f"share: {share} leaves less than the {bits} bits of a block for texels {sheet.mask.shape}")
     return size(low), _read_blocks(sheet, size(low), block)
 
 
 def _read_blocks(sheet: Sheet, size: tuple[int, int], block: tuple[int, int]) -> int:
-    """Counts the blocks of a resized texture that bilinear reads at the centres of the charts' texels touch."""
+    """Counts the blocks of a resized texture that are read for bilinear samples at the centres of charts' texels."""
     place = (np.argwhere(sheet.mask) + 0.5) * (np.array(size) / sheet.mask.shape) - 0.5
     low = np.floor(place).astype(np.int64)
     # A read at a texel's centre touches only this texel.

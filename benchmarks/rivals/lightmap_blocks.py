@@ -100,7 +100,7 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: s
     """Encodes a lightmap as ASTC in blocks of 16 bytes, with astcenc: 8 bits a texel at 4x4 to 0.89 at 12x12.
 
     LDR stores levels with gamma 2.2, scaled by the range of each tile, as for BC7, but decodes them to 16 bits; HDR
-    stores radiance. Where a block spans two tiles, its range changes inside, which loses less quality than one range
+    stores radiance. A block that spans two tiles holds levels of two ranges, which loses less quality than one range
     for the whole map would.
 
     Args:

@@ -53,7 +53,7 @@ def seen_texels(mask: np.ndarray, ring: int = 2) -> np.ndarray:
 
 
 def clear_unseen(image: np.ndarray, seen: np.ndarray, block: int) -> np.ndarray:
-    """Makes blocks black of which renderers read no texel, as black compresses to few bytes. Returns the new image.
+    """Makes blocks black in which renderers read no texel, as black compresses to few bytes. Returns the new image.
 
     Args:
         image: [H, W, C].

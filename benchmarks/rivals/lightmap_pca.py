@@ -5,7 +5,7 @@ are a vector of 3 T numbers. A texel keeps the coefficients of its vector along 
 tile keeps the axes and the mean vector as half floats. Two functions store the maps of coefficients differently:
 
 - `encode_pca_bc4`: K maps as BC4 textures, 4 bits a texel each.
-- `encode_pca`: every map rounded with the same step, which gives the least squared error at a given rate; K follows
+- `encode_pca`: every map rounded with the same step, which gives the smallest squared error at a given rate; K follows
   from the step. A map takes a byte per texel in memory, and on disk it is lossless JPEG XL, a quarter smaller than
   with zstd.
 

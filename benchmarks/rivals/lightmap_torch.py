@@ -1,9 +1,9 @@
 """The temporal lightmap fit in plain torch: the peer that the fused kernels are timed and checked against.
 
-The same model, samples a step, optimiser, schedule and stages as `wlm.lightmap`, written with batched matrix products,
-`grid_sample` and autograd as neural-dynamic-gi, sections 3.3 to 4, describes it. It decodes from quantised values, as a
-file would hold them, but writes no file. Its feature maps can differ from a profile's, for the paper's ablations
-(section 11).
+It has the model, samples per step, optimiser, schedule and stages of `wlm.lightmap`, but is written with batched matrix
+products, `grid_sample` and autograd (neural-dynamic-gi, sections 3.3 to 4). It decodes from quantised values, as a file
+would hold them, but writes no file. Its feature maps can differ from a profile's, for the paper's ablations (section
+11).
 """
 
 import itertools

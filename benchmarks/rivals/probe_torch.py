@@ -1,8 +1,8 @@
 """The probe fit in plain torch: the reference for the speed and the quality of the kernels' fit.
 
-The same model as `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
-(eq. 5 without eq. 6), with autograd, on dense matrices of probes times Gaussians. Its start is the paper's: centres by
-k-means, scales from the nearest centre. It writes no file, and the network stays in float32.
+It fits the model of `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
+(eq. 5 without eq. 6). It uses autograd on dense matrices of probes times Gaussians. It starts as in the paper, with
+centres by k-means and scales from the nearest centre. It writes no file, and the network stays in float32.
 """
 
 import itertools
