@@ -25,7 +25,7 @@ _HIDDEN = 0.25  # share of rays that hit back faces above which a probe counts a
 
 @dataclass(frozen=True, eq=False)
 class BakedProbes:
-    """Probes over time.
+    """The N baked probes of a scene, for T hours.
 
     Attributes:
         hours: Hours in ascending order.
@@ -75,7 +75,7 @@ def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> 
 
 def _check_count(count: float) -> None:
     if not count <= _MOST:
-        raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: take a wider spacing")
+        raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: use a larger spacing")
 
 
 def bake_probes(
@@ -125,7 +125,7 @@ def bake_probes(
 
 
 def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
-    """Writes probes as `.npz`: `position`, `sh` for one hour or `sh_HOUR` for each of several, and likewise the noise.
+    """Writes probes as `.npz`: `position`; for one hour `sh` and `noise`, for several `sh_HOUR` and `noise_HOUR`.
 
     Raises:
         WlmError: The file can't be written.

@@ -96,10 +96,10 @@ class Lamp(_Settings):
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if (self.position is None) == (self.material is None):
-            raise ValueError("expected a lamp at a position or of a material")
+            raise ValueError("expected a lamp with either a position or a material")
         given = self.model_fields_set
         if ("radiance" in given and self.material is None) or ("intensity" in given and self.position is None):
-            raise ValueError("expected intensity with a position, radiance with a material")
+            raise ValueError("expected an intensity for a lamp with a position, a radiance for a lamp with a material")
         return self
 
     def is_lit(self, hour: float) -> bool:
@@ -181,9 +181,9 @@ class BakeScene(_Settings):
         if self.daylight is not None and self.sky is not None:
             raise ValueError("expected daylight or sky, found both")
         if len({f"{hour:.9g}" for hour in self.hours}) < len(self.hours):  # as files are named
-            raise ValueError("hours: expected each once, when rounded to nine digits")
+            raise ValueError("hours: expected different hours, found two that are equal in nine digits")
         if self.period is not None and not all(0 <= hour < self.period for hour in self.hours):
-            raise ValueError(f"hours: expected 0 to below the period of {self.period:g}")
+            raise ValueError(f"hours: expected hours of at least 0 and below the period of {self.period:g}")
         return self
 
     @property

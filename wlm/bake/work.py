@@ -59,9 +59,9 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
     if picture is not None:
         sky = np.ascontiguousarray(read_light(picture)[0][..., :3])
         if not np.isfinite(sky).all() or (sky < 0).any():
-            raise WlmError(f"{picture}: expected finite light, not negative")
+            raise WlmError(f"{picture}: expected finite light of at least 0, found other values")
         if sky.shape[1] != 2 * sky.shape[0]:
-            raise WlmError(f"{picture}: expected a picture twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
+            raise WlmError(f"{picture}: expected an image twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
         digest.update(sky)
     return Task(scene, Path(path), geometry, sky, digest.hexdigest(), trust)
 

@@ -35,14 +35,13 @@ CPU_LANES = 2
 
 
 def _padded(count: int) -> int:
-    """Returns the padded length of a tensor of `count` parameters."""
     # Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
     # CPUs: without a remainder, a tile is the same in any batch.
     return -(-count // _VECTOR) * _VECTOR
 
 
 def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns a flat, padded tensor of zeros for an optimiser, and a view of it in `shape`; both have gradients."""
+    """Returns a flat, padded tensor of zeros for the optimiser, and a view of it with `shape`; both have gradients."""
     count = math.prod(shape)
     stored = torch.zeros(_padded(count), device=device).requires_grad_()
     stored.grad = torch.zeros_like(stored)
@@ -244,7 +243,7 @@ class Trainer:
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
-        """Returns the learning rates and Adam's corrections at each step, vec3 [steps], for `gather.update_maps`."""
+        """Returns the learning rate and Adam's two bias corrections of each step, vec3 [steps]."""
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
@@ -327,7 +326,7 @@ class Trainer:
                 adam.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs `work(lane)` for each CPU lane in a thread of its own; kernel launches release Python's lock."""
+        """Runs `work(i)` for i below `CPU_LANES`, each in its own thread; kernel launches release Python's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
     def losses(self) -> np.ndarray:
@@ -361,7 +360,7 @@ class Trainer:
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
-        """Returns the map of this name as BC7 blocks, uint8 [S, H/4, W/4, 16]; S counts tiles, or tiles and slices."""
+        """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]: S images of H x W texels, one per tile or slice."""
         endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
         with interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
@@ -385,7 +384,7 @@ class Trainer:
         if bool(broken.any()):
             tile = self.numbers[broken.cpu().numpy()][0]
             raise WlmError(
-                f"tile {tile}: the fit diverged; expected a smaller map_rate or net_rate than {self._name}'s"
+                f"tile {tile}: the fit diverged; take a smaller map_rate or net_rate than in profile {self._name}"
             )
 
     def state(self) -> dict[str, np.ndarray]:
@@ -437,7 +436,7 @@ class Trainer:
                         adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
-        """Ends the threads that `_share` runs work in."""
+        """Ends the trainer's threads."""
         if self._pool is not None:
             self._pool.shutdown()
 
@@ -448,8 +447,8 @@ class Advance:
 
     Attributes:
         step: Number of steps done.
-        loss, psnr: Means over the batch's tiles, from the latest samples, see `Trainer`; NaN if not tracked. After the
-            last step they are means for the maps as the file holds them.
+        loss, psnr: Mean loss and mean PSNR in dB over the batch's tiles, from the latest samples; NaN if not tracked.
+            After the last step they describe the maps as the file holds them.
         parts: The maps and networks as the file holds them, once the batch is done.
     """
 
