@@ -26,7 +26,7 @@ MOST_SIDE = 16384
 """Largest side of a texture of all tiles, in texels."""
 
 MOST_LAYERS = 2048
-"""Largest number of layers of a texture array: stored times of tiles that are frames."""
+"""Largest number of layers of a texture array, and so of stored times if tiles are stored as frames."""
 
 _ABOUT = {
     "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
@@ -96,7 +96,7 @@ def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device: str = "cpu") -> Bundle:
-    """Makes the bundle of one sheet.
+    """Makes the bundle (shader, textures and buffers) of one sheet, which has up to three channels of a layer.
 
     The textures `uv` (BC7) and `uvt` (BC7) hold the feature maps F_uv and F_uvt of all tiles, `planes` (R8G8_UNORM)
     holds F_ut and F_vt side by side (neural-dynamic-gi, table 1), `frames` (BC7) has a layer for each stored time, and

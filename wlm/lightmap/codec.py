@@ -160,7 +160,7 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
             parts[name] = parts.get(name, 0) + value.nbytes
     parts["header"] = file_bytes - sum(parts.values())
     if parts["header"] < 0:
-        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")
+        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']} bytes, got {file_bytes}")
     return dict(sorted(((name, size) for name, size in parts.items() if size), key=lambda part: -part[1]))
 
 

@@ -1,6 +1,6 @@
 """Reads sets of lightmaps over time from files or arrays, checks them and repairs them.
 
-The rules for input. Each repair adds a line with the number of texels to `LightmapSet.warnings`:
+These are the rules for input; each repair adds a line with the number of texels to `LightmapSet.warnings`:
 
 - Inside the mask a NaN or infinite texel takes the value of the nearest finite texel at that time, negative channels
   are clamped to 0, and values above 65,504, the maximum of half floats, to 65,504. Outside the mask the same repairs
@@ -18,7 +18,7 @@ The rules for input. Each repair adds a line with the number of texels to `Light
   maps black to the range's lower end and white to its upper end. All states must have the same layers and channels, at
   most 12 channels in an atlas.
 
-Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
+The layout of a set and its evaluation follow neural-dynamic-gi, section 10.1.
 """
 
 import hashlib
@@ -56,8 +56,8 @@ class SheetFrames:
     Attributes:
         name: Name of the set; for any sheet but the ordinary lightmap, followed by the sheet's name.
         times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; if the sheet is linear, normalised
-            values in [0, 1]. Row 0 is v = 0. Arrays of more than 1 GiB are mapped from a file, see
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; if the sheet is not light,
+            normalised values in [0, 1]. Row 0 is v = 0. Arrays of more than 1 GiB are mapped from a file, see
             `wlm.formats.scratch`.
         mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
         period: Length of the day in the unit of `times`, all of which are then in [0, period); None if the set is not
@@ -103,10 +103,11 @@ class LightmapSet:
         return self.sheets[first_light(self.sheets)]
 
     def find(self, sheet: Sheet) -> SheetFrames:
-        """Returns the lightmaps of a sheet, or the only lightmaps of a set with one sheet.
+        """Returns the lightmaps of `sheet`. If the set has only one sheet, it returns the lightmaps of that sheet
+        instead.
 
         Raises:
-            WlmError: The set has several sheets, but not this one.
+            WlmError: The set has several sheets, and `sheet` is not one of them.
         """
         if sheet not in self.sheets and len(self.sheets) > 1:
             found = ", ".join(one.label for one in self.sheets)
@@ -144,7 +145,7 @@ class Layer:
     Attributes:
         frames: The pixels at each time, numeric `[T, H, W, C]`.
         name, atlas: Names of the layer and of the atlas.
-        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Names of the C channels; None: R, G, B, A, or numbers if there are more than four.
     """
 
@@ -263,7 +264,7 @@ def from_layers(
     Args:
         layers: The layers in the order in which they are stored; those of one atlas have the same height and width.
         times: `[T]`, in any order.
-        masks: For names of atlases, a mask as for `from_arrays`. In an atlas without a mask all texels are valid.
+        masks: Masks by the name of their atlas, as for `from_arrays`. In an atlas without a mask all texels are valid.
         period, name: As for `from_arrays`.
 
     Raises:
@@ -397,7 +398,7 @@ class _Reader:
             if pixels.shape[:2] != size:
                 raise WlmError(f"{source.path}: has {_size(pixels.shape)} pixels, but {first.path} has {_size(size)}")
             if layer.encoding != LIGHT.encoding and names != known:
-                raise WlmError(f"{source.path}: channels are {', '.join(names)}, in {first.path} {', '.join(known)}")
+                raise WlmError(f"{source.path}: channels {', '.join(names)}, but {first.path} has {', '.join(known)}")
             for sheet, frames in stack.frames.items():
                 frames[place] = sheet.to_levels(pixels[..., [names.index(name) for name in sheet.channels]])
             if stack.alpha is None:

@@ -78,7 +78,7 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
 def start_workers(
     devices: list[str], workers: int | None, cluster: str | None, batches: int, seed: int, track: bool
 ) -> Workers:
-    """Starts a `Fitter` for each device, or on a cluster at most one for each batch; with `track` it measures PSNR.
+    """Starts a `Fitter` for each device, or on a cluster at most one for each batch; with `track` they measure PSNR.
 
     Raises:
         WlmError: The cluster cannot be reached, or the system cannot start that many processes.
@@ -157,7 +157,7 @@ class Dispatch:
         self._workers.call(number, "start", run.batch.fit.job(run.batch), state)
 
     def _restart(self, number: int, why: Lost) -> None:
-        """Starts the batch of a worker that died again, from the batch's last saved state."""
+        """Restarts the batch of a dead worker from the batch's last saved state."""
         self._dead.add(number)
         run = self._running.pop(number, None)
         if run is None or self._stop is not None:

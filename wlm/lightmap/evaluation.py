@@ -38,7 +38,7 @@ _TIME_TOLERANCE = 1e-6  # stored times are float32 if that keeps them distinct, 
 
 @dataclass(frozen=True)
 class SheetReport(ShownScore):
-    """Error and size of one sheet (up to three channels of a layer). NaN: a mean without values or not computed.
+    """Error and size of one sheet (up to three channels of a layer). Scores that were not computed are NaN.
 
     The scores of `ShownScore` and `ViewScore` are attributes too.
 
@@ -314,7 +314,7 @@ def count_kinds(model: SheetModel) -> dict[str, int]:
 
 
 def _stored(model: SheetModel) -> np.ndarray:
-    """Returns the texels of the tiles that are not empty, bool [H, W]."""
+    """Returns which texels lie in tiles that are not empty, bool [H, W]."""
     grid = model.grid
     return grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
 

@@ -23,7 +23,7 @@ from wlm.system import Meter, OnProgress
 from wlm.workers import each
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE
-"""Texels times times in a batch: 64 tiles of 26 times, 330 MB of training data."""
+"""Number of texels, counted at each time, in a batch: 64 tiles at 26 times, 330 MB of training data."""
 
 CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""

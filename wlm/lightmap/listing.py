@@ -54,7 +54,7 @@ class LayerInfo:
 
     Attributes:
         name: Name of the layer.
-        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
     """
 
@@ -89,7 +89,7 @@ class Listing:
         name: Name of the set.
         where: The `set.json` or the folder.
         times: A time for each state, not yet checked.
-        period: Length of the day in the unit of the times, or None.
+        period: Length of the day in the unit of the times; None if the set is not periodic.
         layers, atlases: The layers and atlases, in the order of the set.
         states: For each time, the pictures by names of atlas and layer.
         labels: Name of each state (the pictures of one time) in messages.
@@ -108,7 +108,7 @@ class Listing:
 
     @property
     def files(self) -> list[Path]:
-        """The files of all pictures, state by state."""
+        """The files of all pictures, one time after another."""
         return [source.path for state in self.states for source in state.values()]
 
 
@@ -312,7 +312,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         named = _named(path, content, "atlases", "an object of atlases")
         atlases = tuple(_atlas(path, name, value, trust) for name, value in named.items())
     if len(layers) > MOST_CHANNELS or len(layers) * len(atlases) > MOST_SHEETS:
-        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers, or {MOST_SHEETS} over all atlases")
+        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers, {MOST_SHEETS} in all atlases together")
     entries = _field(path, content, "lightmaps", "", _is_list, "a list of lightmaps")
     name, period = path.resolve().parent.name, None
     if content.get("name") is not None:

@@ -164,7 +164,7 @@ class SheetModel:
 
     @property
     def scales(self) -> np.ndarray:
-        """The decoded scale of each tile with feature maps at each time, float32 [N_m, T, 3]."""
+        """The mean of each channel of each tile with feature maps at each time, as decoded, float32 [N_m, T, 3]."""
         kinds = self.kind[self.mapped]
         result = np.empty((len(kinds), len(self.times), 3), np.float32)
         result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)

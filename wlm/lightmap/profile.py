@@ -27,13 +27,13 @@ class Profile(Settings):
     hidden: int = Field(16, ge=4, le=128)
     """Units in each of the two hidden layers of the network."""
     uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
-    """Texels of F_uvt along u and along v."""
+    """Size of the feature map F_uvt along u and along v, in texels."""
     uvt_slices: int = Field(12, ge=1, le=_MOST_ALONG_TIME)
-    """Slices of F_uvt along time."""
+    """Number of slices of the feature map F_uvt along time."""
     plane_columns: int = Field(64, ge=1, le=128)
-    """Texels of F_ut along u and of F_vt along v."""
+    """Size of the feature maps F_ut along u and F_vt along v, in texels."""
     plane_rows: int = Field(24, ge=1, le=_MOST_ALONG_TIME)
-    """Texels of F_ut and F_vt along time."""
+    """Size of the feature maps F_ut and F_vt along time, in texels."""
     follow_times: bool = False
     """Adapt the sizes of the maps along time to the number of stored times, see `Profile.for_times`."""
     net_bits: Literal[8, 16] = 16
@@ -114,7 +114,7 @@ class TimeAxis:
 
     Attributes:
         times: float64 [T], increasing.
-        period: Length of the day in the unit of the times, or None.
+        period: Length of the day in the unit of the times; None if the set is not periodic.
         kind: "paper" or "frames", see `Profile.time_axis`.
         interpolation: "radiance" or "network", see `Profile.interpolation`.
     """

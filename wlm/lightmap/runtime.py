@@ -36,7 +36,7 @@ class RuntimeDecoder:
     _tiles: DeviceTiles
 
     def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
-        """Allocates the output; `shared` chooses RGB9E5. The time is initially the first stored one."""
+        """Allocates the output: RGB9E5 if `shared`, else 8-bit RGBA. The time is initially the first stored one."""
         self.model, self.device, self.shared = model, device, shared
         self.numbers = self._tiles.numbers
         self._rows = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
@@ -124,7 +124,7 @@ class _ScratchDecoder(_MapDecoder):
 
 
 class StripDecoder(_ScratchDecoder):
-    """Fast decoder of dynamic tiles: one thread decodes four texels (section 3.5).
+    """Fast decoder of dynamic tiles: one thread decodes four texels (neural-dynamic-gi, section 3.5).
 
     Attributes:
         gelu: The GELU variant in use.

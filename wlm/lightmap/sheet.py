@@ -20,8 +20,7 @@ from wlm.errors import WlmError
 from wlm.formats.limits import PICTURE_TEXELS
 
 VALUE_RANGES = {"radiance": (0.0, 1.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
-"""The values that levels 0 and 1 stand for, by encoding. The levels of radiance are the values and have no upper
-end."""
+"""The values that levels 0 and 1 stand for, by encoding. Radiance is its own level and has no upper limit."""
 
 MOST_CHANNELS = 12
 """Largest number of channels of an atlas, over all layers."""
@@ -46,7 +45,7 @@ class Sheet:
     Attributes:
         atlas, layer: Names of the atlas and of the layer.
         channels: One to three names of channels.
-        encoding: A key of `VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
     """
 
     atlas: str = "0"

@@ -135,7 +135,7 @@ class TileKind(IntEnum):
     EMPTY = 0
     """No valid texel: nothing is stored."""
     CONSTANT = 1
-    """One colour per time."""
+    """One colour at each time for all texels."""
     STATIC = 2
     """One colour per time and one pattern for all times: F_uv and a network."""
     DYNAMIC = 3
@@ -156,7 +156,7 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
         The N tiles.
 
     Raises:
-        WlmError: A number is outside the grid or given twice, or there is none.
+        WlmError: A tile's number is outside the grid or given twice, or `tiles` is empty.
     """
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)

@@ -31,7 +31,7 @@ _VECTOR = 16  # numbers in the widest vector of a CPU that torch uses (AVX-512)
 _CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
 
 CPU_LANES = 2
-"""Ranges of samples with separate sums; fixed, so that results do not depend on the number of cores."""
+"""Number of CPU threads, which sum gradients separately; fixed, so that results do not depend on the cores."""
 
 
 def _padded(count: int) -> int:
@@ -202,7 +202,7 @@ class Trainer:
             self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
-        """Returns the state of our GPU Adam for one array of parameters, with all moments 0."""
+        """Returns the state of the optimiser (Adam) on the GPU for one array of parameters, with all moments 0."""
         adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
@@ -343,7 +343,7 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """Returns maps and networks by their names in `SheetModel`; networks of static tiles are called `net` too."""
+        """Returns maps and networks as the file stores them, by their names in `SheetModel` (always `net`)."""
         nets = self.hidden.detach(), self.output.detach()
         if self._integers:
             nets = self._on_levels
@@ -467,7 +467,7 @@ class Fitter:
         self._trainer: Trainer | None = None
 
     def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
-        """Starts a batch, or continues it from a saved `state`; raises ValueError if that is of another batch."""
+        """Starts a batch, or continues it from a saved `state`; raises ValueError if it is another batch's."""
         self.close()
         options = job.dynamic, self._seed, self._device, self._track
         self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)

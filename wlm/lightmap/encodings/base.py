@@ -29,7 +29,7 @@ class DeviceTiles(ABC):
         self._row_of = {int(number): row for row, number in enumerate(numbers)}
 
     def among(self, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the tiles of this encoding among `numbers`: indices in `numbers` and `self.numbers`, int32 [k]."""
+        """Finds the tiles of this encoding in `numbers`; returns their indices there and in `self.numbers`, int32."""
         pairs = [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
         places, rows = np.array(pairs, np.int32).reshape(-1, 2).T
         return places, np.ascontiguousarray(rows)
@@ -81,7 +81,7 @@ class Encoding(ABC):
         """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none.
 
         Args:
-            sheet: The arrays.
+            sheet: The arrays of the sheet.
             device: As `wlm.interop.check_device` returns it.
             gelu: GELU variant of the networks, see `wlm_kernels.mlp`.
         """

@@ -32,7 +32,7 @@ from wlm.texels import REACH
 from wlm_kernels.lightmap import frames as frame_kernels
 
 EXTRA = "frames"
-"""The extra with the encoder."""
+"""Name of the extra (`pip install 'wlm[frames]'`) that installs the BC7 encoder."""
 
 _ENCODER = "ispc_texcomp"
 _RANGE_BYTES = 2 * 3 * 2  # two half floats for each channel of a frame
@@ -100,11 +100,11 @@ def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
 
 
 def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Encodes the frames of a tile.
+    """Encodes the frames of a tile at T times.
 
     Args:
         colour: float32 [T, 128, 128, 3], in gamma space, gaps filled.
-        valid: bool [128, 128].
+        valid: bool [128, 128], true where a texel of the tile is valid.
         needed: bool [32, 32], from `needed_blocks`.
 
     Returns:
@@ -171,7 +171,7 @@ class FrameTiles(DeviceTiles):
         """Decodes tiles with one kernel launch, which a CUDA graph can capture.
 
         Args:
-            time: A stored time, or a time between two, whose radiance is then interpolated (eq. 2).
+            time: A stored time, or a time between two, whose radiance is then interpolated (neural-dynamic-gi, eq. 2).
             rows: int [k], indices into `numbers`.
             out: [k, 128, 128]: radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds` 8-bit colour, uint32 (RGBA).
             inverse_bounds: float [n], 1 / the bound of each tile.

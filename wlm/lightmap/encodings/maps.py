@@ -1,5 +1,4 @@
-"""Encoding of tiles as feature maps and a network: static tiles have F_uv alone, dynamic ones also F_uvt, F_ut and
-F_vt.
+"""Encoding of tiles as feature maps and a network; static tiles have F_uv, dynamic tiles F_uv, F_uvt, F_ut and F_vt.
 
 In the file each tile is one zstd frame (`wlm.lightmap.codec`). Before packing, the blocks of BC7 mode 6 are split into
 bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. The fit sets texels
@@ -40,7 +39,7 @@ _MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynam
 
 
 def tile_bytes(profile: Profile, temporal: bool) -> int:
-    """Returns the bytes of the maps and the network of one tile before packing, as in table 3 of the paper."""
+    """Returns the bytes of the maps and the network of one tile before packing (neural-dynamic-gi, table 3)."""
     inputs, hidden = profile.inputs(temporal), profile.hidden
     if profile.net_bits == 16:
         size = TILE * TILE + 2 * mlp.parameter_count(inputs, hidden)
@@ -92,7 +91,7 @@ class Reads:
 
 
 def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray:
-    """Returns which of an axis's `count` texels a linear filter reads at each place in [0, 1], bool [places, count]."""
+    """Returns which of an axis's `count` texels a linear filter reads at positions in [0, 1], bool [places, count]."""
     x = np.asarray(places, np.float64) * count - 0.5
     first, last = np.floor(x - _SLACK), np.floor(x + _SLACK) + 1
     cells = np.zeros((len(x), count), bool)
@@ -305,7 +304,7 @@ class MapTiles(DeviceTiles):
         Args:
             state: From `state`.
             rows: int [k], indices into `numbers`.
-            form: Output: 0 for radiance (vec3), 1 for 8 bits, 2 for RGB9E5 (uint32).
+            form: Output: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for RGB9E5 (uint32).
             out: [k, 128, 128], written.
         """
         inputs = [*self.arguments, state, self.places, rows]
