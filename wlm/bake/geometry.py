@@ -184,7 +184,7 @@ def _surface(
 def unwrap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
 ) -> list[Replacement]:
-    """Creates UVs in one unit square for all primitives together; areas there are in proportion to areas in the world.
+    """Creates UVs in one unit square for all primitives together; UV areas are proportional to areas in the world.
 
     Returns:
         A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
@@ -249,7 +249,7 @@ def _without_lightmap(
 
 
 def _texture_sets(value: Any) -> list[int]:
-    """Returns the numbers n of the UV sets `TEXCOORD_n` that the textures in a part of the document use."""
+    """Returns the number n of each UV set `TEXCOORD_n` that a texture in this part of the document uses."""
     if isinstance(value, list):
         return [one for each in value for one in _texture_sets(each)]
     if not isinstance(value, dict):

@@ -184,7 +184,7 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
     """Checks, before a long bake, that lightmaps can be written to a folder.
 
     Raises:
-        WlmError: The folder isn't writable, or it contains other files.
+        WlmError: The folder isn't writable, or contains files other than an earlier bake.
     """
     claim(Path(folder), INDEX, FORMAT)
 
@@ -193,7 +193,7 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     """Writes a lightmap set for `wlm compress`, replacing an earlier one, and returns the paths of its files.
 
     Raises:
-        WlmError: The folder contains other files, or can't be written.
+        WlmError: The folder can't be written, or contains files other than an earlier bake.
     """
     folder = Path(folder)
     height, width = baked.mask.shape

@@ -1,4 +1,4 @@
-"""Bakes a scene's light probes for each hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
+"""Bakes a scene's light probes for each hour: RGB radiance in spherical harmonics, on surfaces or in a lattice."""
 
 import math
 import os
@@ -30,7 +30,7 @@ class BakedProbes:
     Attributes:
         hours: Hours in ascending order.
         position: float32 [N, 3], metres.
-        values: float32 [T, N, 9, 3], orthonormal SH of radiance, RGB; 0 for a probe inside an object.
+        values: float32 [T, N, 9, 3], radiance in nine orthonormal spherical harmonics, RGB; 0 inside an object.
         noise: float32 [T, N, 9, 3], standard errors of the values.
     """
 

@@ -55,7 +55,7 @@ def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, super
     Surfaces without lightmap UVs are skipped; `where` names the geometry in errors.
 
     Raises:
-        WlmError: There are too many samples, no triangle covers one, or charts overlap.
+        WlmError: There are too many samples, no triangle covers any sample, or charts overlap.
     """
     used = [each for each in surfaces if each.uv is not None]
     side = resolution * supersample

@@ -29,7 +29,7 @@ class Task:
         path: The YAML file.
         geometry: The glTF file.
         sky: The environment map, float32 [H, W, 3], or None.
-        source: 32 hexadecimal digits of BLAKE2b over the geometry and the environment map.
+        source: Hash of the geometry and the environment map: 32 hexadecimal digits of BLAKE2b.
         trust: Whether the files may refer to files outside their folder.
     """
 
