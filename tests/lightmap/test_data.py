@@ -134,7 +134,7 @@ def test_mask_from_alpha_may_differ_by_frame(tmp_path):
     expected[1, 1] = False
     np.testing.assert_array_equal(lightmaps.mask, expected)
     np.testing.assert_array_equal(lightmaps.covered, frames[..., 3] > 0)
-    assert "2 texels are in some lightmaps alone" in lightmaps.warnings[0]
+    assert "2 texels are valid in only some lightmaps" in lightmaps.warnings[0]
     # What a frame lacks is the nearest frame's; the rest is as it was.
     for i in range(len(frames)):
         assert np.array_equal(lightmaps.valid(i), frames[i, ..., 3] > 0)

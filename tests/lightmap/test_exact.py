@@ -157,9 +157,7 @@ def _changed(tmp_path, **tensors) -> str:
 
 
 def test_damage_is_one_line(tmp_path):
-    assert "part ranges: expected the least colour of a frame not to exceed" in _changed(
-        tmp_path, ranges=lambda v: v[:, :, ::-1]
-    )
+    assert "part ranges: expected the least colour" in _changed(tmp_path, ranges=lambda v: v[:, :, ::-1])
     assert "part ranges: expected numbers of at least 0" in _changed(tmp_path, ranges=lambda v: v - np.float16(2.0))
 
 
