@@ -537,8 +537,8 @@ class _States:
             _fill_in_time(frames, covered, times, period)
             missing = np.count_nonzero(mask & ~covered.all(0))
             warnings.append(
-                f"{where}: {missing} texels are valid in only some lightmaps: at other times they are fitted to the light "
-                "of the nearest time at which they are valid, and are not scored"
+                f"{where}: {missing} texels are valid in only some lightmaps: at other times they are fitted to the "
+                "light of the nearest time at which they are valid, and are not scored"
             )
         return SheetFrames(
             name=name if sheet == LIGHT else f"{name} {sheet.label}",
