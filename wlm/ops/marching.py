@@ -68,10 +68,10 @@ def march(
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
     check("density", density, (None, None, None))
     if 0 in density.shape:
-        raise ValueError(f"density: expected voxels, got {tuple(density.shape)}")
+        raise ValueError(f"density: expected at least one voxel, got {tuple(density.shape)}")
     device = density.device
     if (toward is None) != (colour is None):
-        raise ValueError("toward, colour: expected both or neither")
+        raise ValueError("toward, colour: expected both arguments or neither, got one")
     if toward is None or colour is None:
         toward = colour = density.new_empty(0, 3)
     check("toward", toward, (None, 3), device)
@@ -100,7 +100,7 @@ def march(
 
 
 class _March(torch.autograd.Function):
-    """Computes each ray's light scattered from each light (colour 1, no phase function), emission and optical depth."""
+    """Computes per ray the scattered light of each light (colour 1, no phase function), emission and optical depth."""
 
     @staticmethod
     def forward(ctx, density, emission, toward, origin, direction, step):

@@ -33,8 +33,8 @@ def plane(
         float [..., C].
 
     Raises:
-        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. Finding that
-            out waits for the GPU and is skipped while a CUDA graph is captured.
+        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. The check
+            of numbers waits for the GPU and is skipped while a CUDA graph is captured.
     """
     return sample(values, points, layer, periodic, axes=2)
 
@@ -110,7 +110,7 @@ def sample(
     """Implements `plane` (`axes` = 2) and `volume` (3); `names`: names of the values and the points in messages."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
-        raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")
+        raise ValueError(f"{names[0]}: expected at least one cell and one channel, got {tuple(values.shape)}")
     check(names[1], points, (*points.shape[:-1], axes), values.device)
     check_finite(**dict(zip(names, (values, points), strict=True)))
     shape = points.shape[:-1]

@@ -1,6 +1,6 @@
 """Compares pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
 
-50 viewers stand along the loop of `wlm evaluate --volume`, each looking in another direction with a field of view of 90
+50 viewers stand along a loop through the scene (`camera_path`), each with another direction and a field of view of 90
 degrees. They see balls at a subset of the probes, and the scene's mesh if it is given; all surfaces are diffuse and
 white. Three kinds of light are compared with the original probes:
 
@@ -105,7 +105,7 @@ def score_views(
     if count is None:
         raise WlmError(f"{probes.name}: expected spherical harmonics, found {probes.outputs} numbers per probe")
     if views < 1 or not 16 <= resolution <= 4096:
-        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels a side, got {views} of {resolution}")
+        raise WlmError(f"views: expected at least 1, with 16 to 4096 pixels a side, got {views} with {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
     things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})
@@ -131,8 +131,7 @@ def score_views(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles without shared corners, vertex normals float64 [V, 3], and the probe's number of each triangle or
-    -1."""
+    """Triangles without shared corners, vertex normals float64 [V, 3], and each triangle's probe (index or -1)."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -147,7 +146,7 @@ def _split(geometry: Geometry) -> _Mesh:
 
 
 class _Scene:
-    """The original and the decoded probes, and a volume of each around a viewer."""
+    """The original and the decoded probes, each with a cascaded lighting volume around the viewer."""
 
     def __init__(self, probes: ProbeSet, decoded: np.ndarray, live: np.ndarray, count: int, device: str) -> None:
         self._position, self._count = probes.position[live], count
@@ -199,7 +198,6 @@ class _Scene:
 
 
 def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields the position and the viewing direction of each viewer."""
     plan = [axis for axis in range(3) if axis != up]
     for number, eye in enumerate(camera_path(position, views, up=up)):
         angle = number * _GOLDEN_ANGLE
@@ -230,8 +228,8 @@ def _look(
 
 
 def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
-    """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3]; pixels not in `seen` are
-    black."""
+    """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3], at the pixels `seen`;
+    the other pixels are black."""
     count = values.shape[1]
     factor = np.array([cosine_factor(band) for band in coefficient_bands(count).tolist()])
     light = np.einsum("pc,pcd->pd", basis(normal, count) * factor, values) / math.pi * exposure

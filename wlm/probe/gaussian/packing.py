@@ -1,10 +1,10 @@
 """Quantises a fit for its file: integers with steps as coarse as an error budget allows.
 
 Numbers that are rounded later compensate for the rounding of earlier ones. The latents are fitted again to the rounded
-Gaussians, so that their sums at the probes stay; each layer of the network is fitted to the original inputs of the next
-layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows compensate for the
-rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained Transformers, 2023).
-Steps are chosen so that a bit reduces the error by about the same amount in each group of numbers.
+Gaussians, so that their weighted sums at the probes hardly change; each layer of the network is fitted to the original
+inputs of the next layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows
+compensate for the rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained
+Transformers, 2023). Steps are chosen so that one more bit reduces the error about equally in each group of numbers.
 """
 
 import math
@@ -54,12 +54,12 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
 
     Args:
         model: The fit, whose Gaussians have no whole numbers yet.
-        position: float64 [N, 3], of the live probes.
-        values: float32 [N, D].
+        position: float64 [N, 3], positions of the live probes.
+        values: float32 [N, D], the numbers of these probes.
         device: Device on which results are compared with the fit.
 
     Returns:
-        The coarsest model found that loses at most `DROP`, or a model with fine steps if there is none.
+        The coarsest model found that loses at most `DROP` dB; if none does, a model with fine steps.
     """
     content = model.content
     assert isinstance(content, Gaussians)
@@ -106,15 +106,14 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """The weights of Gaussians [K, 9] at the probes, float64 [N, K]; None, to save memory, with more than `_TOGETHER`
-    Gaussians."""
+    """K Gaussians, `rows` [K, 9], and their weights at N probes; None, to save memory, above `_TOGETHER` Gaussians."""
 
     rows: np.ndarray
     weight: torch.Tensor | None = None
     square: np.ndarray | None = None
-    """weight^T weight."""
+    """weight^T weight, float64 [K, K]."""
     feed: np.ndarray | None = None
-    """`_feed` of `square`."""
+    """Result of `_feed` for `square`."""
 
 
 class _Search:
@@ -165,7 +164,7 @@ class _Search:
         return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
 
     def _natural(self) -> np.ndarray:
-        """Returns steps, float64 [8], with which all groups of numbers add about the same error."""
+        """Returns the fields of `_Steps`, float64 [8], with which all groups of numbers add about the same error."""
         rows, (first, second, third) = self._rows, self._layers
         latents = first[: len(self._of_latent)]
         slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
@@ -259,14 +258,13 @@ def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: fl
 
 
 def _feed(square: np.ndarray, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a matrix, to whose diagonal a ridge was added."""
+    """Returns the upper Cholesky factor of the inverse of a matrix plus a ridge, with which `_fed` corrects rows."""
     inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
     return linalg.cholesky(0.5 * (inverse + inverse.T))
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
-    """Rounds numbers [I, O] row by row to integers of at most `most`; each row compensates for the rounding of earlier
-    rows."""
+    """Rounds numbers [I, O] row by row to integers of at most `most`; later rows compensate for the rounding error."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
         whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
@@ -285,7 +283,7 @@ def _with_one(inputs: torch.Tensor) -> torch.Tensor:
 
 
 def _positive(numbers: np.ndarray) -> np.ndarray:
-    """Replaces numbers below a thousandth of the largest number by that thousandth."""
+    """Replaces numbers below a thousandth of the largest number by the largest number."""
     most = float(numbers.max()) or 1.0
     return np.where(numbers > 1e-3 * most, numbers, most)
 

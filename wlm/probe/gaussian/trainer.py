@@ -51,7 +51,7 @@ class Trainer:
         steps: Number of steps of the whole fit.
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
-        dropped_change: Largest change of any probe's number that dropping Gaussians causes.
+        dropped_change: Largest change of a number of a probe that results from dropping Gaussians.
     """
 
     def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str) -> None:
@@ -172,7 +172,7 @@ class Trainer:
                 self._stages[stage]()
 
     def _enter(self, stage: int) -> None:
-        """Starts a stage: sets the range of the codes, or fixes the Gaussians."""
+        """Starts a stage: 1 sets the range of the codes; 2 fixes the Gaussians and drops those that no probe needs."""
         t = self._tensors
         if stage == 1:
             t["bounds"].copy_(torch.stack([t["rows"].amin(0), t["rows"].amax(0)]))
@@ -182,7 +182,7 @@ class Trainer:
         self._entered = stage
 
     def finish(self) -> None:
-        """Runs the starts of stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
+        """Starts the stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
         with interop.stream(self.device):
             while self._entered < 2:
                 self._enter(self._entered + 1)
@@ -237,7 +237,7 @@ class Trainer:
         self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
 
     def _share(self, total: int, work) -> None:
-        """Calls `work` for all rows: in one call on CUDA, in two halves on two threads on the CPU."""
+        """Calls `work` for all `total` items: once on CUDA, for two halves on two threads on the CPU."""
         if self._cuda:
             work()
             return
@@ -246,9 +246,8 @@ class Trainer:
         list(self._pool.map(lambda lane: work(*lane), lanes))
 
     def _prune(self) -> None:
-        """Drops Gaussians without which no decoded number changes by more than the limit. Gaussians are dropped in the
-        order of an upper bound of their influence on the probes, as many as together stay within the limit. One
-        Gaussian is always kept."""
+        """Drops as many Gaussians as possible while no decoded number changes by more than `_PRUNE` of the range of all
+        numbers. The Gaussians with the least influence on the probes go first; at least one is kept."""
         t, latent = self._tensors, self._tensors["used"][:, LATENT]
         # With a gradient of one in one channel, the first sum of the latent is the sum of the Gaussian's weights.
         t["grad_f"].zero_()
@@ -283,7 +282,7 @@ class Trainer:
         self.needed[order[:low].cpu().numpy()] = False
 
     def _decoded(self) -> torch.Tensor:
-        """Returns the network's normalised output for the probes' sums of latents, float32 [N, D]."""
+        """Returns the network's output at all probes before it is scaled to the probes' numbers, float32 [N, D]."""
         parts = self._tensors["net"].split([rows * columns for rows, columns in self._layers])
         first, second, third = (part.view(shape) for part, shape in zip(parts, self._layers, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
@@ -297,7 +296,7 @@ class Trainer:
         return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
 
     def quantised(self) -> Gaussians:
-        """Returns the fit with 16-bit codes, but without integers for a file. The network's last layer yields the
+        """Returns the fit with 16-bit codes, but without the integers for a file. The network's last layer yields the
         probes' numbers divided by `gain`, the largest weight of this layer."""
         d = self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
@@ -332,7 +331,7 @@ class Trainer:
         """
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
         if not all(map(all_finite, result.values())):
-            raise WlmError(f"the fit diverged; expected smaller rates than those of {self._name}")
+            raise WlmError(f"the fit diverged; use smaller learning rates than {self._name}")
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def table(self, step: int) -> dict[str, Part]:
@@ -354,7 +353,7 @@ class Trainer:
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
-            raise ValueError("parts kept, bounds: expected a Gaussian, and no lowest value above its highest")
+            raise ValueError("parts kept, bounds: expected a kept Gaussian, and lowest values at most the highest")
         for key in _STATE:
             self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
         self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
@@ -365,7 +364,7 @@ class Trainer:
                 self._features()
 
     def close(self) -> None:
-        """Ends the CPU's threads and frees the graphs, which reference the trainer."""
+        """Ends the CPU's threads and frees the CUDA graphs, which hold references to the trainer."""
         self._stages = []
         if self._pool is not None:
             self._pool.shutdown()

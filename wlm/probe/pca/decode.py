@@ -16,7 +16,7 @@ _BUDGET = 1024  # blocks that the volume decodes per frame; it is awaited
 
 
 class ComponentDecoder(Decoder):
-    """A model of principal components on a device, where it stays packed; also a `wlm.probe.volume.light.Light`.
+    """A model of principal components on a device, stored packed; implements `wlm.probe.volume.light.Light`.
 
     Attributes:
         count: Number of probes, N.

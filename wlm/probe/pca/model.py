@@ -68,7 +68,7 @@ def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> i
 
 
 def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[Components, float]:
-    """Compresses live probes in as few components as reach the error `ENOUGH`.
+    """Compresses live probes with the fewest components whose relative error is at most `ENOUGH`.
 
     Args:
         values: float32 [V, D], numbers of live probes; no row is zero.

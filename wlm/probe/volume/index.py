@@ -62,7 +62,7 @@ class BlockIndex:
         if position.ndim != 2 or position.shape[1] != 3:
             raise ValueError(f"position: expected [N, 3], got {position.shape}")
         if not (np.abs(position) <= _FARTHEST).all():
-            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or more")
+            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or a larger number")
         if not 0.0 < side < np.inf:
             raise ValueError(f"side: expected a positive number, got {side}")
         self.count = len(position)
@@ -128,7 +128,7 @@ def finest_side(position: np.ndarray) -> float:
 
 
 def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> np.ndarray:
-    """Returns the Morton keys of a level's blocks that have at least the smallest weight at a probe."""
+    """Returns the Morton keys of a level's blocks whose weight at some probe is at least `_LEAST`."""
     # Distances in sides from the centre of block 0, as integer and fraction; the index of a cell is exact.
     half = cell // ratio - 1
     whole = half >> 1
