@@ -149,7 +149,7 @@ def test_conventions_that_do_not_fit(tmp_path):
     path = _write(tmp_path / "a.npz", sh=_values(N, 16, 3))
     assert load(path, convention="godot").outputs == 48
     message = error_of(load, path, convention="unity")
-    assert str(path) in message and "knows L0 to L2, got L3" in message
+    assert str(path) in message and "expected bands L0 to L2, got L3" in message
     for values in (_values(N, 5), _values(N, 6), _values(N, 5, 3)):
         assert from_arrays(_position(), values).outputs == np.prod(values.shape[1:])
         assert "expected spherical harmonics" in error_of(from_arrays, _position(), values, convention="unreal")

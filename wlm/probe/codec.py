@@ -45,7 +45,7 @@ _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file: `count` is the number of Gaussians or components; `profile` has the compression method."""
+    """The header of a file: `count` is the number of Gaussians or components; `profile.method` is the method used."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
@@ -62,7 +62,7 @@ class _NameHeader(Header):
 
 
 def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns a file's content for `wlm.formats.artifact`: no settings, the one array of bytes, and no source hash.
+    """Encodes a model for `wlm.formats.artifact`: returns no settings, one array of bytes, and an empty source hash.
 
     Raises:
         ValueError: The model's Gaussians have not been quantised to integers.

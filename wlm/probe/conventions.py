@@ -79,11 +79,11 @@ def _factors(coefficients: int, name: str) -> np.ndarray:
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:
-        raise WlmError(f"convention {name}: expected 1, 4, 9 ... coefficients a channel, got {coefficients}")
+        raise WlmError(f"convention {name}: expected 1, 4, 9 ... coefficients per colour channel, got {coefficients}")
     bands = coefficient_bands(coefficients)
     highest, last = bands[-1], _LAST_BAND.get(name, bands[-1])
     if highest > last:
-        raise WlmError(f"convention {name}: knows L0 to L{last}, got L{highest} ({coefficients} coefficients)")
+        raise WlmError(f"convention {name}: expected bands L0 to L{last}, got L{highest} ({coefficients} coefficients)")
     if name == "godot":
         return np.full(coefficients, 1.0 / math.pi)
     if name == "unreal":

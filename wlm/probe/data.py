@@ -96,7 +96,7 @@ class _Raw:
 def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
     """Reads light probes from a file.
 
-    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
+    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if `sh...` is not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`.
@@ -169,7 +169,7 @@ def from_arrays(
         position: [N, 3] of numbers; copied.
         values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
         name: Name of the set, also used in messages.
-        key: Name of the values.
+        key: Name of the array of values.
         convention: Convention of the values, one of `wlm.probe.conventions.CONVENTIONS`.
         normal: [N, 3], normal of each probe's surface, of any length, 0 for a probe on no surface; copied.
         valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
@@ -276,7 +276,7 @@ _READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".as
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
-    """Returns the name of the array of values: `key`, with or without "sh_", or else the only name with "sh"."""
+    """Returns the name of the array of values: `key`, with or without "sh_", or else the only one that begins "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]

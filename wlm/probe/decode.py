@@ -48,10 +48,10 @@ class Decoder(ABC):
                 surface.
 
         Returns:
-            float32 [M, D].
+            float32 [M, D], for each point as many numbers as a probe has.
 
         Raises:
-            WlmError: A position is not finite, or the model needs the positions of its probes and has none.
+            WlmError: A position is not finite, or the decoder needs the positions of the probes, and they are unknown.
             ValueError: The shape is different.
         """
 
@@ -60,7 +60,7 @@ class Decoder(ABC):
         """Returns the light of the model's own probes, float32 [N, D], zero for dead probes.
 
         Raises:
-            WlmError: The method needs the positions of the probes, and there are none.
+            WlmError: The decoder needs the positions of the probes, and they are unknown.
         """
 
     @abstractmethod

@@ -15,7 +15,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
     """Returns the light of Gaussians at points, by the sum over all Gaussians.
 
     Implements gaussian-probe-compression, eq. 2 to 7 and 14. The sum jumps where a Gaussian's support ends, by up to
-    exp(-CUT^2 / 2) = 0.011 times the Gaussian's latent. Kernels differ from it where float32 crosses this edge.
+    exp(-CUT^2 / 2) = 0.011 times the Gaussian's latent. Kernels can differ from it near this edge, in float32.
 
     Args:
         model: A model of Gaussians.

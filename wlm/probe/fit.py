@@ -38,7 +38,7 @@ def open_checkpoint(
     """Opens the checkpoint of a fit, the file `OUTPUT.partial`.
 
     Args:
-        output: The file that the fit is for.
+        output: The model's file, which is written when the fit is finished.
         probes, profile, seed: The arguments of `compress`; the checkpoint is only valid for them.
         device: Only its kind matters: a fit can continue on another GPU.
         resume: Whether to continue from the file, if it exists.

@@ -28,7 +28,7 @@ def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.n
     """Returns the names of the probes' fields, and a function that reads the field of a name as an array.
 
     Raises:
-        WlmError: The content has neither form. The returned function raises it if a field is missing or not numeric.
+        WlmError: The content has another form. The returned function raises it if a field is missing or not numeric.
     """
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected a JSON object, got {kind_of(content)}")
@@ -55,7 +55,7 @@ def _rows(path: Path, holder: dict, field: str) -> list:
 
 
 def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
-    """Converts nested lists of one shape to an array, of booleans only for fields that allow them.
+    """Converts nested lists of one shape to an array; booleans are allowed only in the fields `_FLAGS`.
 
     Raises:
         WlmError: The lists have several shapes, or an element is not a number.

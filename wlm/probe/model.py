@@ -90,7 +90,7 @@ class Content(ABC):
 
     @abstractmethod
     def decoder(self, model: "ProbeModel", device: str, **options: Any) -> Any:
-        """Loads a model with this content onto a device."""
+        """Loads a model with this content onto a device and returns its decoder."""
 
     @abstractmethod
     def gpu_form(self, model: "ProbeModel", decoder: Any) -> GpuForm:
@@ -108,7 +108,7 @@ class ProbeModel(Model):
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
-        profile: Settings of the fit, with the method that was used; for PCA only the name.
+        profile: Settings of the fit, with the method that was used; PCA has no other settings.
         probes: Number of probes, N.
         outputs: Numbers per probe, D: 27 for second-order spherical harmonics in three colours.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.
@@ -148,15 +148,15 @@ class ProbeModel(Model):
 
     @property
     def has_positions(self) -> bool:
-        """Whether the probes' positions are stored."""
+        """Whether the model stores the positions of its probes."""
         return len(self.positions) > 0
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
-        """Loads the model onto a device.
+        """Loads the model onto a device and returns its decoder.
 
         Args:
             device: "cpu" or "cuda:N".
-            options: Options of the method's decoder.
+            options: Further arguments of the decoder, such as `position`.
 
         Raises:
             WlmError: The device does not exist, or the options do not fit the model.

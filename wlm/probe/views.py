@@ -178,8 +178,8 @@ class _Scene:
             settle(volume, eye)
 
     def lights(self, place: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
-        """Yields SH coefficients, float64 [P, C, 3], at points [P, 3] or at their probes (`owner`): the original light,
-        then each of `KINDS`."""
+        """Yields SH coefficients, float64 [P, C, 3], of the original light and of each of `KINDS`, at points [P, 3] or,
+        where `owner` is not -1, at the probes with these indices."""
         ahead = None
         if owner[0] >= 0:
             direct = [values[owner] for values in self._values]
@@ -209,8 +209,8 @@ def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.nda
 def _look(
     mesh: _Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Renders a mesh from a viewer. Returns the visible pixels, bool [H, W], and for the P visible pixels the points
-    and normals, [P, 3] each, and the probes' numbers, [P]."""
+    """Renders a mesh from a viewer. Returns the pixels that show it, bool [H, W], and for these P pixels the surface
+    points and normals, [P, 3] each, and the indices of the surfaces' probes, [P]."""
     triangle = torch.arange(len(mesh.position), dtype=torch.int32, device=device).reshape(-1, 3)
     clip = torch.tensor(clip_from(mesh.position, eye, forward, up), device=device)
     with torch.no_grad():

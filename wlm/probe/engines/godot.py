@@ -56,8 +56,8 @@ def write_kit(
     If the decoder needs the probes' positions and the model stores none, they are read from `original`.
 
     Raises:
-        WlmError: A probe has not 9 coefficients, `cells` is out of range or given with an `.lmbake`, the `.lmbake` has
-            other probes, the light exceeds float32, or the device does not exist.
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the
+            `.lmbake` has other probes, the light exceeds float32, or the device does not exist.
     """
     model = bundle.model
     bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
@@ -81,7 +81,7 @@ def write_kit(
         if cells is not None:
             raise WlmError(f"cells: expected none with {bake}: the light goes to the probes of this bake")
         if model.outputs != NUMBERS:
-            raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (9 SH in RGB), got {model.outputs}")
+            raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
         places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
     (folder / BAKE_FILE).write_bytes(content)

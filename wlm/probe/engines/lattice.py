@@ -62,11 +62,11 @@ def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | 
         device: Where the light is decoded.
 
     Raises:
-        WlmError: A probe has not 9 coefficients, `cells` is out of range, the device does not exist, or the decoder
-            needs the probes' positions and none are known.
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the device does not exist, or the
+            decoder needs the probes' positions and none are known.
     """
     if model.outputs != NUMBERS:
-        raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (9 SH in RGB), got {model.outputs}")
+        raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
     if not 1 <= cells <= most:
         raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
     span = model.extent * model.size

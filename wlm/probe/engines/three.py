@@ -79,7 +79,7 @@ def write_kit(
     the probes' positions and the model stores none.
 
     Raises:
-        WlmError: A probe has not 9 coefficients in RGB, `cells` is out of range, the light exceeds half floats, or the
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds half floats, or the
             device does not exist.
     """
     model = bundle.model
@@ -108,8 +108,7 @@ def write_kit(
 
 
 def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Packs the values of probes, [nz * ny * nx, 27] in the order of `Lattice.centres`, to float16 [7 (nz + 2), ny, nx,
-    4]."""
+    """Packs probes, [nz * ny * nx, 27] as `Lattice.centres`, to the texels, float16 [7 (nz + 2), ny, nx, 4]."""
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
     padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)

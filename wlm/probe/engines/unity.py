@@ -1,8 +1,8 @@
 """Exports light to Unity: the numbers of `SphericalHarmonicsL2` in JSON, and a component that applies them to a scene.
 
 Unity creates `LightProbes` only by baking, but scripts may replace the baked light, `LightProbes.bakedProbes`. Before a
-bake, the component places a `LightProbeGroup` at the model's positions; after it, it gives each of the scene's probes
-the light of the model's probe there. `sh[channel, coefficient]` follows the convention "unity".
+bake, the component places a `LightProbeGroup` at the model's positions; after the bake, it gives each of the
+scene's probes the light of the model's probe at its place. `sh[channel, coefficient]` follows the convention "unity".
 """
 
 import os
@@ -188,7 +188,7 @@ def write_kit(
     model, position = bundle.model, positions_of(bundle.model, original)
     coefficients = sh_count(model.outputs)
     if coefficients is None or coefficients > _L2:
-        raise WlmError(f"{model.name}: expected 3, 12 or 27 numbers per probe (SH in RGB), got {model.outputs}")
+        raise WlmError(f"{model.name}: expected 3, 12 or 27 numbers per probe (RGB SH, up to L2), got {model.outputs}")
     if model.probes > _MOST_PROBES:
         raise WlmError(f"{model.name}: expected at most {_MOST_PROBES} probes, got {model.probes}")
     if mirror is not None and mirror not in tuple(_AXES):

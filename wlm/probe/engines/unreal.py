@@ -123,7 +123,7 @@ def write_kit(
     is the file that was compressed, required if the decoder needs positions and the model stores none.
 
     Raises:
-        WlmError: A probe has not 9 coefficients in RGB, `cells` is out of range, the light exceeds 11-bit floats, or
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds 11-bit floats, or
             the device does not exist.
     """
     model = bundle.model

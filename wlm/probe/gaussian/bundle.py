@@ -94,7 +94,7 @@ def _network_words(content: Gaussians) -> np.ndarray:
 
 
 def _reference_positions(model: ProbeModel, content: Gaussians) -> np.ndarray:
-    """Returns points for the reference, float64 [M, 3]: Gaussians' centres, evenly spaced by index, and one outside."""
+    """Returns points to decode as examples, float64 [M, 3]: some Gaussians' centres, and a point outside the box."""
     chosen = np.unique(np.linspace(0, content.count - 1, min(content.count, _REFERENCES)).astype(int))
     inside = content.rows()[chosen, CENTRE].astype(np.float64)
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])

@@ -106,7 +106,8 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """K Gaussians, `rows` [K, 9], and their weights at N probes; None, to save memory, above `_TOGETHER` Gaussians."""
+    """K Gaussians, `rows` [K, 9], and their weights at the N probes, float64 [N, K]. To save memory, they are None if
+    there are more than `_TOGETHER` Gaussians."""
 
     rows: np.ndarray
     weight: torch.Tensor | None = None

@@ -58,8 +58,8 @@ class Trainer:
         """Starts a fit.
 
         Args:
-            x: float32 [N, 3], normalised positions of the live probes.
-            values: float32 [N, D].
+            x: float32 [N, 3], positions of the live probes relative to their box, in [0, 1].
+            values: float32 [N, D], the numbers of these probes.
             profile: The settings.
             seed: Seed of the fit; the same seed gives the same result on one device.
             device: "cpu" or "cuda:N".
@@ -400,8 +400,8 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns how much the light varies around each probe.
 
     Args:
-        x: [N, 3].
-        values: [N, D].
+        x: [N, 3], positions of the probes.
+        values: [N, D], the numbers of these probes.
 
     Returns:
         float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
@@ -421,8 +421,8 @@ def first_gaussians(
     section 3.2).
 
     Args:
-        x: float32 [N, 3], normalised positions.
-        values: float32 [N, D].
+        x: float32 [N, 3], positions of the probes relative to their box, in [0, 1].
+        values: float32 [N, D], the numbers of these probes.
         count: Number of Gaussians; reduced to the number of distinct positions.
         detail, first_scale: See `wlm.probe.model.Profile`.
         random: Source of random numbers.

@@ -2,7 +2,7 @@
 
 It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
 of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
-without a probe near it is never queued, takes no memory and is missing when light is read. Light is read from the
+without a probe near it is never decoded, takes no memory and is missing when light is read. Light is read from the
 finest level that has a block there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights`
 describes the light of a block.
 
@@ -53,7 +53,7 @@ class FrameStats:
         entered: Blocks that entered a window, the cube of blocks around the viewer at each level, empty ones included.
         queued: Entered blocks that have to be decoded.
         dropped: Queued blocks that left their window before they were decoded.
-        updated: Blocks decoded and written, at most the budget.
+        updated: Blocks decoded and written, at most `Volume.budget`.
         cached: Blocks that entered a window and were still in memory from earlier frames.
         left: Queued blocks that still wait to be decoded.
         probes: Probes decoded; a probe counts once for each block that it contributes to.
