@@ -35,8 +35,8 @@ def march(
     lattice, spaced by a step but at least a voxel, and interpolated trilinearly between them.
 
     All lengths are in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
-    density and emission are trilinear between centres, with zero outside the grid. Time grows with rays times steps,
-    and for each light with voxels times steps.
+    density and emission are trilinear between centres, with zero outside the grid. Run time is proportional
+    to rays times steps, plus voxels times steps for each light.
 
     The density, the lights' colours and the emission have gradients, exact for the discretised result. The rays and the
     directions to the lights have none: to find directions of light, fit the colours of many lights. On CUDA the

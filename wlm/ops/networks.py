@@ -22,8 +22,8 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
         hidden: float [I + H + 2, H] or [N, I + H + 2, H], concatenated: W1 [I, H], b1 [1, H], W2 [H, H],
             b2 [1, H]. The weight of a `torch.nn.Linear` is the transpose of such a matrix.
         output: float [H + 1, O] or [N, H + 1, O]: W3 [H, O], b3 [1, O].
-        gelu: "exact" (erf); "tanh", within 4.8e-4 of it; "fast": "tanh" with the GPU's instruction, with a relative
-            error of 2^-11 and gradients within 5e-3. On the CPU "fast" equals "tanh".
+        gelu: "exact" (erf); "tanh", an approximation within 4.8e-4 of "exact"; "fast", like "tanh" but with the GPU's
+            instruction, whose relative error is 2^-11, gradients within 5e-3. On the CPU "fast" equals "tanh".
 
     Returns:
         float [B, O] or [N, B, O].

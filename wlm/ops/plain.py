@@ -43,7 +43,7 @@ def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -
 
 
 def _endpoint_bytes(e: Tensor) -> Tensor:
-    """Rounds e [..., 4] to the nearest bytes with equal lowest bits, int64 [..., 4]; even bytes in a tie."""
+    """Rounds colours e [..., 4] to the nearest bytes with equal lowest bits, int64 [..., 4]; ties go to even bytes."""
     v = e * 255.0
     even, odd = (torch.floor((v - bit) / 2.0 + 0.5).clamp(0.0, 127.0) * 2.0 + bit for bit in (0.0, 1.0))
     nearer = ((odd - v) ** 2).sum(-1, keepdim=True) < ((even - v) ** 2).sum(-1, keepdim=True)

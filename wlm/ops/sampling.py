@@ -26,7 +26,7 @@ def plane(
         values: float [H, W, C], or [L, H, W, C] with `layer`; with a gradient.
         points: float [..., 2], u along the width, v along the height (the time, in a lightmap's planes;
             neural-dynamic-gi, eq. 5). Has a gradient: the slope between the adjacent cells.
-        layer: int32 or int64 [...], 0 to L - 1: the plane of each point.
+        layer: int32 or int64 [...], 0 to L - 1: the index of each point's plane.
         periodic: Whether v wraps round: row 0 is the neighbour of row H - 1.
 
     Returns:
@@ -47,7 +47,7 @@ def volume(
     Args:
         values: float [D, H, W, C], or [L, D, H, W, C] with `layer`; with a gradient.
         points: float [..., 3], u along the width, v along the height, w along the depth; with a gradient.
-        layer: int32 or int64 [...], 0 to L - 1: the volume of each point.
+        layer: int32 or int64 [...], 0 to L - 1: the index of each point's volume.
         periodic: Whether w wraps round.
 
     Returns:
@@ -74,7 +74,7 @@ def triplane(
             "concatenate", in the order of the arguments, where C may differ between the planes.
 
     Returns:
-        float [..., C], or [..., the sum of the three C].
+        float [..., C]; with "concatenate" the last size is the sum of the three C.
 
     Raises:
         ValueError: See `plane`; or there is no such reduction.

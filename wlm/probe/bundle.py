@@ -11,7 +11,7 @@ from wlm.probe.sphere import sh_count
 _ABOUT = {
     "values": "A probe has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
     "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
-    "dead": "Probes that are zero, by index from 0 in the order of compression: engines leave them inside walls.",
+    "dead": "Indices from 0, in the order of compression, of the probes whose light is zero, such as those in walls.",
     "positions": "If the buffer positions exists: 3 unsigned 16-bit codes per probe, position = origin + extent * size "
     "* code / 65535.",
 }

@@ -35,12 +35,12 @@ from wlm.probe.pca import codec as pca_codec
 from wlm.system import Header, Name
 
 _METHODS = {"gaussians": gaussian_codec, "pca": pca_codec}
-"""The module that stores each method's content."""
+"""The module that reads and writes the models of each compression method."""
 
 _LENGTH = struct.Struct("<H")
 _FARTHEST = 1e150
 _SOURCE = 8  # hexadecimal digits of the source
-# Most bytes of unpacked parts: a frame of zeros has next to no bytes of its own.
+# Limits of the unpacked arrays in bytes, since a tiny file could unpack to huge arrays of zeros.
 _SURE, _PER_BYTE = 1 << 24, 4096
 
 
@@ -80,7 +80,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     if live < model.probes:
         parts["dead"] = np.packbits(model.dead)
     if model.has_positions:
-        # Differences from probe to probe modulo 2^16: those of a lattice repeat.
+        # Differences from probe to probe, modulo 2^16: on a lattice they repeat, which zstd compresses well.
         parts["positions"] = np.diff(model.positions, axis=0, prepend=np.zeros((1, 3), np.uint16)).T
     text = json.dumps(header, separators=(",", ":")).encode()
     table = _table(_Header.model_validate(header))

@@ -49,7 +49,7 @@ class Profile(Settings):
     net_rate: float = Field(2e-2, gt=0.0, lt=1.0)
     """Initial learning rate of the network."""
     detail: float = Field(1.0, ge=0.0, le=4.0)
-    """How much more densely Gaussians start where the light varies: a power of its local variance; 0: uniformly."""
+    """Initial centres are denser where light varies, by this power of its local variance; 0: uniformly distributed."""
     first_scale: float = Field(0.7, gt=0.0, le=4.0)
     """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)

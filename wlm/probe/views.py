@@ -47,7 +47,7 @@ _BALL_POINTS = 162
 _NEIGHBOURS = 8
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _DOWN = 0.2  # downward part of the viewing direction
-_BUDGET = 1024  # blocks decoded per frame; the volume is awaited
+_BUDGET = 1024  # blocks decoded per frame; many, since all are awaited
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ ENGINES = ("three", "godot", "unity", "unreal")
 
 README_FILE = "README.md"
 
-# Texels along a side of a picture that the editor imports, or that WebGL2 has on most machines.
+# Most texels along a side of a picture that the editor imports, or that WebGL2 supports on most machines.
 _MOST_SIDE = {"unreal": 8192, "godot": 16384, "unity": 16384, "three": 16384}
 
 _MARK = re.compile(r"@(\w+)@")
@@ -24,7 +24,7 @@ _SAMPLER = re.compile(
 
 
 def filled(asset: str, **parts: str) -> str:
-    """Reads a template from `assets` and replaces its marks `@NAME@`.
+    """Reads a template from `assets` and replaces its marks `@NAME@` by `parts`.
 
     Raises:
         KeyError: A mark of the template is not among `parts`.

@@ -28,9 +28,9 @@ _LARGEST = float(np.finfo(np.float32).max)
 _ABOUT = (
     "Assign light.lmbake to the property Light Data of a LightmapGI node that is where it was when the probes were "
     "baked, or at the scene's origin. Meshes with the global illumination mode Dynamic get light within the probes' "
-    "box. If a bake was given as --original, light.lmbake has its textures and meshes and replaces it. Otherwise it "
-    "has none, and the probes are on a lattice: low is its lowest corner, size the side of a cell, cells their number "
-    "along x, y, z."
+    "box. If a bake was given as --original, light.lmbake has its textures and meshes and replaces it. Otherwise "
+    "light.lmbake has no textures, and the probes are on a lattice: low is its lowest corner, size the side of a cell, "
+    "cells the number of cells along x, y, z."
 )
 
 # The six tetrahedra of a cell: paths from its lowest corner along the axes in this order.

@@ -12,7 +12,7 @@ CELLS = 24
 """Default number of cells along the longest side of the box."""
 
 NUMBERS = 27
-"""Numbers of a probe with L2 spherical harmonics in RGB."""
+"""Numbers of a probe with second-order spherical harmonics in three colours."""
 
 _ROWS = 65536  # points decoded at a time
 

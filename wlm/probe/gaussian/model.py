@@ -40,7 +40,7 @@ CUT = 3.0
 """Radius of a Gaussian's support in standard deviations."""
 
 LARGEST = (1 << 24) - 1
-"""Largest magnitude of a whole number of the network."""
+"""Largest magnitude of an integer of the quantised network."""
 
 _FARTHEST = 3e38  # bounds beyond this are clamped, and refused when a file is read
 _SHORTEST = 1e-12  # length of a quaternion that has a direction

@@ -42,10 +42,10 @@ _FAINT = 1e-10  # share of the squared range below which an error counts as floa
 # Factors of the groups' natural steps with which one bit less costs about the same error in each group; the best
 # factors of the sets `livingroom` and `city` are within a third of these.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
-_NEAR = 0.85  # share of the allowed growth that ends the search
+_NEAR = 0.85  # the search ends at this share of the allowed growth of the error
 _TRIES = 8
 _FINEST = 1 / 64  # of the natural steps, where no tried step is fine enough
-_AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth where the other probes lost more
+_AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth if probes that were left out lost more
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share of the mean square
 
 

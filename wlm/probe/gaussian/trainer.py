@@ -21,19 +21,19 @@ from wlm_kernels.probe.network import CPU_LANES
 from wlm_kernels.probe.step import GROUP, Optimiser
 
 CODE_BITS, CENTRE_BITS = 10, 16
-"""Bits of a code in training: of scale, rotation and latent, and of a centre."""
+"""Bits of a code in training: of scales, rotations and latents, and of centres."""
 
 FINAL_RATE = 1e-3
-"""Last learning rates as a share of the first; the schedule is half a cosine."""
+"""Final learning rate as a share of the initial one; it falls along half a cosine."""
 
 _QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the second and the third stage begin
 _FIRST_LATENT = 0.1  # standard deviation of the first latents
 _PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
-_NEIGHBOURS = 9  # probes whose spread is the local spread of one of them
+_NEIGHBOURS = 9  # probes over which the local spread of a probe is taken, itself included
 _PIECE = 4096  # probes per piece
-_ROUNDS = 4  # of k-means where the draw follows detail, which more rounds would undo
-_PLAIN_ROUNDS = 20  # of k-means where the draw is uniform
+_ROUNDS = 4  # rounds of k-means if centres are denser where light varies; more rounds would undo that
+_PLAIN_ROUNDS = 20  # rounds of k-means if the initial centres are drawn uniformly
 _FLOOR = 0.05  # smallest local spread, as a share of the mean
 _SMALLEST = 1e-4  # smallest first scale, as a share of the box
 _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe at the edge of its group's box
@@ -208,7 +208,7 @@ class Trainer:
         if move:
             self._make_shapes(quantised=stage > 0)
         if not self._cuda:
-            # The CPU's two lanes add to these arrays.
+            # The two threads on the CPU add to these arrays.
             t["partial"].zero_()
             t["loss"].zero_()
         if move:

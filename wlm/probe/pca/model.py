@@ -19,7 +19,7 @@ from wlm.probe.decode import Decoder
 from wlm.probe.model import Content, GpuForm, ProbeModel
 
 ENOUGH = 0.02
-"""Error that needs no further component: RMS over the probes of the error over the probe's own norm."""
+"""Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
 
 _LEVELS = 255
 

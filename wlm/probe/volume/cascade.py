@@ -35,7 +35,7 @@ SIDE = 32
 """Blocks along an axis of a window, the cube of blocks around the viewer at each level."""
 
 BUDGET = 64
-"""Blocks decoded per frame."""
+"""Largest number of blocks decoded per frame."""
 
 ROWS = 32768
 """Number of blocks that memory is allocated for."""
