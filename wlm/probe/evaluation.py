@@ -136,7 +136,7 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")
     decoded, values, live = np.asarray(decoded), probes.values, probes.live
     if decoded.ndim != 2:
-        raise ValueError(f"decoded: expected [N, D], got {decoded.shape}")
+        raise ValueError(f"decoded: expected an array [N, D], got {decoded.shape}")
     count, outputs = values.shape
     if decoded.shape != values.shape:
         raise WlmError(
