@@ -29,10 +29,10 @@ def march(
     """Marches rays through a density grid; the reference is `plain.march`.
 
     Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; for another albedo, scale the colours):
-    each sample of a ray scatters the directional lights that reach it towards the ray's origin, by the phase function
-    of Henyey and Greenstein, and emits; both are attenuated along the ray. The steps of a ray are equal, and each is
-    integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes of a
-    lattice, spaced by a step but at least a voxel, and interpolated trilinearly between them.
+    each sample of a ray scatters light from directional lights towards the ray's origin, by the phase function of
+    Henyey and Greenstein, and emits light; this light is attenuated along the ray. The steps of a ray are equally long,
+    and each is integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes
+    of a lattice, whose spacing is a step but at least a voxel, and interpolated trilinearly between the nodes.
 
     All lengths are in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
     density and emission are trilinear between centres, with zero outside the grid. Run time is proportional
@@ -59,7 +59,7 @@ def march(
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit, only one of `toward` and `colour` is given, an
-            argument without a gradient requires one, or a number isn't finite or in range. The check of numbers waits
+            argument that has no gradient requires one, or a number isn't finite or in range. The check of numbers waits
             for the GPU and is skipped while a CUDA graph is captured.
     """
     if not (math.isfinite(step) and step > 0.0):

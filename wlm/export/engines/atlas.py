@@ -102,7 +102,7 @@ def _texts(bundle: Bundle, engine: str, entries: dict[str, Any]) -> dict[str, st
     elif engine == "godot":
         if shared and uv_set > 1:
             raise WlmError(
-                f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the UVs are in {uv_set}"
+                f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, not TEXCOORD_{uv_set}"
             )
         marks = {"SHADER": godot_uniforms(bundle.shader), "UV": "UV2" if uv_set else "UV"}
         texts = {f"{kind}.gdshader": filled(f"godot_{kind}.gdshader", **marks)}
