@@ -254,8 +254,8 @@ def test_emission_beyond_what_pictures_hold_is_lowered(device: str):
     light = volume.temperature.double().cpu() * volume.emission * volume.voxel
     assert light.max() <= 65504 * (1 + 1e-6)
     assert volume.warnings == (
-        "array: temperature: 24 voxels that each emit more light than 65,504, the largest half float, are lowered to it, "
-        "the first is (0, 0, 0)",
+        "array: temperature: 24 voxels that each emit more light than 65,504, the largest half float, are lowered to "
+        "it, the first is (0, 0, 0)",
     )
     # Bright, but no brighter than a picture can be.
     assert from_array(np.ones_like(heat), temperature=np.full_like(heat, 65504), voxel=0.999).warnings == ()

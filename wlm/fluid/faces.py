@@ -101,7 +101,7 @@ def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
 
 
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
-    """Returns what both ends of each axis are for smoke: `PERIODIC`, `CLOSED` if the whole face is a wall, or `OPEN`."""
+    """Returns what each axis's ends are for smoke: `PERIODIC`, `CLOSED` if the whole face is a wall, or `OPEN`."""
     ends = []
     for name in FACES:
         walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()

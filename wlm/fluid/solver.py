@@ -383,12 +383,10 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
-        """Remembers the path of the last checkpoint, and the lattice's number of steps in it, for error messages."""
         self._kept = f"; the state of step {int(steps)} is kept in {path}"
 
     @contextmanager
     def _naming_checkpoint(self) -> Iterator[None]:
-        """Adds the path of the last checkpoint to the messages of errors in the block."""
         try:
             yield
         except WlmError as error:

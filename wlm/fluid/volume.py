@@ -309,7 +309,6 @@ def _check(
 
 
 def _found(bad: torch.Tensor) -> tuple[int, tuple[int, ...]]:
-    """Returns the number of true voxels and the position of the first, for a warning."""
     first = np.unravel_index(int(bad.flatten().to(torch.uint8).argmax()), bad.shape)
     return int(bad.sum()), tuple(int(i) for i in first)
 
@@ -385,7 +384,6 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
 
 
 def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
-    """Makes a volume from one grid, the density, or from two, the density and the temperature."""
     voxels = sum(part.values.numel() for part in parts)
     lattice, values = on_one_lattice(
         parts, _LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up
@@ -428,7 +426,6 @@ def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
 
 
 def _choose(path: Path, names: Sequence[str], wanted: tuple[str | None, str | None]) -> list[str]:
-    """Returns the names of the grids to read: the density and, if there is one, the temperature."""
     density, temperature = wanted
     for name in (density, temperature):
         if name is not None and name not in names:

@@ -81,8 +81,7 @@ def _number(cubes: Cubes, cell: wp.vec3i) -> int:
 
 @wp.func
 def cube_of(cubes: Cubes, x: wp.vec3) -> int:
-    """Returns the index of the cube that contains a point or is nearest to it. For NaN, which no Gaussian reaches, it
-    may be any cube."""
+    """Returns the cube that contains a point or is nearest to it; any cube for NaN, which no Gaussian reaches."""
     return _number(cubes, _cell(cubes, x))
 
 
@@ -185,7 +184,6 @@ def _limit(shape: Shape) -> float:
 
 @wp.func
 def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i) -> bool:
-    """Tests whether a cube meets the Gaussian's support itself, and not only the support's bounding box."""
     if not wp.isfinite(shape.reach):
         return True
     pad = _place_margin(cubes)
@@ -364,7 +362,6 @@ def _grid(corners: np.ndarray, size: float) -> Cubes:
 
 
 def _tested(shapes, cubes: Cubes) -> int:
-    """Returns the number of pairs of a cube and a Gaussian whose bounding box meets the cube."""
     counts = wp.empty(shapes.shape[0], dtype=wp.int64, device=shapes.device)
     wp.launch(_candidates, counts.shape, inputs=[shapes, cubes], outputs=[counts], device=shapes.device)
     return int(counts.numpy().sum())

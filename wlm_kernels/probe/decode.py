@@ -136,7 +136,6 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
-    """Returns the CUDA code that adds the partial sums of Gaussians and evaluates the network for a block of points."""
     snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)

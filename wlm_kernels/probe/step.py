@@ -93,9 +93,7 @@ def next_bit(bits: wp.uint32) -> int:
     return 0u;
 #endif
 """)
-def _ballot(bit: int) -> wp.uint32:
-    """Returns a 32-bit word whose bit i is the argument `bit` of thread i of the warp."""
-    ...
+def _ballot(bit: int) -> wp.uint32: ...
 
 
 @wp.kernel(enable_backward=False)
@@ -429,7 +427,6 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 
 def _block_sum(vec_sums, numbers: int):
-    """Builds a function that sums a vector over the threads of a CUDA block, in a fixed order."""
 
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...

@@ -51,7 +51,6 @@ def _overlap(x: float, y: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _pick(index: Index, windows: Windows, side: int, work: Work):
-    """Picks one of the at most 16 probes that contribute to a block, per thread."""
     k, i = wp.tid()
     total = int(0)
     for j in range(_HALVES):
@@ -87,8 +86,6 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
 
 @wp.kernel(enable_backward=False)
 def _relate(work: Work):
-    """Computes the covariance of a probe with the probes before it, with itself and with the block; one probe per
-    thread."""
     k, i = wp.tid()
     if i < work.picked[k]:
         x = work.places[k, i]
