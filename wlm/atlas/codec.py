@@ -265,8 +265,8 @@ def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
     stride, rest = divmod(len(table), states)
     if rest or stride < count:
         raise ValueError(
-            f"part sheets: expected rows for {count} sheets and their mip levels, equally many in {states} states, found "
-            f"{len(table)} rows"
+            f"part sheets: expected rows for {count} sheets and their mip levels, equally many in "
+            f"{states} states, found {len(table)} rows"
         )
     names, places = (list(header.sheets) + [""] * (stride - count)) * states, []
     for number, row in enumerate(table.tolist()):
