@@ -15,8 +15,9 @@ _PULL = 1e-4
 
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
-    """Returns the largest rows and columns, with the aspect ratio of height and width and at most as large, whose whole
-    blocks fit a budget of bits at `bits` per texel; None if not even one block fits."""
+    """Returns the largest rows and columns, at most `height` and `width` and in their ratio, at which a lightmap takes
+    at most `budget` bits. It is counted in whole blocks of `block` texels, at `bits` per texel. None if one block is
+    too much."""
     longest = max(height, width)
     for side in range(longest, 0, -1):
         rows, columns = (max(1, round(side * size / longest)) for size in (height, width))

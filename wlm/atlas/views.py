@@ -138,8 +138,8 @@ def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple
         device: "cpu" or "cuda:N".
 
     Returns:
-        On the device: int64 [height, width], the number of the triangle in the sheet, the first of several, -1 for
-        none; float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
+        On the device: int64 [height, width], the number of the triangle in the sheet (the first if there are several,
+            -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(

@@ -63,7 +63,7 @@ def input_system(path: str | os.PathLike[str]) -> str:
     "smoke".
 
     Raises:
-        WlmError: It does not exist or cannot be read, or it is not one of these inputs; the line says what to do.
+        WlmError: It does not exist, cannot be read, or is no input of these systems; the message says what to do.
     """
     path = Path(path)
     if not path.exists():
