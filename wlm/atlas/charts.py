@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Numbers the corners of the triangles, int32 [F, 3] from 0: corners with the same position [V, 3] and UV [V, 2]
-    get the same number. A file also splits vertices where another attribute differs, a normal for example, although the
+    get the same number. A file also splits vertices where another attribute differs, such as a normal, though the
     lightmap has no seam there."""
     # Adding 0 turns -0 into 0, which has other bits.
     values = np.ascontiguousarray(np.concatenate([position, uv], 1, dtype=np.float64) + 0.0)

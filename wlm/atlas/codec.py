@@ -4,8 +4,8 @@ Parts: `colour` (half [pages, Hp, Wp, 3], uint32 [pages, Hp, Wp] for RGB9E5, or 
 blocks), `mesh` (uint8, a `.glb` file), `mask` (uint8, the bits of all masks) and, where the model has them, `lut`
 (uint16 [Hc, Wc, 2 or 4]), `blocks` (uint8 [pages, B, 16], the second colour texture of the format "mixed"), `factor`
 (float32 [M, C, 3], factors of tiles that M lightmaps share), `sheets` (int32 [rows, 7], the places of lightmaps in
-`lut`, from `AtlasModel.table`) and `uv` (uint16 [F, 3, 2], new UVs times 65,535). A part is compressed with zstd where
-that makes it smaller.
+`lut`, from `AtlasModel.table`) and `uv` (uint16 [F, 3, 2], new UVs times 65,535). A part is compressed with zstd if
+that saves bytes.
 """
 
 import math
@@ -60,8 +60,7 @@ class _Object(Header):
 
 
 class _Header(Header):
-    """The settings of a file. All sizes are rows and columns in texels; `sizes` has one for each sheet, a layout of
-    lightmaps."""
+    """The settings of a file. All sizes are rows and columns in texels; `sizes` has one for each sheet (UV layout)."""
 
     name: Name
     method: Literal["tiles", "cascade", "plain", "shared"]
@@ -191,7 +190,6 @@ def decode(artifact: Artifact) -> AtlasModel:
 
 
 def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]:
-    """Returns the parts after checking their types and shapes against the settings."""
     shared, method = header.method == "shared", header.method
     texels, second = tuple(header.texels), header.block_texels
     if len(header.sizes) != len(header.sheets):
@@ -255,8 +253,8 @@ def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
-    """Reads from `table` where the tiles of each sheet or mip level lie in the lookup texture; places outside of the
-    texture aren't refused here."""
+    """Reads from `table` where the tiles of each sheet or mip level lie in the lookup texture, even if outside of
+    it."""
     if header.method != "shared":
         (size,), (name,) = header.sizes, header.sheets
         grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)

@@ -55,8 +55,7 @@ def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, de
 def _centre_spans(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields rows and their spans, int64 [N] each: the texels first <= column < stop have their centre in a
-    triangle."""
+    """Yields rows and their spans, int64 [N] each: texels first <= column < stop have their centre in a triangle."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -74,8 +73,8 @@ def _centre_spans(
 def _rows(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int, centres: bool
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields, in pieces of bounded size, the corners of triangles, [N, 3, 2] in texels, each with one row of texels
-    that it may meet, [N]."""
+    """Yields, in pieces of bounded size, the corners of triangles, [N, 3, 2] in texels, and a row of texels that each
+    may meet, [N]."""
     texel = uv * (width, height)
     v = texel[:, 1][triangle]  # [F, 3]
     if centres:

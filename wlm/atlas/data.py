@@ -104,8 +104,7 @@ class Triangles:
         position: float64 [V, 3].
         triangle: int32 [F, 3].
         uv: float64 [V, 2]; 0 for triangles without a lightmap.
-        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide
-            others.
+        sheet: int32 [F], the sheet that lights each triangle; -1 without a lightmap: these only hide others.
     """
 
     position: np.ndarray
@@ -191,17 +190,16 @@ def load(
             `wlm.atlas.listing`; None: the lightmaps that the materials name.
         mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above
             0. None derives it from the triangles.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes the set that the list names; else 1, where engines and
-            viewers look for lightmap UVs, if any primitive has that; else 0. Formats other than glTF have only 0.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes the list's set; else 1, where engines and viewers look
+            for lightmap UVs, if any primitive has that; else 0. Formats other than glTF have only 0.
         node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
-        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None if it is no
-            PNG.
+        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None for other
+            files.
         flip: If there is one lightmap, whether its top row is at v = 1 of glTF.
         trust: Whether files may name files outside their folder, and decompress to huge data (`wlm.formats.limits`).
 
     Raises:
-        WlmError: The input contradicts itself, or a file is missing or damaged; the message names the file and the
-            field.
+        WlmError: The input contradicts itself, or a file is missing or damaged; the message names file and field.
     """
     path = Path(mesh_path)
     document, primitives, metres = _read_triangles(path, trust)
@@ -514,8 +512,7 @@ def _checked_light(
     mask: np.ndarray | None,
     names: Sequence[str],
 ) -> tuple[np.ndarray, list[str]]:
-    """Makes the mask if it is None, or else checks it, and repairs the lightmaps in place. Returns the mask and the
-    warnings."""
+    """Makes the mask if it is None, else checks it, and repairs the lightmaps in place. Returns mask and warnings."""
     warnings = []
     height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):

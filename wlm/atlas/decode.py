@@ -16,8 +16,7 @@ _TEXELS_AT_ONCE = 1 << 24
 
 
 class Decoder:
-    """A model on a device, called with points of the scene to get their light. `wlm.atlas.evaluation.compare` takes it
-    as a `Sampler`.
+    """A model on a device that returns light at points of the scene, for example for `wlm.atlas.evaluation.compare`.
 
     Attributes:
         model: The model.
@@ -52,8 +51,8 @@ class Decoder:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """Returns the factors by which shared tiles sum their components in a state, float32 [C, 3]. Factors are
-        interpolated for a state such as 0.5, which lies between two.
+        """Returns the factors by which shared tiles sum their components in a state, float32 [C, 3]. They are
+        interpolated for a state such as 0.5.
 
         Raises:
             ValueError: The state is below 0 or above the number of the last one.
@@ -76,7 +75,7 @@ class Decoder:
 
         Args:
             uv: float32 [N, 2] on the decoder's device: the model's new UVs if it has any, else the lightmap UVs.
-            sheet: Number of each point's sheet (UV layout), from 0: int [N], or one number for all points.
+            sheet: Number of each point's sheet (UV layout), from 0: int [N], or one for all points.
             state: 0 to the number of states - 1; fractions lie between two states.
             lod: float32 [N], base-2 logarithm of texels per pixel, for a model with mips; None: full resolution.
 
@@ -119,8 +118,7 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], from tiles that all lightmaps share or from separate tiles for each
-        lightmap."""
+        """Returns light, float32 [N, 3], from tiles that all states share or from each state's separate tiles."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -136,8 +134,7 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], at UVs of the sheets or mip levels that are `row` [N] of
-        `AtlasModel.table`."""
+        """Returns light, float32 [N, 3], at UVs of sheets or mip levels, rows `row` [N] of `AtlasModel.table`."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()

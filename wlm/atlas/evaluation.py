@@ -192,8 +192,7 @@ def compare(
     labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmaps. Each view is rendered only twice, however many decoders there
-    are.
+    """Compares any decoders with the original lightmaps. Each view is rendered twice for any number of decoders.
 
     Args:
         scene: The scene with its original lightmaps.
@@ -212,7 +211,7 @@ def compare(
 
     Raises:
         WlmError: There is no such device, or a decoder gives NaN or infinity.
-        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or labels name
+        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or a label has
             no decoder.
     """
     device, labels = check_device(device), dict(labels or {})
@@ -259,8 +258,8 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes a function from points on the device to the numbers of their charts in a model's new UVs, for `labels` of
-    `compare`."""
+    """Makes a function for `labels` of `compare`: from points on the device to their charts' numbers in a model's new
+    UVs."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -344,7 +343,6 @@ def _peaks(
 
 
 def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
-    """Calls the decoder and returns its checked colours, float64 [N, 3]."""
     colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
         raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
@@ -355,7 +353,6 @@ def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedSce
 
 
 def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
-    """Calls the labels' function and returns its checked numbers, int64 [N]."""
     label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
         raise ValueError(f"{name}: expected labels as integers [{count}], got {label.dtype} {tuple(label.shape)}")
@@ -416,7 +413,6 @@ def _ratio(a: float, b: float) -> float:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Returns the mean of the numbers that aren't NaN; NaN if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return fmean(known) if known else math.nan
 
@@ -446,8 +442,8 @@ def _texel_errors(
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
     """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each pixel.
-    A border lies between triangles with different labels and a corner in common; `place`, int [F, 3], has equal numbers
-    for corners at one point in space."""
+    A border lies between triangles with different labels and a corner in common; `place`, int [F, 3], numbers the
+    corners, equally where they coincide."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1
@@ -467,8 +463,8 @@ class _View:
     """One view's pictures of the original lightmaps, to be compared with those of decoders."""
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
-        """Makes pictures of the original's light [N, 3] at the covered pixels `hit`, bool [h, w]. `flip` is true if
-        FLIP is to be computed."""
+        """Makes pictures of the original's light [N, 3] at the covered pixels `hit`, bool [h, w]; `flip`: compute FLIP
+        too."""
         whole = hit.cpu().numpy()
         # SSIM reads half a window around a covered pixel.
         rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
@@ -479,15 +475,14 @@ class _View:
         self._light, self._screen = self._pictures(target)
 
     def errors(self, light: torch.Tensor) -> tuple[float, float, float]:
-        """Returns a decoder's SSIM (NaN if the original has one value), MSE as displayed on a screen, and FLIP (or
+        """Returns a decoder's SSIM (NaN if the original is constant), MSE as displayed on a screen, and FLIP (or
         NaN)."""
         picture, screen = self._pictures(light)
         similarity = ssim(self._light, picture, self._hit, self._peak) if self._peak > 0.0 else math.nan
         return similarity, *picture_error(self._screen, screen, self._hit, self._flip)
 
     def _pictures(self, light: torch.Tensor) -> np.ndarray:
-        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; uncovered pixels are
-        black."""
+        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; the rest is black."""
         values = light.cpu().numpy().astype(np.float64)
         pictures = np.zeros((2, *self._hit.shape, 3))
         pictures[:, self._hit] = values, to_srgb(values * self._exposure)

@@ -36,8 +36,7 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet (a UV layout): a lightmap for each state and a mask. Its other fields are as in
-    `wlm.atlas.load`."""
+    """The files of a sheet (a UV layout): a lightmap for each state and a mask; other fields as in `wlm.atlas.load`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -71,8 +70,7 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """The lightmaps of a scene and the objects that they light, from a JSON file, a bake, a folder or a glTF's
-    materials.
+    """The lightmaps of a scene and the objects that they light, from a JSON file, bake, folder or glTF file.
 
     Attributes:
         path: The file that names the lightmaps.
@@ -243,8 +241,8 @@ def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
 
 
 def _from_bake(path: str) -> Listing:
-    """Reads a list from Godot's `.lmbake`, which must have one texture with one slice, and the rectangles of its
-    nodes."""
+    """Reads one lightmap and its nodes' rectangles from Godot's `.lmbake`, which must have one texture with one
+    slice."""
     bake = read_users(path)
     slices = {user.slice for user in bake.users}
     if len(bake.textures) != 1 or bake.directional or slices != {0}:
@@ -264,7 +262,6 @@ def _godot_place(user: GodotUser) -> ObjectPlace:
 
 
 def _from_folder(where: str, folder: Path) -> Listing:
-    """Lists every lightmap file in a folder."""
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
     except OSError as error:

@@ -143,8 +143,8 @@ class Profile(Settings):
     """For the cascade: weight of errors of image gradients in the loss; errors of colours weigh 1 (section 3.3.3)."""
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Returns the profile with some settings replaced. `values` has new values by name, None for no change;
-        `prefix` begins the error messages.
+        """Returns the profile with new `values` of settings, by name; None changes nothing. Messages begin with
+        `prefix`.
 
         Raises:
             WlmError: A setting is unknown or out of range; or the method is cascade and a budget or the colour "mixed"
@@ -185,8 +185,7 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class SheetPlace:
-    """The place of a sheet (a UV layout of charts with its lightmaps), or of one of its mip levels, in the lookup
-    texture T_c.
+    """The place of a sheet (a UV layout with its lightmaps), or of its mip level, in the lookup texture T_c.
 
     Attributes:
         name: The sheet's name.
@@ -231,17 +230,15 @@ class AtlasModel(Model):
         texels: half [pages, Hp, Wp, 3], T_p as decoded, finite, not negative. For "mixed" the first texture, in RGB9E5.
         lut: uint16 [Hc, Wc, 2 or 4], T_c: `pack_entries` for "tiles", coordinates in units of 1 / `LUT_STEPS` for
             "cascade", `pack_tiles`, or its first two numbers, for "shared"; [0, 0, 2] for "plain".
-        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; [0, 0, 16] if there
-            are no blocks.
+        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; else [0, 0, 16].
         block_texels: half [pages, Hb, Wb, 3], multiples of 4, the decoded second texture of "mixed"; else [0, 0, 0, 3].
         factor: float32 [M, C, 3], finite, of any sign, for "shared": for each group of tiles that share them, a
             constant and then the components' factors; else [0, 0, 3].
-        levels: For "shared" with mips, the mip levels of all sheets: a quarter of a sheet's sides, then half of that,
-            and so on.
+        levels: For "shared" with mips, the mip levels of all sheets: a quarter of a sheet's sides, then an eighth, and
+            so on.
         later: For "shared" with separate tiles for each state, the sheets and mip levels of the second state, then of
             the third and so on.
-        uv: float32 [F, 3, 2] in [0, 1], rounded by `snapped`, the corners' new UVs; [0, 3, 2] if the mesh keeps its
-            UVs.
+        uv: float32 [F, 3, 2] in [0, 1], rounded by `snapped`, the corners' new UVs; [0, 3, 2] if there are none.
         stored: The scene's triangles and masks; None for a model that can't be saved.
         report: Facts about the compression for the user: "seconds" by stage (not saved, since they differ from run to
             run), numbers of groups and tiles, and why the method is plain.
@@ -274,7 +271,7 @@ class AtlasModel(Model):
 
     @property
     def stride(self) -> int:
-        """With separate tiles for each state, the number of rows of `table` per state; 0 if the states share tiles and
+        """The number of rows of `table` per state if each state has separate tiles; 0 if states share tiles and
         rows."""
         return len(self.sheets) + len(self.levels) if self.later else 0
 
@@ -336,8 +333,8 @@ class AtlasModel(Model):
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that a lightmap's size, height and width in texels, is plausible for the numbers of texels in T_p and
-    entries in T_c, since a file of a few bytes must not claim gigabytes.
+    """Checks that a lightmap's height and width are plausible for the numbers of texels of T_p and entries of T_c,
+    since a file of a few bytes must not claim gigabytes.
 
     Raises:
         WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels and also
@@ -375,8 +372,7 @@ def pack_entries(
     """Encodes entries of the lookup texture T_c for the method "tiles".
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, or 4 times `MOST_SIZE` for
-            blocks.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, for blocks 4 times that.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
         blocks: bool [...], true for entries that name compressed blocks, whose first texel and size are multiples of 4.
             Sizes of other entries are at most `code`.
@@ -422,12 +418,10 @@ def pack_tiles(
 
     Args:
         first, size, blocks: As for `pack_entries`: the rectangle of the first component.
-        component: int [...], index in `AtlasModel.factor` of the tile's constant, which its factors follow; below
-            65,536.
+        component: int [...], index in `AtlasModel.factor` of the tile's constant, before its factors; below 65,536.
         count: int [...], number of components, 0 to 255; 0: the tile is black.
         page: int [...], number of the page of T_p, below `MOST_PAGES`.
-        coarse: int [...], number of components stored as a single block each, 0 to `MOST_COARSE`; 0 for tiles without
-            blocks.
+        coarse: int [...], number of components stored as one block each, 0 to `MOST_COARSE`; 0 without blocks.
 
     Returns:
         uint16 [..., 4].
@@ -459,7 +453,6 @@ def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) 
 
 
 def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
-    """Returns the texels along x and y that all components of a tile take, int [..., 2]; arguments as in
-    `pack_tiles`."""
+    """Returns the texels along x and y of all components of a tile, int [..., 2]; arguments as in `pack_tiles`."""
     columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

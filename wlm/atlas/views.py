@@ -108,8 +108,7 @@ def visibility(
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, the pixels of all views whose UVs lie in each cell; a UV of 1 is in the
-        last cell.
+        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 is in the last.
 
     Raises:
         WlmError: There is no such device.

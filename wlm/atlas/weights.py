@@ -22,8 +22,7 @@ _SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
-    """A grid over a sheet whose cells are quarters of texels, with properties of each cell, computed when first
-    used."""
+    """A grid over a sheet whose cells are quarters of texels, and properties of the cells, computed when first used."""
 
     def __init__(self, sheet: Sheet, device: str) -> None:
         self.sheet, self.device = sheet, device

@@ -1,7 +1,7 @@
 """Describes single files by their content and, where that is not enough, by their names.
 
-`_KINDS` is the table of all kinds of files. `inspect` uses it to describe a file, and `wlm compress` to find the system
-that compresses its input.
+`_KINDS` is the table of all kinds of files. `inspect` uses it to describe a file, `wlm compress` to find the system for
+its input.
 """
 
 from collections.abc import Callable, Sequence
@@ -146,7 +146,6 @@ def _probes(path: Path) -> Finding:
 
 
 def _lmbake(path: Path) -> Finding:
-    """Describes the probes of a Godot bake and the lightmap of its meshes."""
     found = _probes(path)
     try:
         bake = read_users(path)

@@ -59,7 +59,7 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def input_system(path: str | os.PathLike[str]) -> str:
-    """Finds the system that compresses a file or folder, from names and headers alone: "lightmap", "atlas", "probe" or
+    """Finds the system that compresses a file or folder, from names and headers: "lightmap", "atlas", "probe" or
     "smoke".
 
     Raises:
@@ -133,7 +133,6 @@ _Found = list[tuple[Finding, set[Path]]]
 
 
 def _documents(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes a folder by the JSON documents in it."""
     documents = [file for file in files if file.suffix.lower() == ".json"]
     for file in sorted(documents, key=lambda file: file.name != SET_FILE)[:_DOCUMENTS]:
         if file.name == SET_FILE:

@@ -3,7 +3,7 @@
 The lightmap is sampled at a grid of points over each triangle, its patch (`wlm_kernels.atlas.patches`). Patches are the
 nodes of a graph. An edge joins two patches if their distance Dist (eq. 2) is below lambda in one of the six orders of
 the vertices. The node with most edges (on a tie the one with the lowest number) and its neighbours form a group, which
-this node represents. The group is removed and the edges of the remaining nodes are counted again, until no edge is left
+this node represents. The group is removed and the edges of the remaining nodes are counted anew, until none is left
 (eq. 6).
 
 The cost of this is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of `SAMPLE`
@@ -51,8 +51,7 @@ class Clusters:
         representative: int32 [G], for each of G groups the triangle that represents it.
         order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]` of
             `wlm_kernels.atlas.patches`. If several orders are equally good, it is the first one; 0 for representatives.
-        distance: float64 [F], the patch's distance Dist (eq. 2) to that of its representative in this order, below
-            lambda.
+        distance: float64 [F], distance Dist (eq. 2) of the patch to its representative's in this order, below lambda.
         excluded: bool [F], true for triangles that are too bright or not active: each is a group of its own.
     """
 
@@ -79,13 +78,13 @@ def cluster(
     """Groups triangles over which the lightmap looks alike, so that one of them can stand for its whole group.
 
     Args:
-        uv: [V, 2], lightmap UVs of the vertices, finite; v = 0 is the top of row 0. Outside [0, 1] the border's texels
-            are read.
+        uv: [V, 2], lightmap UVs of the vertices, finite; v = 0 is the top of row 0. Beyond [0, 1], border texels are
+            read.
         triangle: int [F, 3], vertex numbers.
         lightmap: [H, W, 3], linear RGB, finite.
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
-        max_radiance: Above 0. A triangle with a brighter texel shares texels with no other triangle (section 4.1.1). It
-            stands for the value 255 of the paper, whose thresholds are for 8-bit colours.
+        max_radiance: Above 0. A triangle with a brighter texel shares texels with no other (section 4.1.1). It stands
+            for the paper's 8-bit colour 255.
         active: bool [F], which triangles take part; None for all.
         largest: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
@@ -124,8 +123,8 @@ def cluster(
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """Converts the lightmap to 16 bits per channel, with `max_radiance` as 65,535; a fourth channel is 1 where a texel
-    is brighter."""
+    """Converts light to 16 bits per channel, `max_radiance` to 65,535; a fourth channel is 1 where a texel is
+    brighter."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
     fraction = lightmap.astype(np.float64) / max_radiance
     texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
@@ -140,8 +139,8 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Returns for each triangle the index in `SIZES` of the smallest size not below its longest edge in texels (eq. 1),
-    int32 [F]."""
+    """Returns for each triangle the index in `SIZES` of the smallest size not below its longest edge in texels,
+    int32."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)

@@ -203,8 +203,8 @@ def _chart_meshes(
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Makes each chart a flat mesh with its lower corner at the origin: places float32 [v, 3], triangles uint32 [f, 3]
     and the same places as UVs; the numbers of the triangles in the order of the meshes, int [N], come first in the
-    result. In one mesh the packer would join charts that meet at a point. A smaller mesh also has finer float32
-    coordinates, and the packer accepts thinner triangles in it."""
+    result. In one mesh the packer would join charts that meet at a point. In small meshes float32 is finer, and the
+    packer accepts thinner triangles."""
     charts = np.arange(int(label.max()) + 2)
     low = np.full((len(charts) - 1, 2), np.inf)
     np.minimum.at(low, label, points.min(1))
@@ -256,8 +256,7 @@ def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray)
 
 
 def _thickened(points: np.ndarray, height: float) -> np.ndarray:
-    """Replaces N thin triangles [N, 3, 2] by right triangles around them, with one leg `height` long and the other at
-    least as long."""
+    """Puts right triangles around thin triangles [N, 3, 2]: one leg is `height` long, the other at least as long."""
     out = np.empty_like(points)
     for i, corner in enumerate(points):
         ends = [(corner[k], corner[(k + 1) % 3]) for k in range(3)]

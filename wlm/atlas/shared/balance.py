@@ -30,19 +30,18 @@ _ROUNDS = 4
 @dataclass(frozen=True)
 class ViewShares:
     """The tiles that V views show. `share`, float64 [V, T], is the fraction of a view's pixels that shows each tile, 0
-    for tiles of smaller mip levels; `lost`, float64 [V], is the error of each view that was assumed when tiles were
-    first weighted."""
+    for tiles of smaller mip levels; `lost`, float64 [V], is each view's error that was assumed in the first weights."""
 
     share: csr_array
     lost: np.ndarray
 
     def by_state(self, states: int) -> "ViewShares":
-        """Returns the shares for tiles that are separate in each state, divided by the number of states, since a view's
-        error is the mean over them."""
+        """Returns the shares for separate tiles in each state, divided by the number of states: a view's error is their
+        mean."""
         return replace(self, share=hstack([self.share] * states, "csr") / states)
 
     def psnr(self, error: np.ndarray) -> float:
-        """Returns the PSNR in dB, peak 1, as the mean over the views; `error` [T] is each tile's error divided by its
+        """Returns the mean PSNR of the views in dB, for peak 1; `error` [T] is each tile's error divided by its
         weight."""
         if not len(self.lost):
             return -10.0 * math.log10(float(error.mean()) + FLOOR)

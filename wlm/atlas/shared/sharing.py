@@ -276,7 +276,6 @@ def _allocated(
 
 
 def _laid_out(planes: list[Plane], tile: int) -> Layout:
-    """Places the entries of all sheets and levels in the lookup texture T_c, on shelves."""
     grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
     across = np.array([(columns, rows) for rows, columns in grid])
     best = None

@@ -87,8 +87,7 @@ def _counts(
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
-    """Sums over views the fraction of pixels that show each cell (quarter of a texel), over the variation of light
-    there."""
+    """Sums the fractions of views' pixels that show each cell (quarter of a texel), divided by the views' variation."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)

@@ -108,8 +108,7 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model from the tiles' solved samples, their sizes and places, and their numbers in the grid, int64
-    [T]."""
+    """Makes the model from the tiles' solved samples, sizes and places, and numbers in the grid, int64 [T]."""
     size = scene.sheets[0].mask.shape
     counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)

@@ -77,8 +77,8 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
-    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the error that each bit must
-    save at least.
+    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the least error that a bit must
+    save.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -114,8 +114,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves (rows of rectangles) that gives the smallest texture; returns it and the texture's
-    size."""
+    """Finds the width of shelves (rows of rectangles) for the smallest texture; returns it and the texture's size."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -173,16 +172,15 @@ def composed(
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n,
-    2]."""
+    """Returns rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n, 2]."""
     row = first[:, 1, None, None] + np.arange(ny)[:, None]
     return row, first[:, 0, None, None] + np.arange(nx)
 
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
     """Chooses the size of each tile, int [T], for the least sum of `error`, float64 [sizes, T], within a budget of
-    bits; each bit must save an error of at least `least`. If even the cheapest sizes exceed the budget, all tiles get
-    the cheapest."""
+    bits; each bit must save an error of at least `least`. If even the cheapest exceed the budget, all tiles get
+    these."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
@@ -208,8 +206,8 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 @dataclass(frozen=True)
 class _Run:
     """The places of all rectangles of one size. The first `beside` rectangles start at (x, y), on a shelf (row) shared
-    with another size. All others fill their own shelves, of `each` rectangles, from y = `below` on. `widest` is the x
-    where the rightmost rectangle ends."""
+    with another size. All others fill their own shelves, of `each` rectangles, from y = `below` on. `widest` is the
+    right end of all rectangles."""
 
     beside: int
     x: int
@@ -250,8 +248,7 @@ class _Kinds:
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Packs rectangles, int [R, 2] widths and heights, on shelves (rows) `width` wide, in order of height; each shelf
-    is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height of the
-    shelves."""
+    is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height."""
     first = np.zeros((len(sizes), 2), np.int64)
     if not len(sizes):
         return first, 0
