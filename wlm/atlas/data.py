@@ -104,7 +104,8 @@ class Triangles:
         position: float64 [V, 3].
         triangle: int32 [F, 3].
         uv: float64 [V, 2]; 0 for triangles without a lightmap.
-        sheet: int32 [F], the sheet that lights each triangle; -1 without a lightmap: these only hide others.
+        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide
+            others.
     """
 
     position: np.ndarray
@@ -190,8 +191,8 @@ def load(
             `wlm.atlas.listing`; None: the lightmaps that the materials name.
         mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above
             0. None derives it from the triangles.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes the list's set; else 1, where engines and viewers look
-            for lightmap UVs, if any primitive has that; else 0. Formats other than glTF have only 0.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None: the set that a list of lightmaps names; without one, 1,
+            where engines look for lightmap UVs, if any primitive has it; else 0. Formats other than glTF have only 0.
         node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
         encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None for other
             files.
@@ -209,7 +210,7 @@ def load(
     else:
         for name, value in {"mask": mask_path, "node": node, "encoding": encoding, "flip": flip or None}.items():
             if value is not None:
-                raise WlmError(f"{name}: expected none with a list of lightmaps, which states it for each")
+                raise WlmError(f"{name}: can't be given with a list of lightmaps; state it in the list")
         listing = _listed(path, document, lights_path)
     if node is not None:
         primitives = named(str(path), primitives, node)
@@ -390,7 +391,7 @@ def _listed(path: Path, document: GltfDocument, lights_path: str | os.PathLike[s
     with reported(path):
         listing = material_lightmaps(document)
     if listing is None:
-        raise WlmError(f"{path}: no material has a lightmap (MOZ_lightmap): give a list of lightmaps too")
+        raise WlmError(f"{path}: no material has a lightmap (MOZ_lightmap): give a lightmap or a list of lightmaps")
     return listing
 
 

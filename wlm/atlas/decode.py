@@ -52,7 +52,7 @@ class Decoder:
 
     def factors(self, state: float) -> np.ndarray:
         """Returns the factors by which shared tiles sum their components in a state, float32 [C, 3]. They are
-        interpolated for a state such as 0.5.
+        interpolated for a state such as 0.5, between the first two.
 
         Raises:
             ValueError: The state is below 0 or above the number of the last one.
@@ -134,7 +134,8 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], at UVs of sheets or mip levels, rows `row` [N] of `AtlasModel.table`."""
+        """Returns light, float32 [N, 3], at UVs of sheets or mip levels; `row`, int [N], has their rows in
+        `AtlasModel.table`."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()

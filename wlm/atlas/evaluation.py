@@ -192,7 +192,7 @@ def compare(
     labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmaps. Each view is rendered twice for any number of decoders.
+    """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders at once.
 
     Args:
         scene: The scene with its original lightmaps.
@@ -201,7 +201,7 @@ def compare(
             `VIEWS`, or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: For a decoder of this name, a function from points to numbers of charts or tiles: seams lie where the
+        labels: By the name of a decoder, a function from points to numbers of charts or tiles: its seams lie where the
             number changes. For other decoders, seams are the borders of the lightmaps' charts. Outlines in front of
             other surfaces are no seams.
         progress: Called with the number of views done.
@@ -211,8 +211,8 @@ def compare(
 
     Raises:
         WlmError: There is no such device, or a decoder gives NaN or infinity.
-        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or a label has
-            no decoder.
+        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or a name in
+            `labels` isn't in `decoders`.
     """
     device, labels = check_device(device), dict(labels or {})
     unknown = sorted(labels.keys() - decoders.keys())
@@ -463,8 +463,8 @@ class _View:
     """One view's pictures of the original lightmaps, to be compared with those of decoders."""
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
-        """Makes pictures of the original's light [N, 3] at the covered pixels `hit`, bool [h, w]; `flip`: compute FLIP
-        too."""
+        """Makes pictures of the original's light [N, 3] at the covered pixels `hit`, bool [h, w]. If `flip`, `errors`
+        computes FLIP too."""
         whole = hit.cpu().numpy()
         # SSIM reads half a window around a covered pixel.
         rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))

@@ -13,7 +13,8 @@ def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, sta
     Args:
         model: The model.
         uv: [N, 2], finite: the model's new UVs if it has any, else the UVs of the sheets; clamped to [0, 1].
-        sheet: int [N], or one number for all points: sheet or mip level, a row of `AtlasModel.table` in state 0.
+        sheet: int [N], or one number for all points: number of the sheet or mip level, its row in `AtlasModel.table`
+            for the first state.
         state: The number of the state.
 
     Returns:

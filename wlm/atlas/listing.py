@@ -247,9 +247,9 @@ def _from_bake(path: str) -> Listing:
     slices = {user.slice for user in bake.users}
     if len(bake.textures) != 1 or bake.directional or slices != {0}:
         raise WlmError(
-            f"{path}: expected one texture of one slice without directions, found {len(bake.textures)} with "
-            f"{len(slices)} slices{' with directions' if bake.directional else ''}: save each slice "
-            "as a file, and list the files in JSON"
+            f"{path}: expected one texture of one slice without directions, found "
+            f"{len(bake.textures)} textures and {len(slices)} slices{' with directions' if bake.directional else ''}: "
+            "save each slice as a file, and list the files in JSON"
         )
     sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
     objects = tuple(_godot_place(user) for user in bake.users)

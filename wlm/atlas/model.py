@@ -115,11 +115,11 @@ class Profile(Settings):
     fallback: bool = True
     """For one lightmap: store a plain smaller lightmap of as many bits instead if the error of that is no larger."""
     threshold: float = Field(0.03, ge=0.0, le=1.0)
-    """For the cascade: lambda of eq. 4, the largest difference of triangles that share texels; 0: none do."""
+    """For the cascade: lambda of eq. 4, the largest difference of triangles that share texels; 0: none share."""
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
     """For the cascade: lambda_h of section 3.2.1, the largest difference in colour of triangles that share texels."""
     max_radiance: float | None = Field(2.0, gt=0.0)
-    """For the cascade: triangles with a brighter texel share none, and both thresholds are fractions of this radiance
+    """For the cascade: triangles with brighter texels share none, and both thresholds are fractions of this radiance
     (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright lightmaps alike."""
     scale: float = Field(0.5, gt=0.0, le=1.0)
     """For the cascade: epsilon, texels of the repacked lightmap per original texel along a side (section 3.3.1)."""
@@ -143,7 +143,7 @@ class Profile(Settings):
     """For the cascade: weight of errors of image gradients in the loss; errors of colours weigh 1 (section 3.3.3)."""
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Returns the profile with new `values` of settings, by name; None changes nothing. Messages begin with
+        """Returns the profile with new `values` of settings, by name; None changes nothing. Error messages begin with
         `prefix`.
 
         Raises:

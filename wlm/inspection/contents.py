@@ -52,7 +52,7 @@ def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> Non
     """Checks that the options `given` with a file are among those `known` for its kind.
 
     Raises:
-        WlmError: An option has no meaning for this kind of file.
+        WlmError: An option doesn't apply to this kind of file.
     """
     for name in given:
         if name not in known:

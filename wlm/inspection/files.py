@@ -1,7 +1,7 @@
 """Describes single files by their content and, where that is not enough, by their names.
 
-`_KINDS` is the table of all kinds of files. `inspect` uses it to describe a file, `wlm compress` to find the system for
-its input.
+`_KINDS` is the table of all kinds of files. `inspect` uses it to describe a file, and `wlm compress` to find the system
+that compresses its input.
 """
 
 from collections.abc import Callable, Sequence

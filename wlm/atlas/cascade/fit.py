@@ -63,7 +63,8 @@ class Textures:
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0: no sharing."""
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); returns None if the threshold is 0, since no
+    triangles share texels then."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -156,7 +157,8 @@ def fit_cascade(
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
     """Makes the textures from which tuning starts (section 3.3.3). Each texel of T_p is the mean of the lightmap's
     texels that it covers, and T_c holds the coordinates of its texels' centres. `lightmap` is the repacked one, float32
-    [H_r, W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts. The others are filled first."""
+    [H_r, W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts. All others first take the nearest of these
+    colours."""
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
     colour = resized(fill_gaps(lightmap, mask), mask, *sides, "box").numpy().astype(np.float32)

@@ -203,8 +203,8 @@ def _chart_meshes(
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Makes each chart a flat mesh with its lower corner at the origin: places float32 [v, 3], triangles uint32 [f, 3]
     and the same places as UVs; the numbers of the triangles in the order of the meshes, int [N], come first in the
-    result. In one mesh the packer would join charts that meet at a point. In small meshes float32 is finer, and the
-    packer accepts thinner triangles."""
+    result. In one mesh the packer would join charts that meet at a point. In a smaller mesh float32 coordinates are
+    finer, and the packer accepts thinner triangles."""
     charts = np.arange(int(label.max()) + 2)
     low = np.full((len(charts) - 1, 2), np.inf)
     np.minimum.at(low, label, points.min(1))

@@ -50,8 +50,8 @@ class SceneTiles:
     Attributes:
         texels: float32 [T, B + 1, B + 1, M, 3], light divided by a unit for each state, in M states.
         weight: float32 [T, P], weights of the tiles' points; all add up to 1.
-        plane: int [T], the sheet or level of each tile, ascending.
-        index: int64 [T], the tile's number in its sheet or level, row by row.
+        plane: int [T], number of the sheet or mip level of each tile, ascending.
+        index: int64 [T], the tile's number in its sheet or mip level, row by row.
         size: B, texels along a tile.
         device: The device on which tiles are fitted.
     """
@@ -120,7 +120,8 @@ class Candidate:
 
 
 def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
-    """Lists the choices for `count` components: all of one size, or in blocks with the last ones coarse (one block)."""
+    """Lists the choices for `count` components: all are of one size, or, in block formats, the last ones are coarse:
+    stored as a single block each."""
     few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
     return [
         Choice(size, count, coarse)

@@ -58,7 +58,8 @@ class Tiles:
 
     Attributes:
         index: int64 [T], number of the tile in the grid, row by row.
-        light: float [T, 3, m * m], at m x m points of the tile, row by row, (k + 0.5) / m along an axis.
+        light: float [T, 3, m * m], at m x m points of the tile, row by row, at (k + 0.5) / m of its side along each
+            axis.
         weight: float [T, m * m], weight of each point's squared error, 0 or more; the sum over all tiles is 1.
         size: Texels along a tile.
     """

@@ -77,8 +77,8 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
-    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the least error that a bit must
-    save.
+    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the smallest error that a bit
+    must save.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -98,7 +98,9 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
             shapes.append(shape)
             most = MOST_SIZE * texture.step
             if max(shape) > most:
-                raise WlmError(f"budget: too large: T_p would have {max(shape)} texels along a side, over {most}")
+                raise WlmError(
+                    f"budget: too large, T_p would have {max(shape)} texels along a side; expected at most {most}"
+                )
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
             first = np.zeros((len(chosen), 2), np.int64)
@@ -179,8 +181,8 @@ def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarr
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
     """Chooses the size of each tile, int [T], for the least sum of `error`, float64 [sizes, T], within a budget of
-    bits; each bit must save an error of at least `least`. If even the cheapest exceed the budget, all tiles get
-    these."""
+    bits; each bit must save an error of at least `least`. If even the cheapest sizes exceed the budget, all tiles get
+    the cheapest."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
