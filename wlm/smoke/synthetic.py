@@ -1,4 +1,4 @@
-"""Procedural smoke for demos, benchmarks and the training of `transport.orders`."""
+"""Procedural smoke for demos, benchmarks and the fit of the weights of `transport.orders`."""
 
 import numpy as np
 import torch
