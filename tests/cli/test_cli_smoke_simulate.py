@@ -105,7 +105,7 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     assert sorted(os.listdir(out)) == [*whole, "scene.json", CHECKPOINT]
     # With another scene it isn't resumed, and nothing is lost by the attempt.
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(JET | {"air": {"viscosity": 1.0}}))
-    assert "whose air differs" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
+    assert "its frames have another air" in fails("smoke", "simulate", tmp_path / "other.yaml", "-o", out, "--resume")
     monkeypatch.setattr(Solver, "step", lambda self, steps=1: done.append(1) or step(self, steps))
     call("smoke", "simulate", scene, "-o", out, "--resume", "--checkpoint-every", 0)
     assert len(done) == 4 * per_frame, "no step is done twice"
@@ -224,6 +224,8 @@ def test_earlier_results_outlast_a_command_that_fails(jet, tmp_path, monkeypatch
     fails("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
     monkeypatch.setattr(simulation, "free_memory", lambda device: 3 * 2**10)
     line = fails("smoke", "simulate", jet / "jet.yaml", "-o", frames)
-    assert re.search(r"8 x 10 x 8 cells of air and 16 x 20 x 16 of smoke need .* but only 0.0 GiB are free", line)
+    assert re.search(
+        r"8 x 10 x 8 cells of air and 16 x 20 x 16 voxels of smoke need .* but only 0.0 GiB are free", line
+    )
     changed = {path for path, content in before.items() if not path.exists() or path.read_bytes() != content}
     assert changed == {frames / "frame_0001.npz", tmp_path / "bake" / "six_0001.exr"}

@@ -341,9 +341,13 @@ def test_files_that_are_no_lightmaps(tmp_path):
 
     refused({k: v for k, v in planes.items() if k != "top"}, note, "expected a channel top as bake writes")
     refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
-    refused(planes, None, "camera: not as bake writes")
-    refused(planes, {"camera": {"extent": 1}}, "camera: not as bake writes")
-    refused(planes, {"camera": note["camera"] | {"up": [0, 10**400, 0]}}, "camera: not as bake writes")
+    refused(planes, None, "header attribute wlm: expected a camera as bake writes")
+    refused(planes, {"camera": {"extent": 1}}, "header attribute wlm: expected a camera as bake writes")
+    refused(
+        planes,
+        {"camera": note["camera"] | {"up": [0, 10**400, 0]}},
+        "header attribute wlm: expected a camera as bake writes",
+    )
     refused({k: v[:4] for k, v in planes.items()}, note, "expected 8 x 8 pixels, as its camera has")
     damaged = path.read_bytes()
     path.write_bytes(damaged[: len(damaged) // 2])

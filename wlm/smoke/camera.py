@@ -91,8 +91,8 @@ class Camera:
     Attributes:
         position: In world units: the eye of a perspective camera, or the image centre of an orthographic one. Smoke
             behind it is not visible.
-        right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
-            points from the smoke to the camera.
+        right, up, toward: The image's axes in the world, orthogonal and of length 1; toward, the cross product of
+            right and up, points from the smoke to the camera.
         extent: Height in world units of the region that the image shows; in perspective, at distance 1 from the eye.
         height, width: Size of the image in pixels; pixels are square.
         perspective: Whether all rays start at the eye; six-way lightmaps are always orthographic.
@@ -133,7 +133,7 @@ class Camera:
     ) -> "Camera":
         """Makes a camera that looks from a position to a target.
 
-        If it looks along `world_up`, an axis of the world defines the image's upward direction instead.
+        `world_up` is upwards in the image; if the camera looks along it, an axis of the world is used instead.
 
         Raises:
             ValueError: The position equals the target, or a size is wrong.

@@ -67,7 +67,7 @@ class Frames:
 
     @property
     def single(self) -> bool:
-        """Whether the smoke is a single file instead of a folder."""
+        """Whether `path` is a single file instead of a folder."""
         return self.files.get(1) == self.path
 
     @property
@@ -115,7 +115,7 @@ class Frames:
         return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
-        """Reads a frame.
+        """Reads the volume of a frame.
 
         Raises:
             WlmError: The file is missing or damaged.
@@ -387,7 +387,7 @@ def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixW
         fields = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
         camera = Camera(**fields)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WlmError(f"{path}: header attribute wlm: camera: not as bake writes: {error}") from error
+        raise WlmError(f"{path}: header attribute wlm: expected a camera as bake writes: {error}") from error
     size = next(iter(planes.values())).shape
     if size != (camera.height, camera.width):
         raise WlmError(f"{path}: expected {camera.height} x {camera.width} pixels, as its camera has, found {size}")

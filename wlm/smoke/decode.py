@@ -27,7 +27,7 @@ class Decoder:
     """A trained network for images of one size: predicts encoded lightmaps from an encoded guiding map.
 
     Attributes:
-        height, width: H and W of the images.
+        height, width: Size of the images in pixels, H and W.
         device: Device on which it runs.
         guide: Kind of guiding map that it reads, a key of `planes.GUIDES`.
         half: Whether the network computes in half floats.
@@ -39,7 +39,7 @@ class Decoder:
         Args:
             model: The network; it is not changed.
             device: "cpu", "cuda" or "cuda:N".
-            height, width: H and W, at least 1.
+            height, width: Size of the images in pixels, H and W, at least 1.
             half: Whether a GPU computes in half floats; a CPU always computes in float32.
 
         Raises:

@@ -231,7 +231,7 @@ def compare(
         volumes: Files of further volumes, each a test set of its own; see `pool_of_volume`.
         densities: Factors by which the extinction of the test set is multiplied.
         device: "cpu", "cuda" or "cuda:N".
-        progress: Called after each test set, with the network's PSNR as the figure "PSNR dB".
+        progress: Called after each test set, with the PSNR of the network as the figure "PSNR dB".
 
     Returns:
         One comparison for each density, then one for each volume.

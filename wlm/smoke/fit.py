@@ -91,8 +91,8 @@ def train(
         resume: Whether to continue from the checkpoint, if it exists.
         checkpoint_every: Seconds between two checkpoints; 0: after every 50 steps. A checkpoint is also written at the
             end of each round.
-        progress: Called after each simulated sequence and about every 50 steps, with "PSNR dB" of the last validation
-            and the mean "loss" since then.
+        progress: Called after each simulated sequence and every 50 steps, with the figures "PSNR dB" of the last
+            validation and "loss", the mean of the round.
         make_pool, make_validation: Replace the functions of these names in `network.dataset`.
         **overrides: Replace settings of the profile: `training={"rounds": 2}`.
 
@@ -191,7 +191,7 @@ class _Run:
         return self.before + self.meter.seconds
 
     def begin(self, validation: Pool) -> None:
-        """Validates and saves the untrained network, with which later networks are compared; not if resumed."""
+        """Validates and saves the untrained network, with which later networks are compared."""
         if self.trainer.step == 0:
             self.score = score(of_network(self.trainer.average), validation)
             self.untrained = self.best = self.score.psnr

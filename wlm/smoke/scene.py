@@ -229,7 +229,7 @@ class ObstacleSettings(_Settings):
     Attributes:
         shape: "sphere", "box" or "cylinder", whose axis is y.
         radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z.
-        path: Positions of the centre as (time, x, y, z), between which it moves linearly and outside which it rests.
+        path: Positions (time, x, y, z) between which the centre moves linearly; before and after them it rests.
         colour: Albedo R, G, B of the obstacle in pictures.
     """
 

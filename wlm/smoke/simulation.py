@@ -167,7 +167,7 @@ def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: flo
 
 
 def _require_memory(scene: Scene, device: str) -> None:
-    """Checks before the allocation that air and smoke fit into the free memory together; raises a WlmError."""
+    """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
     voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
@@ -176,8 +176,8 @@ def _require_memory(scene: Scene, device: str) -> None:
     if needed > free:
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
-            f"{scene.name}: {air} cells of air and {dense} of smoke need {needed / 2**30:.1f} GiB on {device}, but only"
-            f" {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, or storage: float16"
+            f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on {device},"
+            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, or storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
     fluid.require_memory(grid.shape, voxel, warp_device)

@@ -231,7 +231,7 @@ def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
 
 
 def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
-    """Lays pictures [N, H, W, C] out in cells of a texture, with `padding` repeated edges; unused cells are `empty`."""
+    """Lays pictures [N, H, W, C] out in cells with borders of `padding` pixels; cells without picture are `empty`."""
     _count, height, width, channels = frames.shape
     page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
     around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
@@ -241,11 +241,11 @@ def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: fl
 
 
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
-    """Writes the textures of a flip book beside `output`: NAME_1, NAME_2 and NAME_motion, each atomically.
+    """Writes the textures of a flip book to files NAME_1, NAME_2 and, with motion, NAME_motion, each atomically.
 
     Args:
         book: The flip book.
-        output: Path of NAME that ends in .exr, .png or .tga, in an existing folder.
+        output: Path in an existing folder: NAME with the suffix .exr, .png or .tga of all files.
 
     Returns:
         The names of the channels of each file, and the number of values that were clipped to the range of the files.
@@ -285,8 +285,8 @@ def read_flipbook(
     """Reads the frames of a flip book of any program; the unknown camera is taken to be in front of the smoke.
 
     Args:
-        paths: The files, .exr, .png or .tga (8 bits per channel, linear): two of the layout, and optionally one with
-            the opacity in its alpha or first channel.
+        paths: The files, .exr, .png or .tga (8 bits per channel, linear): the two of the layout, and optionally a third
+            with the opacity in its alpha or first channel.
         layout: Name of the order of the channels, one of `LAYOUTS`.
         rows, columns: Number of rows and of columns of cells; all cells are read.
         straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.

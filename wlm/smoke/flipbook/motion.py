@@ -90,7 +90,7 @@ def frames_motion(
 
 
 def spread_out(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Replaces values [C, H, W] whose weight [H, W] is 0 by means of the values around, over ever larger squares."""
+    """Replaces values [C, H, W] whose weight [H, W] is 0 by averages of the values around them."""
     sums, weights = [values[None] * weight], [weight[None, None]]
     while max(sums[-1].shape[2:]) > 1:
         for parts in (sums, weights):

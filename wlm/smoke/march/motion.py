@@ -67,7 +67,7 @@ def velocity_file(folder: Path, number: int) -> Path:
 
 
 def write_velocity(path: Path, velocity: wp.array, reach: float) -> None:
-    """Writes the velocities of a frame, vec3 [A, B, C], times `reach`: the world units per frame of a velocity of 1.
+    """Writes the velocities of a frame, vec3 [A, B, C], times `reach`, which converts them to world units per frame.
 
     Raises:
         WlmError: The file cannot be written, or there are more cells than `read_velocity` accepts.

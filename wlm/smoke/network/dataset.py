@@ -165,7 +165,7 @@ class _Maker:
         return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
 
     def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """Returns a sequence's samples, the number of unstable scenes skipped, and of almost empty samples dropped."""
+        """Returns the samples of a sequence, and how many unstable scenes and almost empty samples were left out."""
         for attempt in range(ATTEMPTS):
             index = number * ATTEMPTS + attempt
             settings = self._sequence_settings(index)
@@ -267,7 +267,7 @@ class _Simulation:
         self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:
-        """Advances by a number of air steps, which must be a multiple of the steps in one CUDA graph."""
+        """Advances the smoke by `steps` air steps, which must be a multiple of the steps in one CUDA graph."""
         for _ in range(steps // self._period):
             now = self._done * self._seconds
             active = tuple(source for source, is_active in self._sources if is_active(now))

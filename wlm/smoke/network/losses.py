@@ -17,14 +17,14 @@ _VISIBLE = 0.01  # opacity above which a change counts
 
 
 def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Warps an earlier frame onto a later one.
+    """Moves the pixels of earlier frames along a motion, so that they are comparable with the later frames.
 
     Args:
-        earlier: [N, C, H, W].
+        earlier: Frames [N, C, H, W].
         motion: [N, 2, H, W], as `Pool.motion`.
 
     Returns:
-        The warped frame, and a mask [N, 1, H, W], 1 where the frame was read inside the image.
+        The moved frames [N, C, H, W], and a mask [N, 1, H, W]: 1 where the motion starts inside the image, else 0.
     """
     height, width = earlier.shape[-2:]
     motion = motion.to(earlier.dtype)

@@ -28,7 +28,7 @@ VISIBLE = 0.05
 
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
-    """Encodes linear light by sRGB's curve, continued above 1; values below 0 count as 0."""
+    """Encodes linear light by the sRGB curve, which is continued above 1; values below 0 count as 0."""
     # Clamped away from 0, where the power's slope is infinite and would turn a gradient into NaN.
     curve = 1.055 * linear.clamp(min=FOOT) ** (1 / 2.4) - 0.055
     return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)

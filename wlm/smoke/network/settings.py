@@ -50,7 +50,7 @@ class NetworkSettings(BaseModel):
 
     @property
     def multiple(self) -> int:
-        """Number of pixels to whose multiples the height and width of images are padded with zeros."""
+        """Images are padded with zeros to a height and width that are multiples of this number of pixels."""
         return self.stem * 2 ** (self.levels - 1)
 
 
@@ -148,7 +148,7 @@ class DatasetSettings(BaseModel):
         return self.resolution / high, self.resolution / low
 
     def lattice_steps(self, crossings: float) -> int:
-        """Converts a time, in crossings of the box, to a number of air steps that whole CUDA graphs have."""
+        """Converts a time in crossings of the box to air steps, rounded to whole CUDA graphs of the solver."""
         graph = PERIOD * self.substeps
         return round(crossings * self.cells / (LATTICE_SPEED * graph)) * graph
 

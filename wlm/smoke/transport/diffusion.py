@@ -28,7 +28,7 @@ _FADE = 0.25  # distance from the box, in edges of the box, over which diffusion
 
 
 def share_of(light: AnyLight, volume: DensityVolume) -> float:
-    """Returns the share of pure diffusion in a light's result: 1 for a point light in the box, falling to 0 outside."""
+    """Returns the share of a light's result that diffusion gives: 1 for a point light in the box, 0 far outside."""
     if not isinstance(light, PointLight):
         return 0.0
     place = in_voxels(light, volume)[0]
@@ -37,7 +37,7 @@ def share_of(light: AnyLight, volume: DensityVolume) -> float:
 
 
 class Spreading:
-    """Computes the diffusion of several lights; a march adds them one by one, since it has their optical depths."""
+    """Computes the diffusion of several lights, which are added one by one when a march has their optical depths."""
 
     def __init__(self, scene: Marching, volume: DensityVolume, lights: Sequence[AnyLight]) -> None:
         """Averages the smoke over the cells of the coarse grid; no light has been added yet."""

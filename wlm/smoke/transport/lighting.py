@@ -104,7 +104,7 @@ class LitSmoke:
 
 
 def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np.ndarray) -> torch.Tensor:
-    """Adds planes [H, W, 3] times a colour to an image, without copying the colour to the GPU, which would wait."""
+    """Adds planes [H, W, 3] times a colour to an image, without a copy of the colour to the GPU, which would wait."""
     for channel, value in enumerate(colour):
         image[..., channel].add_(planes[..., channel], alpha=float(value))
     return image
@@ -154,7 +154,7 @@ Depths = tuple[depth_lattice.Lattice, wp.array]
 
 @dataclass(frozen=True, eq=False)
 class Marching:
-    """A prepared march from a camera through a volume, for any number of lights: smoke is searched only once."""
+    """A prepared march from a camera through a volume, for any number of lights: empty bricks are found only once."""
 
     medium: Medium
     view: View
@@ -166,7 +166,7 @@ class Marching:
         return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
-        """Computes light scattered once: `out` is float32 [2, H, W], the opposite light included, or [1, H, W]."""
+        """Computes light scattered once into `out`, float32 [1 or 2, H, W]: from the light and the opposite light."""
         marches.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
     def unlit(self) -> torch.Tensor:

@@ -39,8 +39,8 @@ class Transport:
             order n is multiplied by a^n.
         sources: Names of the sources: "light 1" and so on, "sky" and "emission".
         noise: float32 tensor [S, H, W, 3], standard error of the sum of all planes of each source.
-        total_noise: float32 tensor [H, W, 3], standard error of `total`, which is larger than from `noise` alone, since
-            sources share paths.
+        total_noise: float32 tensor [H, W, 3], standard error of `total`, larger than for sources with independent
+            paths, since sources share their paths.
         albedo: Albedo of the smoke, R, G, B.
         camera: Camera of the images.
         samples: Number of paths per pixel.
@@ -100,7 +100,7 @@ def trace(
         highest: Number of scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
         seed: An integer of at least 0; the same seed gives the same result on one kind of device.
-        progress: Called during the work.
+        progress: Called after each of up to 16 parts of the paths.
 
     Returns:
         The light on the smoke's device.
