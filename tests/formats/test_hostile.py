@@ -439,7 +439,7 @@ def test_alpha_that_is_no_number_is_told_and_not_valid(tmp_path):
     write_exr(tmp_path / "a.exr", pixels, half=False)
     loaded = lightmap.load(path)
     assert np.argwhere(~loaded.light.mask).tolist() == [[0, 0], [0, 1], [1, 0]]
-    assert loaded.warnings == ("a.exr: 3 texels with an alpha NaN or infinite: not valid",)
+    assert loaded.warnings == ("a.exr: 3 texels are not valid: alpha is NaN or infinite",)
 
 
 def test_what_a_terminal_obeys_is_escaped(capsys):
