@@ -200,11 +200,11 @@ rate: RATE
     ("changes", "expected"),
     [
         ({"VELOCITY": "1.0e+300"}, "inlets.0.velocity.1: expected less than or equal to 1000000000000000000"),
-        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps a frame, found a speed of 1e+12 m/s"),
+        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps per frame, found a speed of 1e+12 m/s"),
         ({"CELL": "1.0e-300"}, "grid.cell: expected greater than or equal to 0.000000001"),
         ({"CELL": "1.0e+300"}, "grid.cell: expected less than or equal to 1000000000"),
         ({"RATE": "1.0e-9"}, "rate: expected greater than or equal to 0.000001"),
-        ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps a frame"),
+        ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps per frame"),
     ],
 )
 def test_scenes(tmp_path, changes, expected):

@@ -36,7 +36,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
     if is_six_way(path):
         return "six-way", paths
     if len(paths) > 1:
-        raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
+        raise WlmError(f"{paths[1]}: expected one file; only six-way lightmaps may be several, an EXR per frame")
     if path.is_dir():
         if (path / SCENE_FILE).is_file():
             return "volume", paths
@@ -52,8 +52,8 @@ def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> Non
     """Checks that the options `given` with a file are among those `known` for its kind.
 
     Raises:
-        WlmError: An option has no meaning for this kind of file.
+        WlmError: An option doesn't apply to this kind of file.
     """
     for name in given:
         if name not in known:
-            raise WlmError(f"{path}: --{name} has no meaning for this file")
+            raise WlmError(f"{path}: --{name} doesn't apply to this kind of file")
