@@ -83,11 +83,7 @@ def profile_path(system: str, name: str) -> Path:
 
 
 def profile_names(system: str) -> list[str]:
-    """Lists the names of a system's profiles, sorted.
-
-    Args:
-        system: First part of the file names, the attribute `FILES` of the settings.
-    """
+    """Returns the sorted names of a system's profiles; `system` is the first part of the names of their files."""
     prefix = f"{system}-"
     files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
     return sorted(stem.removeprefix(prefix) for stem in files)
@@ -185,7 +181,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Lists the known keys of the mapping at a location, or only the most similar one."""
+    """Returns the known keys of the mapping that has an unknown key, or only the known key that is most similar."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)
@@ -203,7 +199,7 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Formats a value for a message, like `repr`, but only its beginning if it is long."""
+    """Formats a value for an error message like `repr`, and cuts it short if it is long."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Density volumes of smoke: validated input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
+"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
 
 Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
@@ -69,7 +69,7 @@ SUFFIXES = (".npz", ".nvdb", ".vdb")
 class DensityVolume:
     """Smoke in a box of cubic voxels.
 
-    The constructor does not validate: frames of a solver are used without a copy. `from_array` validates.
+    The constructor does not check the values, so that frames of a solver need no copy; `from_array` checks them.
 
     Attributes:
         density: float32 or float16 tensor [X, Y, Z], finite, not negative.
@@ -78,7 +78,7 @@ class DensityVolume:
         origin: float64 [3], corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
         temperature: Tensor like the density; None: no emission.
         emission: Light emitted per unit of length at temperature 1.
-        warnings: Repairs, one line each.
+        warnings: The values that were repaired, one line for each kind.
     """
 
     density: torch.Tensor
@@ -129,20 +129,17 @@ def from_array(
     """Makes a validated volume from arrays.
 
     Args:
-        density: Numbers [X, Y, Z]; copied only if they must be changed or moved.
-        extinction: Extinction per unit of length at density 1.
-        voxel: Edge of a voxel, in the world's unit.
-        origin: Corner of voxel (0, 0, 0) in the world.
-        temperature: Numbers [X, Y, Z]; None: the smoke emits no light.
-        emission: Light emitted per unit of length at temperature 1.
+        density, temperature: Numbers [X, Y, Z], copied only if they must be changed or moved; temperature None: the
+            smoke emits no light.
+        extinction, voxel, origin, emission: The attributes of `DensityVolume`.
         device: "cpu" or "cuda:N".
-        name: Name in messages.
+        name: Name of the volume in messages.
 
     Returns:
-        The volume, repaired as `docs/fluid.md` lists.
+        The volume; NaN, infinite and negative values are replaced by 0, see `docs/fluid.md`.
 
     Raises:
-        WlmError: The input is one of the errors of `docs/fluid.md`.
+        WlmError: The input has one of the errors that `docs/fluid.md` lists.
     """
     device = check_device(device)
     # Kernels compute in float32.
@@ -199,10 +196,10 @@ def load_volume(
         temperature: Name of the array or grid of temperatures; None: `temperature`, if it exists.
 
     Returns:
-        The volume, repaired as `docs/fluid.md` lists.
+        The volume; NaN, infinite and negative values are replaced by 0, see `docs/fluid.md`.
 
     Raises:
-        WlmError: The input is one of the errors of `docs/fluid.md`; the message names the file and the field.
+        WlmError: The input has one of the errors that `docs/fluid.md` lists; the message names the file and the field.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
