@@ -33,7 +33,7 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise WlmError(f"{path}: expected YAML in UTF-8, found another byte at {error.start}") from error
+        raise WlmError(f"{path}: expected YAML in UTF-8, found an invalid byte at position {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:

@@ -131,7 +131,7 @@ def _nearest(mask: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Finds the nearest valid texels in threads, on overlapping strips of rows; None if the overlap may be too small."""
+    """Finds nearest valid texels by threads, on overlapping strips of rows; None if strips may overlap too little."""
     height, width = mask.shape
     rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
 

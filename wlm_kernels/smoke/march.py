@@ -9,7 +9,7 @@ A light is given by the direction towards it and has irradiance 4 pi, so that an
 of 1 / (4 pi).
 
 Every march of a camera ray calls `begin` and then, while `r.done < r.count`, `look`, which sets the ray's place, sigma
-and x, and `pass_step`. Kernels differ only in what they add up between these two.
+and x, and then `pass_step`. Kernels differ only in what they add up between `look` and `pass_step`.
 
 None of these marches has a gradient; `single_scatter` has one. Read `tests/reference/marching.py` first: it is the same
 in float64 NumPy, without shared work between pixels.

@@ -130,13 +130,13 @@ def bits(random: wp.uint64) -> wp.uint32:
 
 @wp.func
 def uniform(random: wp.uint64) -> float:
-    """Generates a number of 24 bits in [0, 1)."""
+    """Returns the random number in [0, 1), with 24 bits, of a random state."""
     return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
 @wp.func
 def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
-    """Samples the Henyey-Greenstein phase function for a path along d."""
+    """Samples the new direction of a path along d by the Henyey-Greenstein phase function; u and v are in [0, 1)."""
     cosine = 1.0 - 2.0 * u
     if wp.abs(g) > 1.0e-3:
         share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)

@@ -19,7 +19,7 @@ class Solids:
 
     Attributes:
         points: vec3 [V], corners in the world.
-        triangles: int32 [F, 3].
+        triangles: int32 [F, 3], indices of each triangle's corners.
         owner: int32 [F], index of each triangle's obstacle.
         colours: vec3 [obstacles], albedo of each obstacle.
     """
