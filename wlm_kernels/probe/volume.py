@@ -130,7 +130,7 @@ def read(pool, pages, bases, views, side: int, points, normals, out, answered, w
     reproduced.
 
     Args:
-        pool, pages, bases, views: The arrays that the module's docstring describes.
+        pool, pages, bases, views: The blocks' light, the page table and the windows, see the module's docstring.
         side: Blocks along an axis of a window, even.
         points: vec3 [M], relative to the origin of `views`. No block covers a point that is NaN or far away.
         normals: vec3 [M], of unit length: light is read half a block in front of the point's surface, so that the far

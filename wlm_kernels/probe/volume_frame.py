@@ -11,7 +11,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
    takes from another group, and groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
    computes weights of at most 16 of these probes.
-5. `combine` computes a block's light as the weighted sum of these probes, extrapolated by at most half their range.
+5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
+   is extended by half its width on both sides.
 """
 
 import numpy as np
