@@ -94,7 +94,6 @@ def profile_names(system: str) -> list[str]:
 
 
 def _profile_folders() -> Iterator[Path]:
-    """Yields the folders that contain profiles: the checkout's, then the one installed with the package."""
     root = Path(__file__).resolve().parents[1]
     # An installed package is in site-packages; only a checkout has a pyproject.toml beside the package.
     if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():

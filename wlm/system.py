@@ -240,7 +240,6 @@ class Model:
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-        """Returns the settings, the parts and the source hash that `save` writes."""
         return _module(self.SYSTEM, "codec").encode(self)
 
 
@@ -289,5 +288,4 @@ def _package(path: str | os.PathLike[str], artifact: Artifact) -> str:
 
 
 def _module(system: str, name: str) -> Any:
-    """Imports a module of a system's package."""
     return import_module(f"{_PACKAGES[system]}.{name}")

@@ -348,7 +348,6 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _reason(code: int, errors: IO[bytes]) -> str:
-    """Returns the reason why a process ended, as one line."""
     with suppress(OSError, ValueError):
         size = errors.seek(0, os.SEEK_END)
         errors.seek(max(0, size - _TOLD))
