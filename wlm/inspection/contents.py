@@ -52,8 +52,8 @@ def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> Non
     """Checks that the options `given` with a file are among those `known` for its kind.
 
     Raises:
-        WlmError: An option doesn't apply to this kind of file.
+        WlmError: An option has no meaning for this kind of file.
     """
     for name in given:
         if name not in known:
-            raise WlmError(f"{path}: --{name} doesn't apply to this kind of file")
+            raise WlmError(f"{path}: --{name} has no meaning for this file")

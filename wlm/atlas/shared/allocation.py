@@ -17,7 +17,7 @@ _TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the used fraction 
 _LEAST_GAIN = 2.0**-24
 _LESS = 0.95  # fraction of the bits at which the error is measured again, for the value of a bit
 _DROPPED = 8  # one in eight of the mixtures that aren't worth their factors is removed per round
-NO_ROOM = "budget: {:g} is too little for the smallest tiles and their table; give more"
+NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take; give more"
 
 
 @dataclass(frozen=True, eq=False)
